@@ -1,0 +1,1 @@
+"""Method specifications of nerfstudio; shipped as normlift_ns.method_configs."""

@@ -1,0 +1,288 @@
+"""Evidence E_js: how much weight Gaussian j has in image region s. Independent of any feature, "
+"it is all that rasterizing yields."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Float64, Int, Int32, Int64
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from normlift_ns.core.files import atomic_path
+from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
+
+_FORMAT = "normlift_ns.evidence/1"
+
+
+class ViewEvidence(NamedTuple):
+    """Entries of one view, distinct and sorted by (gaussian, region)."""
+
+    gaussian: Int[Tensor, " nnz"]
+    region: Int[Tensor, " nnz"]
+    """View-local region id, -1 for unlabelled pixels."""
+    weight: Float[Tensor, " nnz"]
+    num_regions: int
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """E_js = sum of A_ij over the pixels i of region s, sparse, by Gaussian; unlabelled pixels kept apart by view.
+
+    Columns s number the regions of all views one after the other, like the rows of the feature table. Within a row
+    they ascend, so the
+    order is the same on every run. Raises ValueError on construction if the arrays do not fit each other.
+    """
+
+    offsets: Int64[Tensor, " n_plus_1"]
+    """Row j holds the entries offsets[j]:offsets[j + 1]."""
+    region: Int32[Tensor, " nnz"]
+    """Column s of every entry."""
+    weight: Float[Tensor, " nnz"]
+    """E_js > 0 of every entry (sum of A_ij ** weight_power)."""
+    region_view: Int32[Tensor, " s"]
+    """View of every column, non-decreasing."""
+    unlabeled: SparseRows
+    """[N, views]: weight of Gaussian j in the unlabelled pixels of view v."""
+    num_views: int
+    """Number of views, those without any region included."""
+    weight_power: int = 1
+    """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code)."""
+    num_excluded: int = 0
+    """Gaussians that were not drawn because a parameter was not finite."""
+
+    def __post_init__(self) -> None:
+        if (
+            self.offsets.numel() < 1
+            or int(self.offsets[-1]) != self.region.numel()
+            or self.region.numel() != self.weight.numel()
+        ):
+            raise ValueError(
+                f"Evidence arrays disagree: offsets end at {self.offsets[-1:].tolist()}, {self.region.numel()} "
+                f"regions, {self.weight.numel()} weights"
+            )
+        if len(self.unlabeled) != self.num_gaussians:
+            raise ValueError(
+                f"Evidence.unlabeled has {len(self.unlabeled)} rows, expected one per Gaussian: {self.num_gaussians}"
+            )
+        if self.region.numel() > 0 and not (int(self.region.min()) >= 0 and int(self.region.max()) < self.num_regions):
+            raise ValueError(
+                f"Evidence.region must be in 0..{self.num_regions - 1}, found "
+                f"{int(self.region.min())}..{int(self.region.max())}"
+            )
+        if self.num_regions > 0 and (
+            bool((self.region_view.diff() < 0).any())
+            or not 0 <= int(self.region_view[0]) <= int(self.region_view[-1]) < self.num_views
+        ):
+            raise ValueError(f"Evidence.region_view must be non-decreasing in 0..{self.num_views - 1}")
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.offsets.numel() - 1
+
+    @property
+    def num_regions(self) -> int:
+        return self.region_view.numel()
+
+    @property
+    def nnz(self) -> int:
+        return self.weight.numel()
+
+    @property
+    def rows(self) -> SparseRows:
+        """E as a sparse [N, S] matrix, without a copy."""
+        return SparseRows(self.offsets, self.region, self.weight)
+
+    @staticmethod
+    def from_views(
+        views: Sequence[ViewEvidence], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
+    ) -> Evidence:
+        """Joins the entries of all views, in their order."""
+        counts = torch.tensor([0, *(view.num_regions for view in views)])
+        first_column = counts.cumsum(0).tolist()
+        device = views[0].weight.device if views else torch.device("cpu")
+        labeled = [view.region >= 0 for view in views]
+
+        def join(keep: Sequence[Tensor], columns: Sequence[Tensor]) -> SparseRows:
+            if not views:
+                empty = torch.zeros(0)
+                return SparseRows(torch.zeros(num_gaussians + 1, dtype=torch.int64), empty.int(), empty)
+            gaussian = torch.cat([view.gaussian[k].int() for view, k in zip(views, keep)])
+            weight = torch.cat([view.weight[k] for view, k in zip(views, keep)])
+            return SparseRows.from_coo(gaussian, torch.cat(list(columns)), weight, num_gaussians)
+
+        rows = join(labeled, [view.region[k].int() + first for view, k, first in zip(views, labeled, first_column)])
+        blank = [~k for k in labeled]
+        unlabeled = join(
+            blank,
+            [torch.full_like(view.gaussian[k], v, dtype=torch.int32) for v, (view, k) in enumerate(zip(views, blank))],
+        )
+        region_view = torch.repeat_interleave(torch.arange(len(views)), counts[1:]).int().to(device)
+        return Evidence(
+            rows.offsets, rows.column, rows.weight, region_view, unlabeled, len(views), weight_power, num_excluded
+        )
+
+    @cached_property
+    def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
+        """Entry offsets of the (Gaussian, view) groups: entries of a row that share a view stand next to each other."""
+        view = self.region_view[self.region.long()]
+        starts = torch.ones(self.nnz, dtype=torch.bool, device=view.device)
+        if self.nnz > 0:
+            starts[1:] = view[1:] != view[:-1]
+            starts[self.offsets[:-1][self.offsets.diff() > 0]] = True
+        return torch.cat([starts.nonzero().squeeze(1), self.offsets[-1:]])
+
+    def view_weights(self) -> SparseRows:
+        """W_jv: weight of Gaussian j in the labelled pixels of view v, [N, views], one entry per pair "
+        "with evidence, float64."""
+        groups = self.view_group_offsets
+        view = self.region_view[self.region[groups[:-1]].long()]
+        return SparseRows(torch.searchsorted(groups, self.offsets), view, segment_sum(self.weight, groups))
+
+    def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
+        """Columns of the given views, in their order: features[evidence.columns_of(v)] is the table of "
+        "evidence.select_views(v)."""
+        bounds = torch.searchsorted(
+            self.region_view, torch.arange(self.num_views + 1, dtype=torch.int32, device=self.region_view.device)
+        ).tolist()
+        parts = [torch.arange(bounds[v], bounds[v + 1]) for v in self._checked_views(views)]
+        return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
+
+    def _checked_views(self, views: Sequence[int] | Tensor) -> list[int]:
+        chosen = views.tolist() if isinstance(views, Tensor) else list(views)
+        if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
+            raise ValueError(f"views must be distinct and in 0..{self.num_views - 1}, got {chosen}")
+        return chosen
+
+    def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
+        """The evidence of some views only, renumbered in the given order.
+
+        Raises:
+            ValueError: a view that does not exist or is named twice.
+        """
+        columns = self.columns_of(views)
+        chosen = torch.tensor(self._checked_views(views), dtype=torch.int64, device=columns.device)
+        rows = _select_columns(self.rows, columns, self.num_regions)
+        unlabeled = _select_columns(self.unlabeled, chosen, self.num_views)
+        new_view = torch.full((self.num_views,), -1, dtype=torch.int32, device=columns.device)
+        new_view[chosen] = torch.arange(chosen.numel(), dtype=torch.int32, device=columns.device)
+        region_view = new_view[self.region_view[columns].long()]
+        return self._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
+
+    def _with(self, rows: SparseRows, **changes: Any) -> Evidence:
+        return replace(self, offsets=rows.offsets, region=rows.column, weight=rows.weight, **changes)
+
+    @staticmethod
+    def merge(*parts: Evidence) -> Evidence:
+        """Appends views and columns in argument order; feature tables concatenate likewise.
+
+        Raises:
+            ValueError: no part, or parts of different scenes or weight powers.
+        """
+        if not parts:
+            raise ValueError("Evidence.merge needs at least one part")
+        for name in ("num_gaussians", "weight_power", "num_excluded"):
+            values = [getattr(part, name) for part in parts]
+            if len(set(values)) > 1:
+                raise ValueError(f"Evidence.merge: parts must agree in {name}, found {values}")
+        views = torch.tensor([0, *(part.num_views for part in parts)]).cumsum(0).tolist()
+        regions = torch.tensor([0, *(part.num_regions for part in parts)]).cumsum(0).tolist()
+        rows = _append_columns([part.rows for part in parts], regions)
+        unlabeled = _append_columns([part.unlabeled for part in parts], views)
+        region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
+        return parts[0]._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
+
+    def prune(self, *, relative: float) -> tuple[Evidence, Float64[Tensor, " n"]]:
+        """Drops entries below `relative` times the largest entry of their Gaussian, and says what that can cost.
+
+        With d_j the dropped share of W_j, f_j moves by at most 2 d_j for any table of unit features (f' - f = d_j f'
+        - dropped / W_j), so
+        ||f_j|| by at most as much and the direction by at most 4 d_j / (||f_j|| + ||f'_j||). Unlabelled weight stays.
+
+        Args:
+            relative: in 0..1; the largest entry of a Gaussian always stays.
+        Returns:
+            The smaller evidence, and per Gaussian the bound 2 d_j on |f_j - f'_j|.
+        Raises:
+            ValueError: `relative` outside 0..1.
+        """
+        if not 0 <= relative <= 1:
+            raise ValueError(f"relative must be in 0..1, got {relative}")
+        row = self.rows.row_index()
+        largest = self.weight.new_zeros(self.num_gaussians).scatter_reduce_(
+            0, row, self.weight, "amax", include_self=False
+        )
+        keep = self.weight >= relative * largest[row]
+        total = self.rows.row_sums()
+        dropped = segment_sum(torch.where(keep, 0.0, self.weight.double()), self.offsets)
+        bound = torch.where(total > 0, 2 * dropped / total, 0.0)
+        row = row[keep]
+        kept = SparseRows(row_offsets(row, self.num_gaussians), self.region[keep], self.weight[keep])
+        return self._with(kept), bound
+
+    def to(self, device: torch.device | str) -> Evidence:
+        """A copy on another device."""
+        return self._with(
+            self.rows.to(device), region_view=self.region_view.to(device), unlabeled=self.unlabeled.to(device)
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Writes a safetensors file, complete or not at all."""
+        tensors = {
+            name: getattr(self, name).contiguous().cpu() for name in ("offsets", "region", "weight", "region_view")
+        }
+        tensors |= {
+            f"unlabeled_{name}": getattr(self.unlabeled, name).contiguous().cpu()
+            for name in ("offsets", "column", "weight")
+        }
+        metadata = {name: str(getattr(self, name)) for name in ("num_views", "weight_power", "num_excluded")}
+        with atomic_path(Path(path)) as temporary:
+            save_file(tensors, temporary, metadata={"format": _FORMAT, **metadata})
+
+    @staticmethod
+    def load(path: str | Path) -> Evidence:
+        """Reads what `save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: not an evidence file, or a damaged one.
+        """
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                if metadata.get("format") != _FORMAT:
+                    raise ValueError(
+                        f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "
+                        f"{_FORMAT!r}"
+                    )
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (safe_open is no mapping)
+        except SafetensorError as error:
+            raise ValueError(f"{path} is damaged or no safetensors file ({error}); rasterize again") from error
+        unlabeled = SparseRows(*(tensors.pop(f"unlabeled_{name}") for name in ("offsets", "column", "weight")))
+        num_views, weight_power, num_excluded = (
+            int(metadata[name]) for name in ("num_views", "weight_power", "num_excluded")
+        )
+        return Evidence(
+            **tensors, unlabeled=unlabeled, num_views=num_views, weight_power=weight_power, num_excluded=num_excluded
+        )
+
+
+def _select_columns(rows: SparseRows, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:
+    """Keeps the given columns and renumbers them in the given order."""
+    new = torch.full((num_columns,), -1, dtype=torch.int64, device=columns.device)
+    new[columns] = torch.arange(columns.numel(), device=columns.device)
+    column = new[rows.column.long()]
+    keep = column >= 0
+    return SparseRows.from_coo(rows.row_index()[keep], column[keep], rows.weight[keep], len(rows))
+
+
+def _append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
+    row = torch.cat([part.row_index() for part in parts])
+    column = torch.cat([part.column + first for part, first in zip(parts, first_column)])
+    return SparseRows.from_coo(row, column, torch.cat([part.weight for part in parts]), len(parts[0]))

@@ -1,0 +1,355 @@
+"""`SemanticField`: what a lift leaves on disk, in the smallest form that meets the asked "
+"tolerance, and how it answers text."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Bool, Float, Float16, Int, Int32
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.files import atomic_path
+from normlift_ns.core.lift import Lifted
+from normlift_ns.core.lowrank import half_precision_error, smallest_basis
+from normlift_ns.core.query import RelevancyForm, relevancy
+
+Form = Literal["evidence", "float16", "low_rank"]
+SCHEMA_VERSION = 1
+_QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """The numbers of every Gaussian, [N] each; see `Lifted` for their meaning."""
+
+    norm: Float[Tensor, " n"]
+    c_intra: Float[Tensor, " n"]
+    c_inter: Float[Tensor, " n"]
+    n_eff: Float[Tensor, " n"]
+    reliability: Float[Tensor, " n"]
+    weight: Float[Tensor, " n"]
+    view_count: Int32[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class EvidenceForm:
+    """E and F themselves: exact, and ready for another encoder."""
+
+    evidence: Evidence
+    features: Float[Tensor, "s d"]
+
+    def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
+        table = (self.features.double() @ vectors.double().T).to(torch.float64)
+        length = scalars.weight.double() * scalars.norm.double()
+        sums = self.evidence.rows.matmul(table)
+        return torch.where((length > 0)[:, None], sums / length[:, None], 0.0).clamp(-1, 1).float()
+
+    def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
+        sums = self.evidence.rows.select_rows(gaussians).sums_of_unit_rows(self.features)
+        found = (scalars.norm[gaussians] > 0)[:, None]
+        return torch.where(found, sums / torch.linalg.vector_norm(sums, dim=1, keepdim=True), 0.0).float()
+
+
+@dataclass(frozen=True)
+class DirectionForm:
+    """Directions in float16, of the M Gaussians with evidence only, as they are or as coordinates in a basis."""
+
+    coordinates: Float16[Tensor, "m r"]
+    basis: Float[Tensor, "r d"] | None
+
+    def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
+        projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
+        out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
+        out[scalars.norm > 0] = torch.cat([block.float() @ projected.T for block in self.coordinates.split(2**16)])
+        return out
+
+    def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
+        found = scalars.norm > 0
+        row = (found.cumsum(0) - 1)[gaussians].clamp(min=0)
+        rows = self.coordinates[row].float() if self.basis is None else self.coordinates[row].float() @ self.basis
+        return torch.where(found[gaussians][:, None], torch.nn.functional.normalize(rows, dim=1), 0.0)
+
+
+@dataclass(frozen=True)
+class SemanticField:
+    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three forms."""
+
+    scalars: Scalars
+    source: Int32[Tensor, " n"]
+    """The refined direction of Gaussian i is that of source[i]; source[i] = i where nothing was refined."""
+    store: EvidenceForm | DirectionForm
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+    """What is known of the field: form, sizes and bounds of all three forms, fingerprint of the "
+    "means, provenance. JSON types only."""
+
+    def __len__(self) -> int:
+        return self.source.numel()
+
+    @property
+    def dimension(self) -> int:
+        """D, length of the feature vectors."""
+        return int(self.manifest["dimension"])
+
+    @staticmethod
+    def build(
+        lifted: Lifted,
+        means: Float[Tensor, "n 3"],
+        source: Int[Tensor, " n"] | None = None,
+        *,
+        tolerance: float = 1e-3,
+        form: Form | Literal["auto"] = "auto",
+        provenance: Mapping[str, Any] | None = None,
+    ) -> SemanticField:
+        """Chooses the form and reports the size in bytes and the error bound of all three.
+
+        Args:
+            source: result of `refine`; none: unrefined.
+            tolerance: largest error of any cosine of any Gaussian to any unit vector, > 0.
+            form: "auto" takes the smallest form whose bound is within the tolerance.
+            provenance: JSON-ready facts for the manifest: source config and step, encoder, regions, hyper-parameters.
+        Raises:
+            ValueError: `means` or `source` of another length, a tolerance <= 0, an unknown form, or "low_rank" where
+                no rank meets the tolerance.
+        """
+        n, dimension = lifted.norm.numel(), lifted.features.shape[1]
+        if len(means) != n or (source is not None and len(source) != n):
+            raise ValueError(
+                f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
+                f"{None if source is None else len(source)}"
+            )
+        if not tolerance > 0:
+            raise ValueError(f"tolerance must be positive, got {tolerance}")
+        if form not in (*get_args(Form), "auto"):
+            raise ValueError(f"form must be auto, {', '.join(get_args(Form))}; got {form!r}")
+        basis = smallest_basis(lifted, tolerance)
+        with_evidence = int((lifted.norm > 0).sum())
+        evidence = lifted.evidence
+        forms: dict[str, dict[str, Any]] = {
+            "evidence": {"bytes": evidence_bytes(evidence) + 4 * lifted.features.numel(), "bound": 0.0},
+            "float16": {"bytes": 2 * with_evidence * dimension, "bound": half_precision_error(dimension)},
+        }
+        if basis is not None:
+            rank = len(basis.rows)
+            bound = basis.bound[lifted.norm > 0] + half_precision_error(rank)
+            quantiles = (
+                {
+                    str(q): float(bound.quantile(q))
+                    if bound.numel() < 2**24
+                    else float(bound.kthvalue(max(1, round(q * bound.numel()))).values)
+                    for q in _QUANTILES
+                }
+                if bound.numel()
+                else {}
+            )
+            forms["low_rank"] = {
+                "bytes": 2 * with_evidence * rank + 4 * rank * dimension,
+                "bound": quantiles.get("1.0", 0.0),
+                "rank": rank,
+                "bound_quantiles": quantiles,
+            }
+        if form == "auto":
+            form = min(
+                (name for name, facts in forms.items() if facts["bound"] <= tolerance),
+                key=lambda name: forms[name]["bytes"],
+            )  # type: ignore[assignment]
+        if form not in forms:
+            raise ValueError(
+                f"no basis keeps every Gaussian within tolerance {tolerance}; raise it, or take form float16 or "
+                "evidence"
+            )
+        store = (
+            EvidenceForm(evidence, lifted.features.float())
+            if form == "evidence"
+            else _directions(lifted, basis.rows if form == "low_rank" and basis else None)
+        )
+        manifest = {
+            "schema_version": SCHEMA_VERSION,
+            "num_gaussians": n,
+            "dimension": dimension,
+            "means_fingerprint": fingerprint(means),
+            "form": form,
+            "tolerance": tolerance,
+            "forms": forms,
+            **(provenance or {}),
+        }
+        scalars = Scalars(**{f.name: _single(getattr(lifted, f.name)) for f in fields(Scalars)})
+        identity = torch.arange(n, dtype=torch.int32, device=lifted.norm.device)
+        return SemanticField(scalars, identity if source is None else source.int(), store, manifest)
+
+    def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
+        """True where a Gaussian has a direction: evidence of its own or, refined, that of the neighbour it copies."""
+        found = self.scalars.norm > 0
+        return found[self.source.long()] if refined else found
+
+    def query(self, text_vectors: Float[Tensor, "q d"], *, refined: bool = True) -> Float[Tensor, "n q"]:
+        """Cosine of every Gaussian's direction to Q vectors of any length > 0; 0 where `valid` is False.
+
+        Raises:
+            ValueError: vectors of another dimension, zero or not finite.
+        """
+        if text_vectors.ndim != 2 or text_vectors.shape[1] != self.dimension:
+            raise ValueError(
+                f"text vectors must be [Q, {self.dimension}] like the field's features, got "
+                f"{tuple(text_vectors.shape)}; use the encoder that made them"
+            )
+        vectors = text_vectors.to(self.scalars.norm.device, torch.float64)
+        length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
+        if not bool((length.isfinite() & (length > 0)).all()):
+            raise ValueError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
+        cosine = self.store.products(vectors / length, self.scalars)
+        return cosine[self.source.long()] if refined else cosine
+
+    def relevancy(
+        self,
+        text_vectors: Float[Tensor, "q d"],
+        negatives: Float[Tensor, "b d"] | None = None,
+        *,
+        form: RelevancyForm = "cosine",
+        refined: bool = True,
+    ) -> Float[Tensor, "n q"]:
+        """`query` followed by `relevancy` of module query; a Gaussian without a direction gets 0 (form "
+        ""margin": -2), never a find."""
+        count = len(text_vectors)
+        cosine = self.query(
+            text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined
+        )
+        values = relevancy(cosine[:, :count], cosine[:, count:], form=form)
+        return torch.where(self.valid(refined=refined)[:, None], values, -2.0 if form == "margin" else 0.0)
+
+    def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
+        """Unit directions of all or some Gaussians, 0 where `valid` is False."""
+        rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
+        rows = self.source.long()[rows] if refined else rows
+        return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
+        """Writes field.safetensors, evidence.safetensors (form "evidence") and, last, manifest.json.
+
+        A folder with a manifest is complete.
+
+        Raises:
+            FileExistsError: the folder holds a field and `overwrite` is False.
+        """
+        folder = Path(folder)
+        if (folder / "manifest.json").exists() and not overwrite:
+            raise FileExistsError(
+                f"{folder} already holds a semantic field; choose another folder or allow overwriting"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "manifest.json").unlink(missing_ok=True)
+        tensors = dict(_tensors(self))
+        if isinstance(self.store, EvidenceForm):
+            self.store.evidence.save(folder / "evidence.safetensors")
+        else:
+            (folder / "evidence.safetensors").unlink(missing_ok=True)
+        with atomic_path(folder / "field.safetensors") as temporary:
+            save_file({name: tensor.contiguous().cpu() for name, tensor in tensors.items()}, temporary)
+        with atomic_path(folder / "manifest.json") as temporary:
+            temporary.write_text(json.dumps(dict(self.manifest), indent=2) + "\n")
+
+    @staticmethod
+    def load(
+        folder: str | Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
+    ) -> SemanticField:
+        """Reads what `save` wrote; with `means`, only if the field belongs to them.
+
+        Args:
+            checkpoint: where the means come from, for the message.
+        Raises:
+            FileNotFoundError: no complete field in the folder.
+            ValueError: another schema, a damaged file, or a field of other Gaussians.
+        """
+        folder = Path(folder)
+        if not (folder / "manifest.json").exists():
+            raise FileNotFoundError(
+                f"{folder} holds no complete semantic field (manifest.json is missing); lift again with: "
+                "ns-normlift --load-config ..."
+            )
+        try:
+            manifest = json.loads((folder / "manifest.json").read_text())
+            if manifest.get("schema_version") != SCHEMA_VERSION:
+                raise ValueError(
+                    f"{folder}: schema version {manifest.get('schema_version')!r}, this program reads "
+                    f"{SCHEMA_VERSION}; lift again"
+                )
+            if means is not None:
+                _check_belongs(manifest, means, folder, checkpoint)
+            tensors = load_file(folder / "field.safetensors")
+            scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
+            if manifest["form"] == "evidence":
+                store = EvidenceForm(Evidence.load(folder / "evidence.safetensors"), tensors["features"])
+            else:
+                store = DirectionForm(tensors["coordinates"], tensors.get("basis"))
+            return SemanticField(scalars, tensors["source"], store, manifest)
+        except (SafetensorError, json.JSONDecodeError, KeyError) as error:
+            raise ValueError(
+                f"the semantic field in {folder} is damaged ({type(error).__name__}: {error}); lift again with: "
+                "ns-normlift --load-config ..."
+            ) from error
+
+
+def fingerprint(means: Float[Tensor, "n 3"]) -> str:
+    """BLAKE2 of the float32 bytes of the means: tells two sets of Gaussians apart."""
+    return hashlib.blake2b(means.detach().float().contiguous().cpu().numpy().tobytes(), digest_size=16).hexdigest()
+
+
+def evidence_bytes(evidence: Evidence) -> int:
+    """Bytes of the evidence's arrays."""
+    blank = evidence.unlabeled
+    arrays = (
+        evidence.offsets,
+        evidence.region,
+        evidence.weight,
+        evidence.region_view,
+        blank.offsets,
+        blank.column,
+        blank.weight,
+    )
+    return sum(a.numel() * a.element_size() for a in arrays)
+
+
+def _directions(lifted: Lifted, basis: Tensor | None) -> DirectionForm:
+    blocks = []
+    for first, block in lifted.iter_directions():
+        rows = block[lifted.norm[first : first + len(block)] > 0]
+        blocks.append((rows if basis is None else torch.nn.functional.normalize(rows.double() @ basis.T, dim=1)).half())
+    return DirectionForm(torch.cat(blocks), None if basis is None else basis.float())
+
+
+def _single(values: Tensor) -> Tensor:
+    return values.float() if values.dtype == torch.float64 else values
+
+
+def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
+    yield "source", semantic_field.source
+    for f in fields(Scalars):
+        yield f.name, getattr(semantic_field.scalars, f.name)
+    store = semantic_field.store
+    if isinstance(store, EvidenceForm):
+        yield "features", store.features
+    else:
+        yield "coordinates", store.coordinates
+        if store.basis is not None:
+            yield "basis", store.basis
+
+
+def _check_belongs(manifest: Mapping[str, Any], means: Tensor, folder: Path, checkpoint: str | Path) -> None:
+    if manifest["num_gaussians"] != len(means):
+        raise ValueError(
+            f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "
+            f"{len(means)}; lift again with: ns-normlift --load-config ..."
+        )
+    if manifest["means_fingerprint"] != fingerprint(means):
+        raise ValueError(
+            f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
+            "number, other means); lift again with: ns-normlift --load-config ..."
+        )

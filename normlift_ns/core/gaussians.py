@@ -1,0 +1,106 @@
+"""The two inputs of every lift: a trained Gaussian scene and the cameras that looked at it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class GaussianScene:
+    """N Gaussians with activated parameters, as the rasterizer sees them.
+
+    A Gaussian with a NaN, an infinity or a zero quaternion stays in the scene, so that rows keep their meaning, but
+    is never drawn:
+    see `drawable`.
+
+    Raises:
+        ValueError: wrong shapes, no floating point, mixed devices, a negative scale or an opacity outside 0..1 in a
+            finite row.
+    """
+
+    means: Float[Tensor, "n 3"]
+    """Centres in world units."""
+    quats: Float[Tensor, "n 4"]
+    """Rotations as (w, x, y, z); any non-zero length."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the three axes in world units, linear (not the logarithm), >= 0."""
+    opacities: Float[Tensor, " n"]
+    """Opacities in 0..1 (not logits)."""
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.ndim > 0 else 0
+        for name, shape in (("means", (n, 3)), ("quats", (n, 4)), ("scales", (n, 3)), ("opacities", (n,))):
+            value: Tensor = getattr(self, name)
+            if tuple(value.shape) != shape:
+                raise ValueError(f"GaussianScene.{name} has shape {tuple(value.shape)}, expected {shape}")
+            if not value.dtype.is_floating_point or value.device != self.means.device:
+                raise ValueError(
+                    f"GaussianScene.{name} is {value.dtype} on {value.device}, expected a floating-point tensor on "
+                    f"{self.means.device}"
+                )
+        if bool((self.scales < 0).any()):
+            raise ValueError(
+                "GaussianScene.scales has negative values; pass linear scales: exp() of a splatfacto "
+                "checkpoint's `scales`"
+            )
+        if bool(((self.opacities < 0) | (self.opacities > 1)).any()):
+            raise ValueError(
+                "GaussianScene.opacities leaves 0..1; pass activated opacities: sigmoid() of a splatfacto "
+                "checkpoint's `opacities`"
+            )
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @cached_property
+    def drawable(self) -> Bool[Tensor, " n"]:
+        """True where all parameters are finite and the quaternion is not zero."""
+        finite = torch.cat([self.means, self.quats, self.scales, self.opacities[:, None]], dim=1).isfinite().all(dim=1)
+        return finite & (self.quats != 0).any(dim=1)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in the OpenCV convention: x right, y down, z forward; pixel centres at half integers.
+
+    Raises:
+        ValueError: wrong shapes, non-finite or skewed intrinsics, a pose that is not rigid, a size below one pixel.
+    """
+
+    K: Float[Tensor, "3 3"]
+    """[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels."""
+    world_to_camera: Float[Tensor, "4 4"]
+    """Rigid transform p_camera = world_to_camera @ p_world."""
+    width: int
+    """Image width in pixels."""
+    height: int
+    """Image height in pixels."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("K", (3, 3)), ("world_to_camera", (4, 4))):
+            value: Tensor = getattr(self, name)
+            if tuple(value.shape) != shape or not value.dtype.is_floating_point or not bool(value.isfinite().all()):
+                raise ValueError(
+                    f"Camera.{name} must be a finite floating-point tensor of shape {shape}, got {value.dtype} "
+                    f"{tuple(value.shape)}: {value}"
+                )
+        (fx, skew, _), (zero, fy, _), last = self.K.tolist()
+        if fx <= 0 or fy <= 0 or skew != 0 or zero != 0 or last != [0, 0, 1]:
+            raise ValueError(
+                f"Camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, got {self.K.tolist()}"
+            )
+        pose = self.world_to_camera.double()
+        rotation = pose[:3, :3]
+        gap = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=pose.device)).abs().max().item()
+        if gap > 1e-3 or torch.linalg.det(rotation).item() < 0 or pose[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError(
+                "Camera.world_to_camera must be a rotation and a translation (no scale, no mirror), got "
+                f"{self.world_to_camera.tolist()}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"Camera size must be at least 1x1 pixel, got width {self.width}, height {self.height}")

@@ -1,0 +1,165 @@
+"""The lift: directions and reliability of every Gaussian, from evidence and one table of unit features.
+
+For Gaussian j, with E_js the evidence and F_s the unit feature of region s (equation numbers of the NormLift paper)::
+
+    f_j     = sum_s E_js F_s / W_j,   W_j = sum_s E_js        eq. 3, back-projection
+    u_j     = f_j / ||f_j||                                   eq. 5, optimum of the cosine alignment problem, eq. 4
+    S_jv    = sum_{s in v} E_js F_s,  W_jv = sum_{s in v} E_js
+    C_intra = sum_v ||S_jv|| / W_j                            eq. 7
+    C_inter = ||sum_v S_jv|| / sum_v ||S_jv||                 eq. 7, so that ||f_j|| = C_intra C_inter
+    N_eff   = W_j ** 2 / sum_v W_jv ** 2
+    R_j     = ||f_j|| N_eff / (N_eff + beta)                  eq. 8
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int, Int32
+from torch import Tensor
+
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.sparse import SparseRows, segment_sum
+
+Unlabeled = Literal["ignore", "dilute"]
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """What a lift knows of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all is 0 but "
+    "`view_count` and `weight`."""
+
+    norm: Float[Tensor, " n"]
+    """||f_j||, in 0..1."""
+    c_intra: Float[Tensor, " n"]
+    """Agreement within views, in 0..1."""
+    c_inter: Float[Tensor, " n"]
+    """Agreement between views, in 0..1."""
+    n_eff: Float[Tensor, " n"]
+    """Effective number of views, in 1..view_count (0 without evidence)."""
+    reliability: Float[Tensor, " n"]
+    """R_j, in 0..1."""
+    view_count: Int32[Tensor, " n"]
+    """Number of views in which the Gaussian has weight."""
+    weight: Float[Tensor, " n"]
+    """W_j, the denominator of f_j."""
+    evidence: Evidence
+    features: Float[Tensor, "s d"]
+    """The feature table, normalised, in the precision of the lift."""
+
+    def directions(self, gaussians: Int[Tensor, " m"] | None = None) -> Float[Tensor, "m d"]:
+        """u_j of all or of some Gaussians, unit rows, 0 without evidence. Any subset gives the same "
+        "rows as the whole."""
+        rows = self.evidence.rows if gaussians is None else self.evidence.rows.select_rows(gaussians)
+        norm = self.norm if gaussians is None else self.norm[gaussians]
+        return torch.cat(
+            [
+                _normalized(block, norm[first : first + len(block)], self.features)
+                for first, block in rows.chunks(self.features.shape[1])
+            ]
+        )
+
+    def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
+        """u_j in blocks of consecutive Gaussians, (first Gaussian, block), with bounded memory."""
+        for first, block in self.evidence.rows.chunks(self.features.shape[1]):
+            yield first, _normalized(block, self.norm[first : first + len(block)], self.features)
+
+
+def lift(
+    evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: Unlabeled = "ignore"
+) -> Lifted:
+    """Directions u_j and reliability R_j of all Gaussians (eq. 3 to 8 of the paper; formulas at the top of this file).
+
+    Args:
+        evidence: E, from `rasterize_evidence`.
+        features: one unit row per column of the evidence; half-precision rows are normalised again.
+        beta: prior strength of the shrinkage of R, in virtual views, >= 0.
+        unlabeled: "ignore": unlabelled pixels do not exist. "dilute": they count as observations of the zero vector,
+            in W_jv everywhere.
+    Returns:
+        `Lifted`, in float64 if the evidence or the features are, else in float32.
+    Raises:
+        ValueError: a table of another length; zero, non-finite or non-unit rows; beta < 0; an unknown `unlabeled`.
+    """
+    if unlabeled not in ("ignore", "dilute"):
+        raise ValueError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
+    if not beta >= 0:
+        raise ValueError(f"beta must be >= 0, got {beta}")
+    table = _unit_table(evidence, features)
+    view_weights = evidence.view_weights()
+    if unlabeled == "dilute":
+        view_weights = SparseRows.add(view_weights, evidence.unlabeled)
+    weight = view_weights.row_sums()
+    weight_squared = segment_sum(view_weights.weight.double() ** 2, view_weights.offsets)
+
+    total = _row_norms(evidence.rows, table)  # ||sum_v S_jv||
+    by_view = _sum_of_view_norms(evidence, table)  # sum_v ||S_jv||
+
+    found = (weight > 0) & (total > (1e-12 if table.dtype == torch.float64 else 1e-6) * weight)
+    norm = _ratio(total, weight, found).clamp(max=1)
+    n_eff = _ratio(weight**2, weight_squared, found)
+    values = {
+        "norm": norm,
+        "c_intra": _ratio(by_view, weight, found).clamp(max=1),
+        "c_inter": _ratio(total, by_view, found).clamp(max=1),
+        "n_eff": n_eff,
+        "reliability": _ratio(norm * n_eff, n_eff + beta, found),
+        "weight": weight,
+    }
+    view_count = segment_sum((view_weights.weight > 0).float(), view_weights.offsets)
+    return Lifted(
+        **{name: value.to(table.dtype) for name, value in values.items()},
+        view_count=view_count.int(),
+        evidence=evidence,
+        features=table,
+    )
+
+
+def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
+    if features.ndim != 2 or features.shape[0] != evidence.num_regions or not features.dtype.is_floating_point:
+        raise ValueError(
+            f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
+            f"{features.dtype} {tuple(features.shape)}"
+        )
+    exact = features.to(evidence.weight.device, torch.float64)
+    length = torch.linalg.vector_norm(exact, dim=1)
+    bad = (~((length - 1).abs() < 1e-2)).nonzero().squeeze(1)
+    if bad.numel() > 0:
+        shown = ", ".join(f"row {i} has length {length[i]:.3g}" for i in bad[:3].tolist())
+        raise ValueError(
+            f"{bad.numel()} of {len(features)} feature rows are not unit vectors ({shown}); normalise them, "
+            "and label regions without a feature -1"
+        )
+    double = torch.float64 in (evidence.weight.dtype, features.dtype)
+    return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
+
+
+def _row_norms(rows: SparseRows, table: Tensor) -> Tensor:
+    norms = [
+        torch.linalg.vector_norm(block.sums_of_unit_rows(table), dim=1).double()
+        for _, block in rows.chunks(table.shape[1])
+    ]
+    return torch.cat([table.new_zeros(0, dtype=torch.float64), *norms])
+
+
+def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
+    """sum_v ||S_jv|| per Gaussian. A view that shows a Gaussian in one region only, the common "
+    "case, needs no vector: ||S_jv|| = E_js."""
+    groups = evidence.view_group_offsets
+    norms = segment_sum(evidence.weight, groups)
+    several = (groups.diff() > 1).nonzero().squeeze(1)
+    norms[several] = _row_norms(SparseRows(groups, evidence.region, evidence.weight).select_rows(several), table)
+    return segment_sum(norms, torch.searchsorted(groups, evidence.offsets))
+
+
+def _normalized(rows: SparseRows, norm: Tensor, table: Tensor) -> Tensor:
+    sums = rows.sums_of_unit_rows(table)
+    length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
+    return torch.where((norm > 0)[:, None], sums / length, 0.0)
+
+
+def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
+    return torch.where(where, numerator / denominator, 0.0)

@@ -1,0 +1,78 @@
+"""Directions in a low-rank basis of the scene's own feature table, with a bound on what that "
+"costs every Gaussian in any query."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from normlift_ns.core.lift import Lifted
+
+_ROUNDING = 1e-6
+"""Relative float32 rounding of the stored weights, norms and directions, added to x_j."""
+
+
+def half_precision_error(dimension: int) -> float:
+    """Bound on the length of the error of a unit vector rounded to float16: 2**-11 relative, and "
+    "2**-25 per component near zero."""
+    return 2.0**-11 + dimension**0.5 * 2.0**-25
+
+
+class Basis(NamedTuple):
+    """r orthonormal rows and the bound that they give each Gaussian."""
+
+    rows: Float64[Tensor, "r d"]
+    bound: Float64[Tensor, " n"]
+    """Largest |<u_j, t> - <u'_j, t>| over all unit t, with u' the projected and renormalised "
+    "direction; 0 without evidence."""
+
+
+class SpectralTable(NamedTuple):
+    """Eigenvectors of F^T F by falling eigenvalue, and the residual of every feature row for every rank."""
+
+    vectors: Float64[Tensor, "d d"]
+    residual: Float64[Tensor, "s ranks"]
+    """|F_s - F_s B B^T| of the first r eigenvectors, r = 0 ... D, in column r."""
+
+
+def spectral_table(features: Float[Tensor, "s d"]) -> SpectralTable:
+    """Eigenvectors of the feature table, in float64."""
+    exact = features.double()
+    vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
+    power = (exact @ vectors) ** 2
+    tail = power.flip(1).cumsum(1).flip(1)  # energy in directions r, r + 1, ...
+    return SpectralTable(vectors, torch.cat([tail, tail.new_zeros(len(tail), 1)], dim=1).sqrt())
+
+
+def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
+    """The first `rank` eigenvectors with their bound.
+
+    With r_s the residual of row s and x_j = sum_s E_js r_s / (W_j ||f_j||), the part of u_j outside the basis is at
+    most x_j long.
+    Projecting loses at most x_j; projecting and renormalising moves u_j by at most sqrt(2 - 2 sqrt(1 - x_j^2)) if x_j
+    <= 1, else by at most 2.
+    """
+    residual = table.residual[:, rank : rank + 1].contiguous()
+    lost = lifted.evidence.rows.matmul(residual).squeeze(1)
+    length = lifted.weight.double() * lifted.norm.double()
+    x = torch.where(length > 0, lost / length, 0.0) + _ROUNDING * (lifted.norm > 0)
+    bound = (2 - 2 * (1 - x.clamp(max=1) ** 2).sqrt()).clamp(min=0).sqrt()
+    return Basis(table.vectors[:, :rank].T.contiguous(), torch.where(x > 1, 2.0, bound))
+
+
+def smallest_basis(lifted: Lifted, tolerance: float) -> Basis | None:
+    """The basis of least rank that keeps every Gaussian's bound, float16 coordinates included, "
+    "within `tolerance`; None if none does."""
+    table = spectral_table(lifted.features)
+    low, high, best = 1, lifted.features.shape[1] + 1, None
+    while low < high:  # the bound falls with the rank
+        rank = (low + high) // 2
+        basis = basis_of_rank(lifted, table, rank)
+        if float(basis.bound.max()) + half_precision_error(rank) <= tolerance:
+            best, high = basis, rank
+        else:
+            low = rank + 1
+    return best

@@ -1,0 +1,94 @@
+"""Exact nearest neighbours of Gaussian centres, with one answer where distances tie."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int64
+from scipy.spatial import KDTree
+from torch import Tensor
+
+
+class Neighbors(NamedTuple):
+    """The K nearest other Gaussians of each Gaussian, nearest first, equal distances by index."""
+
+    index: Int64[Tensor, "n k"]  # pyright: ignore[reportIncompatibleMethodOverride]
+    """-1 where there are fewer than K others with finite means."""
+    distance: Float64[Tensor, "n k"]
+    """Euclidean, in the units of the means; inf where index is -1."""
+    spacing: Float64[Tensor, " n"]
+    """Distance to the nearest Gaussian that is not at the same place; inf if there is none."""
+
+
+def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
+    """The K nearest neighbours in 3D, N_K(i) of the paper, self excluded, exact: a k-d tree over the distinct places.
+
+    Any number of Gaussians may share a place; a tree over all of them would need all pairs to answer ties in a fixed
+    order.
+    A Gaussian whose mean is not finite has no neighbours and is nobody's neighbour.
+
+    Raises:
+        ValueError: k < 1.
+    """
+    if k < 1:
+        raise ValueError(f"k must be at least 1, got {k}")
+    n = means.shape[0]
+    points = means.detach().cpu().double().numpy()
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    index, distance, spacing = np.full((n, k), -1), np.full((n, k), np.inf), np.full(n, np.inf)
+    if finite.size > 1:
+        places, place_of = np.unique(points[finite], axis=0, return_inverse=True)
+        place_of = place_of.reshape(-1)
+        tree = KDTree(places)
+        which: Any = range(1, min(k + 2, len(places)) + 1)  # a sequence, so that one neighbour is still a column
+        reach, near = map(np.asarray, tree.query(places, k=which, workers=-1))
+        ranked, ranked_distance = _rank_gaussians(tree, place_of, near, reach, k + 1)
+        ranked, ranked_distance = ranked[place_of], ranked_distance[place_of]
+        # Leave out self; it is missing from the list only where k + 1 others share its place.
+        later = np.cumsum(ranked == np.arange(finite.size)[:, None], axis=1)[:, :k] > 0
+        chosen = np.where(later, ranked[:, 1:], ranked[:, :k])
+        index[finite] = np.where(chosen < 0, -1, finite[chosen])
+        distance[finite] = np.where(later, ranked_distance[:, 1:], ranked_distance[:, :k])
+        if len(places) > 1:
+            spacing[finite] = reach[place_of, 1]
+    return Neighbors(*(torch.from_numpy(x).to(means.device) for x in (index, distance, spacing)))
+
+
+def _rank_gaussians(
+    tree: KDTree, place_of: np.ndarray, near: np.ndarray, reach: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """For every place its `count` nearest Gaussians (-1 where there are fewer) and their distances, "
+    "sorted by (distance, index)."""
+    by_place = np.argsort(place_of, kind="stable")
+    population = np.bincount(place_of)
+    first = np.cumsum(population) - population
+    slot = np.arange(min(count, population.max()))
+    member = np.where(
+        slot < population[:, None], by_place[np.minimum(first[:, None] + slot, len(place_of) - 1)], -1
+    )  # [P, c]
+
+    def rank(near: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gaussian = member[near].reshape(len(near), -1)
+        distance = np.where(gaussian < 0, np.inf, np.repeat(reach, slot.size, axis=1))
+        unsorted = (
+            np.flatnonzero((np.diff(distance, axis=1) <= 0).any(axis=1)) if slot.size == 1 else np.arange(len(near))
+        )
+        order = np.lexsort((gaussian[unsorted], distance[unsorted]), axis=1)
+        gaussian[unsorted] = np.take_along_axis(gaussian[unsorted], order, 1)
+        distance[unsorted] = np.take_along_axis(distance[unsorted], order, 1)
+        short = max(0, count - gaussian.shape[1])
+        gaussian = np.pad(gaussian[:, :count], ((0, 0), (0, short)), constant_values=-1)
+        return gaussian, np.pad(distance[:, :count], ((0, 0), (0, short)), constant_values=np.inf)
+
+    step = max(1, 2**22 // (near.shape[1] * slot.size))
+    blocks = [rank(near[i : i + step], reach[i : i + step]) for i in range(0, len(near), step)]
+    ranked, distance = (np.concatenate(parts) for parts in zip(*blocks))
+    if near.shape[1] > count:  # places that tie across the end of the list: the tree kept any of them
+        for place in np.flatnonzero(reach[:, count - 1] == reach[:, count]):
+            around = np.array(tree.query_ball_point(tree.data[place], reach[place, count] * (1 + 1e-12)))
+            far = np.linalg.norm(tree.data[around] - tree.data[place], axis=1)
+            far = np.where(np.isclose(far, reach[place, count], rtol=1e-12, atol=0), reach[place, count], far)
+            ranked[place : place + 1], distance[place : place + 1] = rank(around[None], far[None])
+    return ranked, distance

@@ -1,0 +1,121 @@
+"""Reliability-guided mode voting: an unreliable Gaussian copies the direction that its reliable neighbours agree on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int32
+from torch import Tensor
+
+from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+
+_CHUNK_ELEMENTS = 2**24
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Parameters of the vote.
+
+    These values are ours: the paper publishes none, only that K, sigma_d, tau and Delta sit on plateaus.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    k: int = 36
+    """K, number of neighbours, >= 1."""
+    sigma_d: float = 3.0
+    """Width of the spatial decay, > 0, in units of the scene's median distance to the nearest "
+    "Gaussian at another place (scenes are rescaled)."""
+    tau: float = 0.8
+    """Cosine at which two directions half agree, in -1..1."""
+    gamma: float = 0.05
+    """Softness of that agreement, > 0."""
+    delta: float = 0.1
+    """Delta, margin by which the best neighbour must win, >= 0."""
+
+    def __post_init__(self) -> None:
+        for name, valid, expected in (
+            ("k", self.k >= 1, "at least 1"),
+            ("sigma_d", self.sigma_d > 0, "positive"),
+            ("tau", -1 <= self.tau <= 1, "in -1..1"),
+            ("gamma", self.gamma > 0, "positive"),
+            ("delta", self.delta >= 0, "not negative"),
+        ):
+            if not valid:
+                raise ValueError(f"RefineConfig.{name} must be {expected}, got {getattr(self, name)}")
+
+
+def refine(
+    means: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n d"],
+    reliability: Float[Tensor, " n"],
+    config: RefineConfig | None = None,
+    *,
+    neighbors: Neighbors | None = None,
+) -> Int32[Tensor, " n"]:
+    """Mode voting among neighbours (eq. 9 and 10 of the paper): the refined direction of i is directions[source[i]].
+
+    With N+ the K nearest neighbours of i and i itself::
+
+        S_ij = R_j sum_{k in N+} R_k d_ik g_jk
+        d_ik = exp(-|mu_i - mu_k|^2 / (2 sigma_d^2)),   g_jk = sigmoid((<u_k, u_j> - tau) / gamma)
+        source_i = argmax_{j in N+, j != i} S_ij   if that S_ij > S_ii + Delta,   else i
+
+    All votes read the unrefined directions. Ties go to the nearer neighbour. Where nobody in N+ is reliable nothing
+    changes; see `unsupported`.
+
+    Args:
+        directions: u, unit rows or 0; any floating-point type, read in float32 (float64 if given).
+        reliability: R in 0..1.
+        neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes.
+    Raises:
+        ValueError: shapes that disagree, neighbours of another K.
+    """
+    config = config or RefineConfig()
+    n = means.shape[0]
+    if directions.ndim != 2 or directions.shape[0] != n or tuple(reliability.shape) != (n,):
+        raise ValueError(
+            f"means, directions and reliability must have the same rows, got {n}, {tuple(directions.shape)}, "
+            f"{tuple(reliability.shape)}"
+        )
+    neighbors = neighbors or nearest_neighbors(means, config.k)
+    if tuple(neighbors.index.shape) != (n, config.k):
+        raise ValueError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
+    dtype = torch.promote_types(directions.dtype, torch.float32)
+    reliability = reliability.to(dtype)
+    source = torch.arange(n, dtype=torch.int32, device=means.device)
+    # Only a Gaussian with a reliable neighbour can win anything, and only if its best possible score clears the margin.
+    active = (_gather(reliability, neighbors.index) > 0).any(dim=1).nonzero().squeeze(1)
+    step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
+    for i in active.split(step):
+        group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
+        r = _gather(reliability, group)
+        d = spatial_decay(neighbors, config, i).to(dtype)
+        u = directions[group.clamp(min=0)].to(dtype)
+        g = torch.sigmoid((u @ u.transpose(1, 2) - config.tau) / config.gamma)
+        score = r * (g @ (r * d)[:, :, None]).squeeze(2)
+        best, choice = score[:, 1:].max(dim=1)
+        wins = best > score[:, 0] + config.delta
+        source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
+    return source
+
+
+def spatial_decay(neighbors: Neighbors, config: RefineConfig, rows: Tensor) -> Float[Tensor, "m k_plus_1"]:
+    """d_ik of the given Gaussians, self first; 0 where a neighbour is missing."""
+    finite = neighbors.spacing[neighbors.spacing.isfinite()]
+    unit = finite.median() if finite.numel() > 0 else neighbors.spacing.new_ones(())
+    distance = torch.cat([neighbors.distance.new_zeros(rows.numel(), 1), neighbors.distance[rows]], dim=1)
+    return torch.exp(-0.5 * (distance / (config.sigma_d * unit)) ** 2)
+
+
+def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """True where neither a Gaussian nor any neighbour has R > 0: the regions that voting cannot "
+    "repair (limitation 4 of the paper)."""
+    return (reliability <= 0) & (_gather(reliability, neighbors.index) <= 0).all(dim=1)
+
+
+def _gather(values: Tensor, index: Tensor) -> Tensor:
+    """values[index], 0 where the index is -1."""
+    return torch.where(index >= 0, values[index.clamp(min=0)], 0.0)

@@ -1,0 +1,148 @@
+"""Sparse rows: the one data structure under evidence, per-view weights and unlabelled weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64, Int, Int32, Int64
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+CANCELLED = 1e-3
+"""Below this share of its weight a vector sum is recomputed in float64: its float32 digits have cancelled."""
+_CHUNK_ELEMENTS = 2**24
+
+
+def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
+    """Sums of consecutive segments values[offsets[i]:offsets[i + 1]], in float64, 0 for empty ones.
+
+    Each segment is added up on its own, so that 1e-12 in one row survives 1e6 in another.
+
+    >>> segment_sum(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([0, 2, 2, 3])).tolist()
+    [3.0, 0.0, 4.0]
+    """
+    if values.numel() == 0:
+        return torch.zeros(offsets.numel() - 1, dtype=torch.float64, device=values.device)
+    return torch.segment_reduce(values.double(), "sum", offsets=offsets, initial=0.0)
+
+
+@dataclass(frozen=True)
+class SparseRows:
+    """A sparse matrix by rows (CSR): row i holds columns column[offsets[i]:offsets[i + 1]], "
+    "ascending, with their weights."""
+
+    offsets: Int64[Tensor, " rows_plus_1"]
+    column: Int32[Tensor, " nnz"]
+    weight: Float[Tensor, " nnz"]
+
+    @staticmethod
+    def from_coo(
+        row: Int[Tensor, " m"], column: Int[Tensor, " m"], weight: Float[Tensor, " m"], num_rows: int
+    ) -> SparseRows:
+        """Sorts entries given in any order; entries of the same place become one. See `sum_duplicates`."""
+        row, column, weight = sum_duplicates(row, column, weight)
+        return SparseRows(row_offsets(row, num_rows), column.int(), weight)
+
+    @staticmethod
+    def add(a: SparseRows, b: SparseRows) -> SparseRows:
+        """The sum of two matrices of the same shape, in float64."""
+        weight = torch.cat([a.weight.double(), b.weight.double()])
+        return SparseRows.from_coo(
+            torch.cat([a.row_index(), b.row_index()]), torch.cat([a.column, b.column]), weight, len(a)
+        )
+
+    def __len__(self) -> int:
+        return self.offsets.numel() - 1
+
+    def to(self, device: torch.device | str) -> SparseRows:
+        """A copy on another device."""
+        return SparseRows(self.offsets.to(device), self.column.to(device), self.weight.to(device))
+
+    def row_index(self) -> Int64[Tensor, " nnz"]:
+        """The row of every entry."""
+        return torch.repeat_interleave(torch.arange(len(self), device=self.offsets.device), self.offsets.diff())
+
+    def row_sums(self) -> Float64[Tensor, " rows"]:
+        """Sum of the weights of each row, in float64."""
+        return segment_sum(self.weight, self.offsets)
+
+    def select_rows(self, rows: Int[Tensor, " m"]) -> SparseRows:
+        """The given rows in the given order."""
+        start, length = self.offsets[:-1][rows], self.offsets.diff()[rows]
+        offsets = torch.cat([length.new_zeros(1), length.cumsum(0)])
+        entry = torch.arange(int(offsets[-1]), device=offsets.device) + torch.repeat_interleave(
+            start - offsets[:-1], length
+        )
+        return SparseRows(offsets, self.column[entry], self.weight[entry])
+
+    def matmul(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
+        """Dense product with a table, in the table's precision; all rows at once."""
+        if self.weight.numel() == 0:
+            return table.new_zeros(len(self), table.shape[1])
+        # An embedding bag is exactly this product: gather rows, scale, add. It is threaded on CPU, deterministic on
+        # GPU, and needs no MKL.
+        return embedding_bag(
+            self.column.long(),
+            table,
+            self.offsets,
+            mode="sum",
+            per_sample_weights=self.weight.to(table.dtype),
+            include_last_offset=True,
+        )
+
+    def chunks(self, row_size: int) -> Iterator[tuple[int, SparseRows]]:
+        """Consecutive blocks of rows, (first row, block), small enough that block rows x row_size stays "
+        "near 2**24 elements."""
+        step = max(1, _CHUNK_ELEMENTS // max(1, row_size))
+        for first in range(0, len(self), step):
+            offsets = self.offsets[first : first + step + 1]
+            low, high = int(offsets[0]), int(offsets[-1])
+            yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
+
+    def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
+        """`matmul` with a table of unit rows; sums that nearly cancel are recomputed in float64, so "
+        "that their direction is right."""
+        sums = self.matmul(table)
+        if table.dtype == torch.float64:
+            return sums
+        weak = (torch.linalg.vector_norm(sums, dim=1) < CANCELLED * self.row_sums()).nonzero().squeeze(1)
+        if weak.numel() > 0:
+            rows = self.select_rows(weak)
+            used, column = rows.column.unique(return_inverse=True)
+            exact = SparseRows(rows.offsets, column.int(), rows.weight).matmul(table[used.long()].double())
+            sums[weak] = exact.to(sums.dtype)
+        return sums
+
+
+def sum_duplicates(
+    row: Int[Tensor, " m"], column: Int[Tensor, " m"], weight: Float[Tensor, " m"]
+) -> tuple[Int[Tensor, " nnz"], Int[Tensor, " nnz"], Float[Tensor, " nnz"]]:
+    """Entries sorted by (row, column), those of the same place added up in float64: the same result on every run.
+
+    >>> sum_duplicates(torch.tensor([1, 0, 1]), torch.tensor([5, 7, 5]), torch.tensor([1.0, 2.0, 4.0]))
+    (tensor([0, 1]), tensor([7, 5]), tensor([2., 5.]))
+    """
+    if row.numel() == 0:
+        return row, column, weight
+    key = row.long() * (int(column.max()) + 1) + column
+    key, order = key.sort(stable=True)
+    starts = torch.ones_like(key, dtype=torch.bool)
+    starts[1:] = key[1:] != key[:-1]
+    if bool(starts.all()):
+        return row[order], column[order], weight[order]
+    first = starts.nonzero().squeeze(1)
+    place = order[first]
+    summed = segment_sum(weight[order], torch.cat([first, first.new_tensor([key.numel()])]))
+    return row[place], column[place], summed.to(weight.dtype)
+
+
+def row_offsets(row: Int[Tensor, " nnz"], num_rows: int) -> Int64[Tensor, " rows_plus_1"]:
+    """CSR offsets of entries with the given row numbers.
+
+    >>> row_offsets(torch.tensor([2, 0, 2]), 3).tolist()
+    [0, 1, 1, 3]
+    """
+    counts = torch.bincount(row.long(), minlength=num_rows)
+    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -1,0 +1,137 @@
+"""From Gaussians and a camera to depth-sorted 2D Gaussians and tile lists, exactly as gsplat "
+"1.4.0 does (utils.cuh, isect_tiles.cu)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.raster.settings import RasterSettings
+
+
+class World(NamedTuple):
+    """The drawable Gaussians of a scene, ready for any camera."""
+
+    gaussian: Int64[Tensor, " m"]
+    means: Float[Tensor, "m 3"]
+    """In the scene's own precision, which decides the order of drawing."""
+    covariances: Float[Tensor, "m 3 3"]
+    opacities: Float[Tensor, " m"]
+
+
+class Projected(NamedTuple):
+    """The Gaussians that a camera sees, nearest first."""
+
+    gaussian: Int64[Tensor, " m"]
+    means2d: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    """Inverse covariance in square pixels: xx, xy, yy."""
+    opacities: Float[Tensor, " m"]
+    radii: Float[Tensor, " m"]
+    """Half side in pixels of the square that selects the tiles; a whole number."""
+
+
+class Tiles(NamedTuple):
+    """Lists of Gaussians by tile, row by row of tiles; members[offsets[t]:offsets[t + 1]] index "
+    "`Projected`, nearest first."""
+
+    offsets: Int64[Tensor, " tiles_plus_1"]
+    members: Int32[Tensor, " intersections"]
+
+
+def to_world(scene: GaussianScene, dtype: torch.dtype) -> World:
+    """Covariances R diag(scale ** 2) R^T of the drawable Gaussians."""
+    gaussian = scene.drawable.nonzero().squeeze(1)
+    quats, scales, opacities = (x[gaussian].to(dtype) for x in (scene.quats, scene.scales, scene.opacities))
+    w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True)).unbind(1)
+    rotation = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+        ],
+        1,
+    )
+    half = rotation * scales[:, None, :]
+    return World(gaussian, scene.means[gaussian], half @ half.transpose(1, 2), opacities)
+
+
+def project(world: World, camera: Camera, settings: RasterSettings, antialiased: bool) -> Projected:
+    """Projects, blurs by eps2d, drops what the image cannot show, and sorts by depth (equal depths by index).
+
+    Args:
+        antialiased: scale opacities by sqrt(det / det of the blurred covariance), splatfacto's rasterize_mode
+            "antialiased".
+    """
+    dtype, device = world.opacities.dtype, world.opacities.device
+    pose = camera.world_to_camera.to(device)
+    fx, _, cx, _, fy, cy, *_ = camera.K.double().flatten().tolist()
+    width, height = camera.width, camera.height
+    depth = _camera_axis(world.means, pose[2])
+    near = ((depth >= settings.near_plane) & (depth <= settings.far_plane)).nonzero().squeeze(1)
+    near = near[torch.argsort(depth[near], stable=True)]
+    means, rotation = world.means[near].to(dtype), pose[:3, :3].to(dtype)
+    x, y, z = (_camera_axis(means, row) for row in pose[:3])
+
+    margin_x, margin_y = settings.frustum_margin * 0.5 * width / fx, settings.frustum_margin * 0.5 * height / fy
+    tx = z * (x / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
+    ty = z * (y / z).clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [torch.stack([fx / z, zero, -fx * tx / z**2], 1), torch.stack([zero, fy / z, -fy * ty / z**2], 1)], 1
+    )
+    to_image = jacobian @ rotation
+    covariance = to_image @ world.covariances[near] @ to_image.transpose(1, 2)
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    det_sharp = a * c - b * b
+    a, c = a + settings.eps2d, c + settings.eps2d
+    det = a * c - b * b
+    opacities = world.opacities[near]
+    if antialiased:
+        opacities = opacities * (det_sharp / det).clamp(min=0).sqrt()
+
+    mean = 0.5 * (a + c)
+    larger = mean + (mean * mean - det).clamp(min=settings.min_discriminant).sqrt()
+    radii = (settings.radius_sigmas * larger.sqrt()).ceil()
+    u, v = fx * x / z + cx, fy * y / z + cy
+    seen = (det > 0) & radii.isfinite() & (u + radii > 0) & (u - radii < width) & (v + radii > 0) & (v - radii < height)
+    conics = torch.stack([c, -b, a], 1) / det[:, None]
+    seen = (seen & conics.isfinite().all(1)).nonzero().squeeze(1)
+    return Projected(
+        world.gaussian[near[seen]], torch.stack([u, v], 1)[seen], conics[seen], opacities[seen], radii[seen]
+    )
+
+
+def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float[Tensor, " m"]:
+    """One camera coordinate of all means, rounded as CUDA rounds R p + t: b y, fused + a x, fused + c z, + t.
+
+    Where Gaussians overlap at the same distance, the order of drawing hangs on the last bit. A product of two float32
+    numbers is exact in
+    float64, so that rounding its sum once is a fused multiply-add.
+    """
+    dtype, (x, y, z) = means.dtype, means.double().unbind(1)
+    a, b, c, t = row.to(dtype).double()
+    total = (b * y).to(dtype)
+    total = (a * x + total).to(dtype)
+    total = (c * z + total).to(dtype)
+    return total + t.to(dtype)
+
+
+def assign_tiles(projected: Projected, width: int, height: int, tile_size: int) -> Tiles:
+    """Lists, for every tile, the Gaussians whose square touches it."""
+    columns, rows = -(-width // tile_size), -(-height // tile_size)
+    u, v = (projected.means2d / tile_size).unbind(1)
+    radius = projected.radii / tile_size
+    x0, x1 = (u - radius).floor().clamp(0, columns).long(), (u + radius).ceil().clamp(0, columns).long()
+    y0, y1 = (v - radius).floor().clamp(0, rows).long(), (v + radius).ceil().clamp(0, rows).long()
+    wide, count = x1 - x0, (x1 - x0) * (y1 - y0)
+    member = torch.repeat_interleave(torch.arange(count.numel(), device=count.device), count)
+    step = torch.arange(member.numel(), device=count.device) - (count.cumsum(0) - count)[member]
+    tile = ((y0[member] + step // wide[member]) * columns + x0[member] + step % wide[member]).int()
+    tile, order = tile.sort(stable=True)
+    bounds = torch.arange(rows * columns + 1, dtype=tile.dtype, device=tile.device)
+    return Tiles(torch.searchsorted(tile, bounds), member[order].int())
