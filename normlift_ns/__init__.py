@@ -8,7 +8,7 @@ from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
 from normlift_ns.core.refine import RefineConfig, refine, unsupported
-from normlift_ns.raster.rasterize import rasterize_evidence
+from normlift_ns.raster.rasterize import rasterize_evidence, render
 from normlift_ns.raster.settings import RasterSettings
 
 __version__ = "0.1.0"
@@ -30,5 +30,6 @@ __all__ = [
     "refine",
     "refine_variant",
     "relevancy",
+    "render",
     "unsupported",
 ]

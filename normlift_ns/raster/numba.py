@@ -8,7 +8,7 @@ import math
 import numba
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from normlift_ns.core.evidence import ViewEvidence
@@ -35,10 +35,7 @@ def view_evidence(
     counts = _count_labels(label_map, settings.tile_size)
     first_slot = np.concatenate([[0], np.cumsum(np.diff(offsets) * counts)])
     slots = (np.zeros(first_slot[-1]), np.empty(first_slot[-1], np.int32), np.empty(first_slot[-1], np.int32))
-    arrays = (projected.means2d.numpy(), projected.conics.numpy(), projected.opacities.numpy())
-    limits = tuple(
-        arrays[0].dtype.type(x) for x in (settings.max_alpha, settings.min_alpha, settings.min_transmittance)
-    )
+    arrays, limits = _inputs(projected, settings)
     _fill_slots(
         offsets, tiles.members.numpy(), *arrays, label_map, first_slot, slots, weight_power, settings.tile_size, limits
     )
@@ -46,6 +43,26 @@ def view_evidence(
     weight, member, region = (torch.from_numpy(x[used]) for x in slots)
     gaussian, region, weight = sum_duplicates(projected.gaussian[member.long()], region + 1, weight)
     return ViewEvidence(gaussian, region - 1, weight.to(projected.opacities.dtype), num_regions)
+
+
+def composite(
+    projected: Projected, tiles: Tiles, values: Float[Tensor, "m c"], width: int, height: int, settings: RasterSettings
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """The same as `reference.composite`, for tensors on the CPU."""
+    arrays, limits = _inputs(projected, settings)
+    image = np.zeros((height, width, values.shape[1]), arrays[0].dtype)
+    alpha = np.zeros((height, width), arrays[0].dtype)
+    _composite(
+        *(tiles.offsets.numpy(), tiles.members.numpy(), *arrays),
+        *(values.to(projected.opacities.dtype).contiguous().numpy(), image, alpha, settings.tile_size, limits),
+    )
+    return torch.from_numpy(image), torch.from_numpy(alpha)
+
+
+def _inputs(projected: Projected, settings: RasterSettings):
+    arrays = (projected.means2d.numpy(), projected.conics.numpy(), projected.opacities.numpy())
+    limits = (settings.max_alpha, settings.min_alpha, settings.min_transmittance)
+    return arrays, tuple(arrays[0].dtype.type(x) for x in limits)
 
 
 @numba.njit(cache=True)
@@ -80,10 +97,8 @@ def _count_labels(labels, size):  # pragma: no cover (compiled)
 
 
 @numba.njit(cache=True)
-def _splat(
-    g, box, means2d, conics, opacities, local, transmittance, sums, power, limits
-):  # pragma: no cover (compiled)
-    """Composites one Gaussian over the open pixels of a tile; adds its weights to sums[label], returns how many closed.
+def _splat(g, box, means2d, conics, opacities, transmittance, limits, pixels, weights):  # pragma: no cover (compiled)
+    """Composites one Gaussian over the open pixels of a tile: their numbers and A_ij, how many, and how many closed.
 
     alpha >= min_alpha where (a dx^2 + c dy^2) / 2 + b dx dy <= reach: an ellipse, walked row by row.
     """
@@ -92,9 +107,9 @@ def _splat(
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
     a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
     half, one = means2d.dtype.type(0.5), means2d.dtype.type(1)
+    drawn, closed = 0, 0
     if opacity < min_alpha:
-        return 0
-    closed = 0
+        return drawn, closed
     reach = math.log(np.float64(opacity) / min_alpha) + _REACH_MARGIN
     a64, b64 = np.float64(a), np.float64(b)
     det = a64 * c - b64 * b64
@@ -110,7 +125,7 @@ def _splat(
         for x in range(start, stop + 1):
             pixel = (y - top) * size + x - left
             before = transmittance[pixel]
-            if before == 0:  # closed
+            if before < 0:  # closed
                 continue
             dx = u - (x + half)
             sigma = half * (a * dx * dx + c * dy * dy) + b * dx * dy
@@ -121,13 +136,20 @@ def _splat(
                 continue
             after = before * (one - alpha)
             if after <= min_transmittance:
-                transmittance[pixel] = 0
+                transmittance[pixel] = -before
                 closed += 1
                 continue
             transmittance[pixel] = after
-            weight = np.float64(alpha * before)
-            sums[local[pixel]] += weight if power == 1 else weight**power
-    return closed
+            pixels[drawn], weights[drawn] = pixel, alpha * before
+            drawn += 1
+    return drawn, closed
+
+
+@numba.njit(cache=True)
+def _tile_box(tile, height, width, size):  # pragma: no cover (compiled)
+    columns = (width + size - 1) // size
+    top, left = tile // columns * size, tile % columns * size
+    return top, left, min(top + size, height), min(left + size, width), size
 
 
 @numba.njit(cache=True, parallel=True)
@@ -138,27 +160,56 @@ def _fill_slots(  # pragma: no cover (compiled)
 
     So there are no locks, and the sums are the same on every run.
     """
-    height, width = labels.shape
-    columns = (width + size - 1) // size
     slot_weight, slot_member, slot_region = slots
     for tile in numba.prange(offsets.size - 1):
-        local = np.empty(size * size, np.int32)
-        distinct = np.empty(size * size, np.int32)
+        local, distinct, pixels = (
+            np.empty(size * size, np.int32),
+            np.empty(size * size, np.int32),
+            np.empty(size * size, np.int32),
+        )
+        transmittance, weights = np.ones(size * size, means2d.dtype), np.empty(size * size, means2d.dtype)
         count = _tile_labels(labels, tile, size, local, distinct)
         sums = np.zeros(count)
-        transmittance = np.ones(size * size, means2d.dtype)
-        top, left = tile // columns * size, tile % columns * size
-        box = (top, left, min(top + size, height), min(left + size, width), size)
-        open_pixels = (box[2] - top) * (box[3] - left)
+        box = _tile_box(tile, labels.shape[0], labels.shape[1], size)
+        open_pixels = (box[2] - box[0]) * (box[3] - box[1])
         slot = first_slot[tile]
         for entry in range(offsets[tile], offsets[tile + 1]):
             if open_pixels == 0:
                 break
             g = members[entry]
-            open_pixels -= _splat(g, box, means2d, conics, opacities, local, transmittance, sums, power, limits)
+            drawn, closed = _splat(g, box, means2d, conics, opacities, transmittance, limits, pixels, weights)
+            open_pixels -= closed
+            for i in range(drawn):
+                weight = np.float64(weights[i])
+                sums[local[pixels[i]]] += weight if power == 1 else weight**power
             for number in range(count):
                 slot_weight[slot] = sums[number]
                 slot_member[slot] = g
                 slot_region[slot] = distinct[number]
                 sums[number] = 0
                 slot += 1
+
+
+@numba.njit(cache=True, parallel=True)
+def _composite(  # pragma: no cover (compiled)
+    offsets, members, means2d, conics, opacities, values, image, alpha, size, limits
+):
+    """image[y, x] = sum of A_ij values[j], alpha[y, x] = sum of A_ij."""
+    for tile in numba.prange(offsets.size - 1):
+        pixels = np.empty(size * size, np.int32)
+        transmittance, weights = np.ones(size * size, means2d.dtype), np.empty(size * size, means2d.dtype)
+        box = _tile_box(tile, image.shape[0], image.shape[1], size)
+        open_pixels = (box[2] - box[0]) * (box[3] - box[1])
+        for entry in range(offsets[tile], offsets[tile + 1]):
+            if open_pixels == 0:
+                break
+            g = members[entry]
+            drawn, closed = _splat(g, box, means2d, conics, opacities, transmittance, limits, pixels, weights)
+            open_pixels -= closed
+            for i in range(drawn):
+                y, x = box[0] + pixels[i] // size, box[1] + pixels[i] % size
+                for channel in range(values.shape[1]):
+                    image[y, x, channel] += weights[i] * values[g, channel]
+        for y in range(box[0], box[2]):
+            for x in range(box[1], box[3]):
+                alpha[y, x] = 1 - abs(transmittance[(y - box[0]) * size + x - box[1]])

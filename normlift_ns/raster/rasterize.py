@@ -8,12 +8,13 @@ from itertools import zip_longest
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence, ViewEvidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.raster import reference
-from normlift_ns.raster.projection import Projected, Tiles, assign_tiles, project, to_world
+from normlift_ns.raster.projection import assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
 Backend = Literal["auto", "torch", "numba"]
@@ -60,12 +61,11 @@ def rasterize_evidence(
             its `num_regions`,
             or iterables of different lengths; the message names the view.
     """
-    if rasterize_mode not in ("classic", "antialiased"):
-        raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
+    _check_mode(rasterize_mode)
     if weight_power not in (0, 1, 2):
         raise ValueError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     settings = settings or RasterSettings()
-    view_evidence = _choose(backend, scene.means.device)
+    view_evidence = _choose(backend, scene.means.device).view_evidence
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
@@ -87,13 +87,50 @@ def rasterize_evidence(
     return Evidence.from_views(views, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
-def _choose(
-    backend: str, device: torch.device
-) -> Callable[[Projected, Tiles, Tensor, int, int, RasterSettings], ViewEvidence]:
+def render(
+    scene: GaussianScene,
+    camera: Camera,
+    values: Float[Tensor, "n c"],
+    *,
+    backend: Backend = "auto",
+    rasterize_mode: RasterizeMode = "classic",
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Composites any per-Gaussian values: sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
+
+    Args:
+        values: colours, relevancies, reliability, …; not premultiplied.
+    Returns:
+        The image without background (add background * (1 - alpha)), and alpha in 0..1.
+    Raises:
+        ValueError: values of another length, an unknown option.
+    """
+    _check_mode(rasterize_mode)
+    if values.ndim != 2 or len(values) != len(scene):
+        raise ValueError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
+    settings = settings or RasterSettings()
+    with torch.no_grad():
+        world = to_world(scene, dtype or scene.means.dtype)
+        projected = project(world, camera, settings, rasterize_mode == "antialiased")
+        tiles = assign_tiles(projected, camera.width, camera.height, settings.tile_size)
+        drawn = values[projected.gaussian].to(projected.opacities.dtype)
+        return _choose(backend, scene.means.device).composite(
+            projected, tiles, drawn, camera.width, camera.height, settings
+        )
+
+
+def _check_mode(rasterize_mode: str) -> None:
+    if rasterize_mode not in ("classic", "antialiased"):
+        raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
+
+
+def _choose(backend: str, device: torch.device) -> Any:
+    """The module that sums one view: `view_evidence` and `composite`."""
     if backend == "auto":
         backend = "numba" if device.type == "cpu" else "torch"
     if backend == "torch":
-        return reference.view_evidence
+        return reference
     if backend == "numba":
         if device.type != "cpu":
             raise ValueError(
@@ -101,7 +138,7 @@ def _choose(
             )
         from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
 
-        return numba.view_evidence
+        return numba
     raise ValueError(f'backend must be "auto", "torch" or "numba", got {backend!r}')
 
 

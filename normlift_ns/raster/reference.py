@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -37,35 +40,51 @@ def view_evidence(
     settings: RasterSettings,
 ) -> ViewEvidence:
     """Sums of A_ij ** weight_power by (Gaussian, region) of one view; region -1 collects the unlabelled pixels."""
-    size = settings.tile_size
-    columns = -(-labels.shape[1] // size)
-    bounds = tiles.offsets.tolist()
     found: list[tuple[Tensor, Tensor, Tensor]] = []
-    for tile in range(len(bounds) - 1):
-        member = tiles.members[bounds[tile] : bounds[tile + 1]].long()
-        if member.numel() == 0:
-            continue
-        top, left = tile // columns * size, tile % columns * size
-        label = labels[top : top + size, left : left + size]
-        v = torch.arange(top, top + label.shape[0], device=labels.device) + 0.5
-        u = torch.arange(left, left + label.shape[1], device=labels.device) + 0.5
-        mean, (a, b, c) = projected.means2d[member], projected.conics[member].unbind(1)
-        dx, dy = (
-            mean[:, 0] - u.to(mean.dtype)[None, :, None],
-            mean[:, 1] - v.to(mean.dtype)[:, None, None],
-        )  # [1, W, K], [H, 1, K]
-        sigma = (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy).flatten(0, 1)  # [P, K]
-        alpha = (projected.opacities[member] * torch.exp(-sigma)).clamp(max=settings.max_alpha)
-        alpha = torch.where((sigma >= 0) & (alpha >= settings.min_alpha), alpha, 0.0)
-        weight = compositing_weights(alpha, settings.min_transmittance).double()
-        weight = torch.where(weight > 0, weight**weight_power, 0.0)
-        region, local = label.flatten().unique(return_inverse=True)
+    for member, (rows, columns), a in _tiles(projected, tiles, labels.shape[1], labels.shape[0], settings):
+        weight = torch.where(a > 0, a.double() ** weight_power, 0.0)
+        region, local = labels[rows, columns].flatten().unique(return_inverse=True)
         sums = weight.new_zeros(region.numel(), member.numel()).index_add_(0, local, weight)
         r, k = sums.nonzero(as_tuple=True)
         found.append((projected.gaussian[member[k]], region[r], sums[r, k]))
-    if not found:
-        none = torch.zeros(0, dtype=torch.int64, device=labels.device)
-        return ViewEvidence(none, none, projected.opacities.new_zeros(0), num_regions)
-    gaussian, region, weight = (torch.cat(parts) for parts in zip(*found))
+    none = torch.zeros(0, dtype=torch.int64, device=labels.device)
+    gaussian, region, weight = (torch.cat(parts) for parts in zip((none, none, none.double()), *found))
     gaussian, region, weight = sum_duplicates(gaussian, region + 1, weight)
     return ViewEvidence(gaussian, region - 1, weight.to(projected.opacities.dtype), num_regions)
+
+
+def composite(
+    projected: Projected, tiles: Tiles, values: Float[Tensor, "m c"], width: int, height: int, settings: RasterSettings
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """sum_j A_ij values_j and sum_j A_ij of every pixel i (eq. 2 of the paper without its background)."""
+    image, alpha = values.new_zeros(height, width, values.shape[1]), values.new_zeros(height, width)
+    for member, (rows, columns), weight in _tiles(projected, tiles, width, height, settings):
+        area = image[rows, columns]
+        image[rows, columns] = (weight.to(values.dtype) @ values[member]).view(area.shape)
+        alpha[rows, columns] = weight.sum(1).view(area.shape[:2]).to(values.dtype)
+    return image, alpha
+
+
+def _tiles(
+    projected: Projected, tiles: Tiles, width: int, height: int, settings: RasterSettings
+) -> Iterator[tuple[Tensor, tuple[slice, slice], Tensor]]:
+    """For every tile that shows anything: its K Gaussians, its pixels as slices of the image, and A_ij [pixels, K]."""
+    size, device, dtype = settings.tile_size, projected.means2d.device, projected.means2d.dtype
+    across = -(-width // size)
+    bounds = tiles.offsets.tolist()
+    for tile, (start, stop) in enumerate(pairwise(bounds)):
+        if start == stop:
+            continue
+        member = tiles.members[start:stop].long()
+        top, left = tile // across * size, tile % across * size
+        rows, columns = slice(top, min(top + size, height)), slice(left, min(left + size, width))
+        dx = (
+            projected.means2d[member, 0]
+            - (torch.arange(left, columns.stop, device=device).to(dtype) + 0.5)[None, :, None]
+        )
+        dy = projected.means2d[member, 1] - (torch.arange(top, rows.stop, device=device).to(dtype) + 0.5)[:, None, None]
+        a, b, c = projected.conics[member].unbind(1)
+        sigma = (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy).flatten(0, 1)  # [P, K]
+        alpha = (projected.opacities[member] * torch.exp(-sigma)).clamp(max=settings.max_alpha)
+        alpha = torch.where((sigma >= 0) & (alpha >= settings.min_alpha), alpha, 0.0)
+        yield member, (rows, columns), compositing_weights(alpha, settings.min_transmittance)
