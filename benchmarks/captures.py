@@ -1,0 +1,60 @@
+"""Trained captures for benchmarks: Gaussians, and cameras as splatfacto sees them (split, world transform, undistortion)."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from normlift_ns import Camera, GaussianScene
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+STEPS = {"fox": 11999, "tabletop": 6999}
+
+
+def trained_scene(name: str) -> GaussianScene:
+    """The activated Gaussians of a splatfacto checkpoint."""
+    run = SHARED / "captures" / "outputs" / name / "splatfacto" / "run"
+    path = run / "nerfstudio_models" / f"step-{STEPS[name]:09d}.ckpt"
+    state = torch.load(path, map_location="cpu", weights_only=True)["pipeline"]
+    means, quats, scales, opacities = (
+        state[f"_model.gauss_params.{key}"] for key in ("means", "quats", "scales", "opacities")
+    )
+    return GaussianScene(means, quats, scales.exp(), opacities.sigmoid().squeeze(-1))
+
+
+def training_cameras(name: str) -> list[Camera]:
+    """Cameras of the 90 % training split, lens distortion taken out as nerfstudio's full-image data manager does it."""
+    capture = SHARED / "captures" / name
+    meta = json.loads((capture / "transforms.json").read_text())
+    run = SHARED / "captures" / "outputs" / name / "splatfacto" / "run"
+    world = json.loads((run / "dataparser_transforms.json").read_text())
+    frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
+    train = np.linspace(0, len(frames) - 1, math.ceil(len(frames) * 0.9), dtype=int)
+    K, width, height = _undistorted_intrinsics(meta)
+    cameras = []
+    for i in train:
+        pose = np.array(world["transform"] + [[0, 0, 0, 1]]) @ np.array(frames[i]["transform_matrix"])
+        pose[:3, 3] *= world["scale"]
+        pose[:, 1:3] *= -1  # OpenGL to OpenCV
+        pose = torch.linalg.inv(torch.from_numpy(pose))
+        pose[3] = torch.tensor([0.0, 0, 0, 1])
+        cameras.append(Camera(K, pose.float(), width, height))
+    return cameras
+
+
+def _undistorted_intrinsics(meta: dict) -> tuple[torch.Tensor, int, int]:
+    K = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]])
+    distortion = np.array([meta.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
+    if not distortion.any():
+        return torch.from_numpy(K).float(), meta["w"], meta["h"]
+    K[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
+    K, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(K, distortion, (meta["w"], meta["h"]), 0)
+    K[:2, 2] += 0.5 - np.array([x, y])
+    return torch.from_numpy(K).float(), width, height

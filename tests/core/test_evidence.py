@@ -1,0 +1,157 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Evidence, lift
+from normlift_ns.core.evidence import ViewEvidence
+from normlift_ns.core.sparse import SparseRows
+from tests.scenes import dense, generator, random_evidence, unit_rows
+
+VIEWS = [3, 0, 1, 5, 2]
+SEEDS = st.integers(0, 2**31)
+
+
+def same(a: Evidence, b: Evidence) -> bool:
+    arrays = ("offsets", "region", "weight", "region_view")
+    blank = ("offsets", "column", "weight")
+    return (
+        all(torch.equal(getattr(a, name), getattr(b, name)) for name in arrays)
+        and all(torch.equal(getattr(a.unlabeled, name), getattr(b.unlabeled, name)) for name in blank)
+        and (a.num_views, a.weight_power, a.num_excluded) == (b.num_views, b.weight_power, b.num_excluded)
+    )
+
+
+@settings(deadline=None)
+@given(seed=SEEDS)
+def test_view_weights_add_up_regions(seed):
+    evidence = random_evidence(30, VIEWS, seed)
+    by_region = dense(evidence.rows, sum(VIEWS))
+    expected = torch.stack([by_region[:, evidence.region_view == v].sum(1) for v in range(len(VIEWS))], 1)
+    weights = evidence.view_weights()
+    assert torch.allclose(dense(weights, len(VIEWS)), expected, rtol=1e-14, atol=0)
+    assert weights.weight.numel() == int((expected > 0).sum())
+
+
+@settings(deadline=None)
+@given(seed=SEEDS, views=st.permutations(range(5)), keep=st.integers(0, 5))
+def test_select_views_takes_columns_in_the_order_asked(seed, views, keep):
+    evidence = random_evidence(20, VIEWS, seed)
+    chosen = list(views)[:keep]
+    part = evidence.select_views(chosen)
+    columns = evidence.columns_of(chosen)
+    assert part.num_views == keep
+    assert torch.equal(dense(part.rows, columns.numel()), dense(evidence.rows, sum(VIEWS))[:, columns])
+    assert torch.equal(dense(part.unlabeled, keep), dense(evidence.unlabeled, 5)[:, chosen])
+    assert part.region_view.tolist() == [i for i, v in enumerate(chosen) for _ in range(VIEWS[v])]
+
+
+@settings(deadline=None)
+@given(seed=SEEDS, cut=st.integers(0, 5))
+def test_merging_shards_gives_the_whole(seed, cut):
+    whole = random_evidence(20, VIEWS, seed)
+    shards = [whole.select_views(range(cut)), whole.select_views(range(cut, 5))]
+    assert same(Evidence.merge(*shards), whole)
+    assert same(Evidence.merge(whole), whole)
+
+
+def test_merge_refuses_other_scenes():
+    one, other = random_evidence(5, [2], 0), random_evidence(6, [2], 0)
+    with pytest.raises(ValueError, match=r"parts must agree in num_gaussians, found \[5, 6\]"):
+        Evidence.merge(one, other)
+    with pytest.raises(ValueError, match="at least one part"):
+        Evidence.merge()
+
+
+def test_views_must_exist_once():
+    evidence = random_evidence(5, VIEWS, 0)
+    for views in ([5], [-1], [1, 1]):
+        with pytest.raises(ValueError, match=r"views must be distinct and in 0\.\.4"):
+            evidence.select_views(views)
+
+
+@settings(deadline=None)
+@given(seed=SEEDS, relative=st.floats(0, 1))
+def test_pruning_stays_within_its_bound(seed, relative):
+    evidence = random_evidence(30, VIEWS, seed)
+    features = unit_rows(sum(VIEWS), 8, seed)
+    smaller, bound = evidence.prune(relative=relative)
+    before, after = lift(evidence, features), lift(smaller, features)
+    f, g = before.norm[:, None] * before.directions(), after.norm[:, None] * after.directions()
+    assert ((f - g).norm(dim=1) <= bound + 1e-12).all()
+    assert ((before.norm - after.norm).abs() <= bound + 1e-12).all()
+    has = evidence.rows.row_sums() > 0
+    assert (smaller.rows.row_sums()[has] > 0).all()
+    assert same(evidence.prune(relative=0.0)[0], evidence)
+
+
+def test_pruning_drops_something_and_says_what():
+    weight = torch.tensor([1.0, 0.25, 0.01, 2.0])
+    rows = SparseRows.from_coo(torch.tensor([0, 0, 0, 1]), torch.tensor([0, 1, 2, 0]), weight, 3)
+    blank = SparseRows.from_coo(torch.zeros(0).int(), torch.zeros(0).int(), torch.zeros(0), 3)
+    evidence = Evidence(rows.offsets, rows.column, rows.weight, torch.zeros(3).int(), blank, 1)
+    smaller, bound = evidence.prune(relative=0.1)
+    assert smaller.weight.tolist() == pytest.approx([1, 0.25, 2])
+    assert bound.tolist() == pytest.approx([2 * 0.01 / 1.26, 0, 0])
+    with pytest.raises(ValueError, match=r"relative must be in 0\.\.1"):
+        evidence.prune(relative=1.5)
+
+
+def test_save_and_load_are_exact(tmp_path):
+    for dtype in (torch.float32, torch.float64):
+        evidence = random_evidence(15, VIEWS, 3, dtype=dtype)
+        evidence.save(tmp_path / "e.safetensors")
+        assert same(Evidence.load(tmp_path / "e.safetensors"), evidence)
+        assert [p.name for p in tmp_path.iterdir()] == ["e.safetensors"]
+
+
+def test_loading_something_else_names_the_file(tmp_path):
+    path = tmp_path / "e.safetensors"
+    with pytest.raises(FileNotFoundError):
+        Evidence.load(path)
+    path.write_bytes(b"no tensors")
+    with pytest.raises(ValueError, match=r"e\.safetensors is damaged or no safetensors file"):
+        Evidence.load(path)
+    random_evidence(15, VIEWS, 3).save(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(ValueError, match="is damaged"):
+        Evidence.load(path)
+
+
+def test_a_failed_save_leaves_nothing(tmp_path, monkeypatch):
+    def full_disk(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("normlift_ns.core.evidence.save_file", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        random_evidence(5, [2], 0).save(tmp_path / "e.safetensors")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_from_views_keeps_unlabelled_weight_apart():
+    g = torch.tensor([0, 0, 2])
+    one = ViewEvidence(g, torch.tensor([-1, 1, 0]), torch.tensor([0.5, 1.0, 2.0]), 2)
+    two = ViewEvidence(torch.tensor([1, 2]), torch.tensor([0, -1]), torch.tensor([3.0, 4.0]), 1)
+    evidence = Evidence.from_views([one, two], 3)
+    assert dense(evidence.rows, 3).tolist() == [[0, 1, 0], [0, 0, 3], [2, 0, 0]]
+    assert dense(evidence.unlabeled, 2).tolist() == [[0.5, 0], [0, 0], [0, 4]]
+
+
+def test_disagreeing_arrays_are_refused():
+    e = random_evidence(5, [2, 2], 0)
+    with pytest.raises(ValueError, match=r"region must be in 0\.\.1"):
+        Evidence(e.offsets, e.region, e.weight, e.region_view[:2], e.unlabeled, 2)
+    with pytest.raises(ValueError, match="one per Gaussian"):
+        Evidence(e.offsets[:-1], e.region[: e.offsets[-2]], e.weight[: e.offsets[-2]], e.region_view, e.unlabeled, 2)
+    with pytest.raises(ValueError, match="region_view must be non-decreasing"):
+        Evidence(e.offsets, e.region, e.weight, e.region_view.flip(0), e.unlabeled, 2)
+
+
+@settings(deadline=None)
+@given(seed=SEEDS)
+def test_sums_of_duplicates_do_not_depend_on_order_beyond_rounding(seed):
+    g = generator(seed)
+    row, column = torch.randint(0, 5, (60,), generator=g), torch.randint(0, 4, (60,), generator=g)
+    weight = torch.rand(60, generator=g, dtype=torch.float64)
+    expected = torch.zeros(5, 4, dtype=torch.float64).index_put_((row, column), weight, accumulate=True)
+    assert torch.allclose(dense(SparseRows.from_coo(row, column, weight, 5), 4), expected, rtol=1e-14)

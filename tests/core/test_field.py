@@ -1,0 +1,240 @@
+"""What is stored answers like the lift that made it, within the bound it states."""
+
+import json
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Evidence, Lifted, SemanticField, lift, relevancy
+from normlift_ns.core.field import EvidenceForm, fingerprint
+from normlift_ns.core.lowrank import basis_of_rank, spectral_table
+from tests.captures import clip_vectors, needs_shared
+from tests.scenes import generator, random_evidence, unit_rows
+
+VIEWS = [6, 5, 0, 7]
+S, D, N = sum(VIEWS), 12, 40
+FORMS = ["evidence", "float16", "low_rank"]
+
+
+def low_rank_table(rank: int, seed: int, dtype: torch.dtype) -> torch.Tensor:
+    return torch.nn.functional.normalize(unit_rows(S, rank, seed) @ unit_rows(rank, D, seed + 1), dim=1).to(dtype)
+
+
+def example(
+    seed: int = 0, rank: int = 4, dtype: torch.dtype = torch.float32
+) -> tuple[Lifted, torch.Tensor, torch.Tensor]:
+    lifted = lift(random_evidence(N, VIEWS, seed, fill=0.15, dtype=dtype), low_rank_table(rank, seed, dtype))
+    means = torch.rand(N, 3, generator=generator(seed))
+    return lifted, means, torch.randint(0, N, (N,), generator=generator(seed)).int()
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("refined", [True, False])
+def test_every_form_answers_within_its_bound_after_a_round_trip(form, refined, tmp_path):
+    lifted, means, source = example()
+    field = SemanticField.build(lifted, means, source, form=form, tolerance=2e-3)
+    field.save(tmp_path / "normlift")
+    loaded = SemanticField.load(tmp_path / "normlift", means)
+    text = 10 * unit_rows(20, D, 9).float()
+    directions = lifted.directions()[source.long()] if refined else lifted.directions()
+    expected = directions @ torch.nn.functional.normalize(text, dim=1).T
+    bound = field.manifest["forms"][form]["bound"]
+    assert bound <= 2e-3
+    assert (loaded.query(text, refined=refined) - expected).abs().max() <= bound + 1e-6
+    assert torch.equal(loaded.query(text, refined=refined), field.query(text, refined=refined))
+    assert (loaded.directions(refined=refined) - directions).norm(dim=1).max() <= bound + 1e-3
+    assert torch.equal(loaded.valid(refined=refined), directions.abs().sum(1) > 0)
+    assert (loaded.query(text, refined=refined)[~loaded.valid(refined=refined)] == 0).all()
+    assert 0 < int((~loaded.valid(refined=False)).sum()) < N  # the example has Gaussians without evidence
+    for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "view_count"):
+        assert torch.equal(getattr(loaded.scalars, name), getattr(lifted, name))
+
+
+def test_sizes_are_those_of_the_files(tmp_path):
+    lifted, means, source = example()
+    for form in FORMS:
+        field = SemanticField.build(lifted, means, source, form=form, tolerance=2e-3)
+        field.save(tmp_path / form)
+        stored = sum(p.stat().st_size for p in (tmp_path / form).glob("*.safetensors"))
+        shared = 4 * 8 * N  # seven scalars and the source of each Gaussian
+        assert 0 < stored - shared - field.manifest["forms"][form]["bytes"] < 3000, form  # headers
+
+
+def test_auto_takes_the_smallest_form_within_the_tolerance():
+    lifted, means, _ = example(rank=2)
+    forms = SemanticField.build(lifted, means, tolerance=2e-3).manifest["forms"]
+    assert set(forms) == set(FORMS)
+    assert forms["low_rank"]["rank"] == 2
+    for tolerance, expected in ((2e-3, min(FORMS, key=lambda name: forms[name]["bytes"])), (1e-6, "evidence")):
+        assert SemanticField.build(lifted, means, tolerance=tolerance).manifest["form"] == expected
+
+
+def test_no_row_is_stored_without_evidence():
+    lifted, means, _ = example()
+    field = SemanticField.build(lifted, means, form="float16")
+    assert not isinstance(field.store, EvidenceForm)
+    assert len(field.store.coordinates) == int((lifted.norm > 0).sum()) < N
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**31), rank=st.integers(0, D))
+def test_bound_of_any_basis_holds_for_every_gaussian(seed, rank):
+    lifted = lift(random_evidence(N, VIEWS, seed), unit_rows(S, D, seed))
+    basis = basis_of_rank(lifted, spectral_table(lifted.features), rank)
+    exact = lifted.directions()
+    projected = exact @ basis.rows.T @ basis.rows
+    renormalised = torch.nn.functional.normalize(projected, dim=1)
+    error = (renormalised - exact).norm(dim=1)  # the largest over all unit query vectors
+    assert (error <= basis.bound + 1e-9).all()
+    assert rank < D or basis.bound.max() < 2e-5
+
+
+def views_of_clip(noise: float, seed: int = 0, views: int = 12, names: int = 15) -> torch.Tensor:
+    """A feature table as views see it: real CLIP vectors of a few names, disturbed anew in every view."""
+    chosen = torch.randperm(1203, generator=generator(seed))[:names]
+    table = clip_vectors()[chosen].repeat(views, 1)
+    disturbance = torch.randn(table.shape, generator=generator(seed + 1), dtype=torch.float64) / 512**0.5
+    return torch.nn.functional.normalize(table + noise * disturbance, dim=1)
+
+
+@needs_shared
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2, 1.0])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-2, 5e-2])
+def test_measured_error_never_exceeds_the_bound_on_real_clip_vectors(noise, tolerance):
+    table = views_of_clip(noise)
+    lifted = lift(random_evidence(300, [15] * 12, 0, fill=0.05), table)
+    field = SemanticField.build(lifted, torch.rand(300, 3), tolerance=tolerance)
+    forms = field.manifest["forms"]
+    exact = lifted.directions()
+    text = clip_vectors()
+    for form in forms:
+        answer = SemanticField.build(lifted, torch.rand(300, 3), form=form, tolerance=tolerance).query(
+            text, refined=False
+        )
+        worst = (answer.double() - exact @ text.T).abs().max().item()
+        assert worst <= forms[form]["bound"] + 1e-6, form
+    if noise == 0:
+        assert forms["low_rank"]["rank"] <= 15
+
+
+def test_near_cancelled_gaussians_force_an_exact_form():
+    """||f|| = 5e-5: any basis short of the whole space would turn that direction, so none is offered."""
+    u = unit_rows(1, D, 0)
+    table = torch.cat([u, torch.nn.functional.normalize(-u + 1e-4 * unit_rows(1, D, 1), dim=1), unit_rows(9, D, 2)])
+    rows = random_evidence(2, [11], 0, fill=1.0)
+    weight = torch.cat([torch.ones(2), torch.full((9,), 1e-9), torch.ones(11)]).double()
+    evidence = Evidence(rows.offsets, rows.region, weight, rows.region_view, rows.unlabeled, 1)
+    lifted = lift(evidence, table)
+    assert lifted.norm[0] < 1e-4
+    forms = SemanticField.build(lifted, torch.rand(2, 3), tolerance=1e-3).manifest["forms"]
+    assert "low_rank" not in forms or forms["low_rank"]["rank"] == 11
+
+
+def test_queries_near_cancellation_are_right():
+    u = unit_rows(1, D, 0)
+    table = torch.cat([u, torch.nn.functional.normalize(-u + 1e-4 * unit_rows(1, D, 1), dim=1)]).float()
+    rows = random_evidence(1, [2], 0, fill=1.0, dtype=torch.float32)
+    evidence = Evidence(rows.offsets, rows.region, torch.ones(2), rows.region_view, rows.unlabeled, 1)
+    lifted = lift(evidence, table)
+    field = SemanticField.build(lifted, torch.zeros(1, 3), form="evidence")
+    text = unit_rows(50, D, 3).float()
+    exact = torch.nn.functional.normalize(table.double().sum(0, keepdim=True), dim=1)
+    assert (field.query(text, refined=False) - exact @ text.double().T).abs().max() < 1e-4
+
+
+def test_relevancy_never_finds_gaussians_without_evidence():
+    lifted, means, _ = example()
+    field = SemanticField.build(lifted, means, form="evidence")
+    text, negatives = unit_rows(3, D, 1).float(), unit_rows(4, D, 2).float()
+    empty = ~field.valid()
+    for form, least in (("cosine", 0), ("lerf", 0), ("margin", -2)):
+        values = field.relevancy(text, negatives, form=form)
+        assert (values[empty] == least).all()
+        expected = relevancy(field.query(text), field.query(negatives), form=form)
+        assert torch.allclose(values[~empty], expected[~empty], atol=1e-6)
+
+
+def test_unrefined_field_is_its_own_source():
+    lifted, means, _ = example()
+    field = SemanticField.build(lifted, means)
+    assert torch.equal(field.source, torch.arange(N, dtype=torch.int32))
+    text = unit_rows(2, D, 0).float()
+    assert torch.equal(field.query(text), field.query(text, refined=False))
+
+
+def test_a_field_of_other_gaussians_is_refused(tmp_path):
+    lifted, means, source = example()
+    SemanticField.build(lifted, means, source).save(tmp_path / "a")
+    with pytest.raises(ValueError, match=r"/a has 40 Gaussians, but step-1\.ckpt has 39; lift again with: ns-normlift"):
+        SemanticField.load(tmp_path / "a", means[1:], checkpoint="step-1.ckpt")
+    with pytest.raises(ValueError, match=r"/a was lifted from other Gaussians than those of step-1\.ckpt"):
+        SemanticField.load(tmp_path / "a", means + 1, checkpoint="step-1.ckpt")
+    assert fingerprint(means) == fingerprint(means.double()) != fingerprint(means + 1)
+
+
+def test_nothing_is_overwritten_unasked(tmp_path):
+    lifted, means, source = example()
+    SemanticField.build(lifted, means, source, form="evidence").save(tmp_path)
+    other = SemanticField.build(lifted, means, source, form="float16")
+    with pytest.raises(FileExistsError, match="already holds a semantic field"):
+        other.save(tmp_path)
+    other.save(tmp_path, overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["field.safetensors", "manifest.json"]
+    assert SemanticField.load(tmp_path, means).manifest["form"] == "float16"
+
+
+def test_damaged_and_incomplete_fields_are_named(tmp_path):
+    lifted, means, source = example()
+    with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):
+        SemanticField.load(tmp_path)
+    SemanticField.build(lifted, means, source).save(tmp_path)
+    path = tmp_path / "field.safetensors"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-10])
+    with pytest.raises(ValueError, match="is damaged"):
+        SemanticField.load(tmp_path)
+    path.write_bytes(whole)
+    manifest = tmp_path / "manifest.json"
+    text = manifest.read_text()
+    manifest.write_text(text[:-20])
+    with pytest.raises(ValueError, match="is damaged"):
+        SemanticField.load(tmp_path)
+    manifest.write_text(json.dumps({**json.loads(text), "schema_version": 99}))
+    with pytest.raises(ValueError, match="schema version 99, this program reads 1"):
+        SemanticField.load(tmp_path)
+
+
+def test_a_full_disk_leaves_no_manifest(tmp_path, monkeypatch):
+    def full_disk(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    lifted, means, source = example()
+    monkeypatch.setattr("normlift_ns.core.field.save_file", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        SemanticField.build(lifted, means, source, form="float16").save(tmp_path / "f")
+    assert list((tmp_path / "f").iterdir()) == []
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bad_arguments_are_named():
+    lifted, means, source = example()
+    field = SemanticField.build(lifted, means, provenance={"encoder": "test"})
+    assert field.manifest["encoder"] == "test"
+    for vectors, message in (
+        (torch.ones(1, D + 1), rf"text vectors must be \[Q, {D}\]"),
+        (torch.zeros(1, D), "must be finite and not zero"),
+        (torch.full((1, D), torch.nan), "must be finite and not zero"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            field.query(vectors)
+    for kwargs, message in (
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"form": "zip"}, "form must be auto, evidence, float16, low_rank"),
+        ({"source": source[1:]}, "one row per lifted Gaussian"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            SemanticField.build(lifted, means, **kwargs)
+    with pytest.raises(ValueError, match="no basis keeps every Gaussian within tolerance 1e-05"):
+        SemanticField.build(lifted, means, form="low_rank", tolerance=1e-5)

@@ -1,0 +1,86 @@
+"""Exact neighbours against all pairs, ties and coincident points above all."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import nearest_neighbors
+from tests.scenes import generator
+
+
+def all_pairs(means: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+    distance = torch.linalg.vector_norm(means.double()[:, None] - means.double()[None], dim=-1)
+    index = torch.full((len(means), k), -1)
+    sorted_distance = torch.full((len(means), k), math.inf, dtype=torch.float64)
+    for i, row in enumerate(distance.tolist()):
+        order = sorted((d, j) for j, d in enumerate(row) if j != i)[:k]
+        for place, (d, j) in enumerate(order):
+            index[i, place], sorted_distance[i, place] = j, d
+    return index, sorted_distance
+
+
+def grid() -> torch.Tensor:
+    axis = torch.arange(4.0)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+
+SCENES = {
+    "random": torch.rand(120, 3, generator=generator(0)),
+    "grid": grid(),
+    "all at one place": torch.zeros(30, 3),
+    "few places": torch.rand(20, 3, generator=generator(1))[torch.randint(0, 20, (100,), generator=generator(2))],
+    "grid, several at a place": torch.randint(0, 3, (90, 3), generator=generator(3)).float(),
+    "dense and sparse": torch.cat([1e-4 * torch.rand(60, 3, generator=generator(4)), 1e3 * torch.rand(20, 3)]),
+    "one": torch.zeros(1, 3),
+    "two": torch.tensor([[0.0, 0, 0], [1, 0, 0]]),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("k", [1, 3, 7, 36, 130])
+def test_equals_all_pairs_ties_by_index(name, k):
+    found = nearest_neighbors(SCENES[name], k)
+    index, distance = all_pairs(SCENES[name], k)
+    assert torch.equal(found.index, index)
+    assert torch.allclose(found.distance, distance, rtol=1e-12, atol=0)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**31), side=st.integers(1, 6), n=st.integers(1, 60), k=st.integers(1, 12))
+def test_equals_all_pairs_on_lattices(seed, side, n, k):
+    means = torch.randint(0, side, (n, 3), generator=generator(seed)).float()
+    assert torch.equal(nearest_neighbors(means, k).index, all_pairs(means, k)[0])
+
+
+def test_spacing_ignores_coincident_points():
+    means = torch.tensor([[0.0, 0, 0]] * 5 + [[2.0, 0, 0]] * 5 + [[5.0, 0, 0]])
+    assert nearest_neighbors(means, 2).spacing.tolist() == [2] * 10 + [3]
+    assert nearest_neighbors(means[:5], 2).spacing.tolist() == [math.inf] * 5
+
+
+def test_non_finite_means_are_nobodys_neighbour():
+    means = torch.rand(20, 3, generator=generator(0))
+    means[3] = torch.nan
+    means[7, 0] = torch.inf
+    found = nearest_neighbors(means, 30)
+    assert (found.index[[3, 7]] == -1).all()
+    others = found.index[[i for i in range(20) if i not in (3, 7)]]
+    assert not ((others == 3) | (others == 7)).any()
+    assert ((others >= 0).sum(1) == 17).all()
+
+
+def test_many_coincident_points_stay_cheap():
+    """20,000 Gaussians at one place: all pairs would be 400 million."""
+    means = torch.cat([torch.zeros(20_000, 3), torch.ones(5, 3)])
+    found = nearest_neighbors(means, 4)
+    assert found.index[0].tolist() == [1, 2, 3, 4]
+    assert found.index[19_999].tolist() == [0, 1, 2, 3]
+    assert found.index[20_004].tolist() == [20_000, 20_001, 20_002, 20_003]
+
+
+def test_k_must_be_positive():
+    with pytest.raises(ValueError, match="k must be at least 1, got 0"):
+        nearest_neighbors(torch.zeros(3, 3), 0)

@@ -1,0 +1,75 @@
+"""The rasterizer once more, as loops over Python floats: written from the formulas, sharing no "
+"code with the package."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from normlift_ns import Camera, GaussianScene
+
+TILE, NEAR, BLUR, CAP, SKIP, STOP = 16, 0.01, 0.3, 0.999, 1 / 255, 1e-4
+
+
+def _rotation(q: list[float]) -> np.ndarray:
+    w, x, y, z = (v / math.sqrt(sum(c * c for c in q)) for v in q)
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def compositing_matrix(scene: GaussianScene, camera: Camera, antialiased: bool = False) -> np.ndarray:
+    """A [height, width, N] of one view, float64."""
+    K, pose = camera.K.double().numpy(), camera.world_to_camera.double().numpy()
+    width, height = camera.width, camera.height
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    splats = []
+    for j in range(len(scene)):
+        if not bool(scene.drawable[j]):
+            continue
+        x, y, z = pose[:3, :3] @ scene.means[j].double().numpy() + pose[:3, 3]
+        if z < NEAR:
+            continue
+        R = pose[:3, :3] @ _rotation(scene.quats[j].double().tolist())
+        covariance = R @ np.diag(scene.scales[j].double().numpy() ** 2) @ R.T
+        limit_x = 0.3 * width / (2 * fx)
+        limit_y = 0.3 * height / (2 * fy)
+        tx = min(max(x / z, -cx / fx - limit_x), (width - cx) / fx + limit_x)
+        ty = min(max(y / z, -cy / fy - limit_y), (height - cy) / fy + limit_y)
+        J = np.array([[fx / z, 0, -fx * tx / z], [0, fy / z, -fy * ty / z]])
+        sharp = J @ covariance @ J.T
+        blurred = sharp + BLUR * np.eye(2)
+        determinant = np.linalg.det(blurred)
+        opacity = float(scene.opacities[j])
+        if antialiased:
+            opacity *= math.sqrt(max(0.0, np.linalg.det(sharp) / determinant))
+        half_trace = 0.5 * np.trace(blurred)
+        radius = math.ceil(3 * math.sqrt(half_trace + math.sqrt(max(0.01, half_trace**2 - determinant))))
+        u, v = fx * x / z + cx, fy * y / z + cy
+        if u + radius <= 0 or u - radius >= width or v + radius <= 0 or v - radius >= height:
+            continue
+        splats.append((z, j, u, v, radius, np.linalg.inv(blurred), opacity))
+    splats.sort(key=lambda splat: (splat[0], splat[1]))
+    weights = np.zeros((height, width, len(scene)))
+    for row in range(height):
+        for column in range(width):
+            transmittance = 1.0
+            for _, j, u, v, radius, conic, opacity in splats:
+                if not math.floor((u - radius) / TILE) <= column // TILE < math.ceil((u + radius) / TILE):
+                    continue
+                if not math.floor((v - radius) / TILE) <= row // TILE < math.ceil((v + radius) / TILE):
+                    continue
+                d = np.array([column + 0.5 - u, row + 0.5 - v])
+                alpha = min(CAP, opacity * math.exp(-0.5 * d @ conic @ d))
+                if alpha < SKIP:
+                    continue
+                if transmittance * (1 - alpha) <= STOP:
+                    break
+                weights[row, column, j] = alpha * transmittance
+                transmittance *= 1 - alpha
+    return weights

@@ -1,0 +1,55 @@
+"""Both CPU backends against weights that gsplat 1.4.0's CUDA kernels gave on trained scenes."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.captures import trained_scene, training_cameras
+from normlift_ns import rasterize_evidence
+from tests.captures import fixture_view, needs_shared, weight_fixtures
+
+pytestmark = [pytest.mark.slow, needs_shared]
+scene_of = cache(trained_scene)
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+@pytest.mark.parametrize("path", weight_fixtures(), ids=lambda path: path.stem)
+def test_float32_weights_are_those_of_the_cuda_kernels(path, backend, record_property):
+    name, _, mode = path.stem.split("_")
+    scene = scene_of(name)
+    camera, labels, arrays = fixture_view(path)
+    columns = int(labels.max()) + 2
+    place = arrays["gaussian"].astype(np.int64) * columns + arrays["region"] + 1
+    expected = torch.zeros(len(scene) * columns, dtype=torch.float64)
+    expected[torch.from_numpy(place)] = torch.from_numpy(arrays["weight"]).double()
+
+    evidence = rasterize_evidence(scene, [camera], [labels], backend=backend, rasterize_mode=mode)
+    found = torch.zeros_like(expected)
+    found[evidence.rows.row_index() * columns + evidence.region + 1] = evidence.weight.double()
+    found[evidence.unlabeled.row_index() * columns] = evidence.unlabeled.weight.double()
+
+    frobenius = float((found - expected).norm() / expected.norm())
+    one_sided = float((found + expected)[(found == 0) != (expected == 0)].sum() / expected.sum())
+    total = abs(float(found.sum() / expected.sum()) - 1)
+    for key, value in (("frobenius", frobenius), ("one_sided", one_sided), ("total", total)):
+        record_property(key, value)
+    print(f"{path.stem} {backend}: Frobenius {frobenius:.1e}, one-sided weight {one_sided:.1e}, total {total:.1e}")
+    assert evidence.weight.dtype == torch.float32
+    assert frobenius <= 2e-5
+    assert one_sided < 1e-6
+    assert total < 1e-6
+    alpha = arrays["alpha"].astype(np.float64)  # stored in float16: its sum is off by up to 1e-4
+    assert abs(float(found.sum()) / alpha.sum() - 1) < 1.2e-4
+
+
+@pytest.mark.parametrize("path", weight_fixtures(), ids=lambda path: path.stem)
+def test_benchmark_cameras_are_those_that_were_trained(path):
+    """Split, world transform and undistortion of the cameras that the benchmarks use."""
+    name, view, _ = path.stem.split("_")
+    camera, labels, _ = fixture_view(path)
+    mine = training_cameras(name)[int(view.removeprefix("view"))]
+    assert (mine.width, mine.height) == (labels.shape[1], labels.shape[0])
+    assert (mine.K - camera.K).abs().max() < 1e-4
+    assert (mine.world_to_camera - camera.world_to_camera).abs().max() < 1e-6

@@ -1,0 +1,225 @@
+"""Scenes that break rasterizers, each with what must come out."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence, render
+from tests.scenes import dense, orbit, orbit_camera, random_labels, random_scene
+
+BACKENDS = ["torch", "numba"]
+
+
+def one_gaussian(
+    mean=(0.0, 0.0, 0.0), scale=(0.3, 0.3, 0.3), opacity=0.5, quat=(1.0, 0.0, 0.0, 0.0), dtype=torch.float32
+):
+    rows = (torch.tensor([x], dtype=dtype) for x in (mean, quat, scale))
+    means, quats, scales = rows
+    return GaussianScene(means, quats, scales, torch.tensor([opacity], dtype=dtype))
+
+
+def total_weight(scene: GaussianScene, camera: Camera, backend: str, **kwargs) -> torch.Tensor:
+    labels = torch.zeros(camera.height, camera.width, dtype=torch.int32)
+    return rasterize_evidence(scene, [camera], [labels], backend=backend, **kwargs).rows.row_sums()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("opacity", "peak"), [(0.0, 0.0), (1 / 256, 0.0), (0.999, 0.999), (1.0, 0.999)])
+def test_opacity_at_its_ends(backend, opacity, peak):
+    """Opacity 0 draws nothing, 1 is capped at 0.999."""
+    camera = orbit_camera(0.0, width=32, height=32)
+    camera = Camera(torch.tensor([[40.0, 0, 16.5], [0, 40, 16.5], [0, 0, 1]]), camera.world_to_camera.float(), 32, 32)
+    _, alpha = render(one_gaussian(opacity=opacity), camera, torch.ones(1, 1), backend=backend)
+    assert alpha.max().item() == pytest.approx(peak, abs=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_non_finite_gaussians_are_counted_and_not_drawn(backend, field, value):
+    scene = random_scene(20, seed=1, dtype=torch.float32, size=0.4)
+    camera = orbit_camera(0.5)
+    others = GaussianScene(*(getattr(scene, name)[1:] for name in ("means", "quats", "scales", "opacities")))
+    if field == "opacities" and value == math.inf:
+        value = math.nan  # an infinite opacity is out of range and refused
+    getattr(scene, field)[0] = value
+    with pytest.warns(UserWarning, match="1 of 20 Gaussians"):
+        evidence = rasterize_evidence(scene, [camera], [random_labels(camera, 3)], backend=backend)
+    assert evidence.num_excluded == 1
+    assert evidence.num_gaussians == 20
+    assert evidence.rows.row_sums()[0] == 0
+    expected = rasterize_evidence(others, [camera], [random_labels(camera, 3)], backend=backend)
+    assert torch.equal(evidence.weight, expected.weight)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_zero_quaternion_is_not_drawn(backend):
+    with pytest.warns(UserWarning, match="1 of 1 Gaussians"):
+        assert total_weight(one_gaussian(quat=(0.0, 0, 0, 0)), orbit_camera(0.0), backend).tolist() == [0]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "scale", [(3.0, 1e-6, 1e-6), (1e-9, 1e-9, 1e-9), (2.0, 2.0, 1e-7), (0.0, 0.0, 0.0), (50.0, 1e-8, 0.5)]
+)
+def test_needles_pancakes_and_points(backend, scale):
+    """float32 stays within 1 % of float64, or within what rounding a needle's exponent allows: never NaN."""
+    camera = orbit_camera(0.7, width=64, height=48)
+    quat = (0.9, 0.2, -0.3, 0.1)
+    exact = total_weight(one_gaussian(scale=scale, quat=quat, dtype=torch.float64), camera, backend)
+    single = total_weight(one_gaussian(scale=scale, quat=quat), camera, backend)
+    assert exact.isfinite().all()
+    assert exact.item() > 0.1
+    assert single.item() == pytest.approx(exact.item(), rel=1e-2)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("z", "drawn"), [(-1.0, False), (0.0, False), (0.00999, False), (0.0101, True), (1.0, True), (2e10, False)]
+)
+def test_near_plane_and_behind_the_camera(backend, z, drawn):
+    camera = orbit_camera(0.0, distance=0.0)
+    weight = total_weight(one_gaussian(mean=(0.0, 0.0, z), scale=(1e-3, 1e-3, 1e-3)), camera, backend)
+    assert weight.isfinite().all()
+    assert bool(weight[0] > 0) == drawn
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scale", [100.0, 1e6, 1e12, 1e20])
+def test_larger_than_the_image(backend, scale):
+    """A huge Gaussian covers every pixel with its opacity, until float32 overflows: then it is not drawn."""
+    camera = orbit_camera(0.0)
+    weight = total_weight(one_gaussian(scale=(scale,) * 3, opacity=0.25), camera, backend).item()
+    assert weight == pytest.approx(0.25 * camera.width * camera.height, rel=1e-3) or (scale >= 1e12 and weight == 0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (15, 17), (16, 16), (17, 15), (33, 1), (1, 40)])
+def test_any_image_size(backend, width, height):
+    camera = orbit_camera(0.2, width=width, height=height, focal=10.0)
+    weight = total_weight(one_gaussian(scale=(1e3,) * 3, opacity=0.5), camera, backend).item()
+    assert weight == pytest.approx(0.5 * width * height, rel=1e-3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_stack_stops_at_the_transmittance_limit(backend):
+    """40 sheets of opacity 0.5 straight ahead: the 14th would leave 2 ** -14 < 1e-4 and is not drawn."""
+    means = torch.stack([torch.zeros(40), torch.zeros(40), torch.linspace(0, 1, 40)], 1)
+    scene = GaussianScene(
+        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1), torch.full((40, 3), 1e3), torch.full((40,), 0.5)
+    )
+    weight = total_weight(scene, orbit_camera(0.0, width=8, height=8), backend) / 64
+    assert weight[:13].tolist() == pytest.approx([0.5 ** (i + 1) for i in range(13)], rel=1e-3)
+    assert weight[13:].tolist() == [0] * 27
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_views_without_regions_and_regions_without_pixels(backend):
+    scene, cameras = random_scene(30, size=0.4), orbit(3)
+    blank = torch.full((cameras[0].height, cameras[0].width), -1, dtype=torch.int32)
+    labels = [blank, random_labels(cameras[1], 2), blank]
+    evidence = rasterize_evidence(scene, cameras, labels, backend=backend, num_regions=[0, 5, 3])
+    assert evidence.num_views == 3
+    assert evidence.region_view.tolist() == [1] * 5 + [2] * 3
+    assert set(evidence.region.tolist()) <= {0, 1}
+    assert dense(evidence.unlabeled, 3).sum(0).min() > 0
+    none = rasterize_evidence(scene, cameras, [blank] * 3, backend=backend)
+    assert (none.nnz, none.num_regions, none.num_views) == (0, 0, 3)
+    assert none.view_weights().row_sums().tolist() == [0] * 30
+
+
+def test_no_view_and_no_gaussian():
+    empty = GaussianScene(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
+    camera = orbit_camera(0.0)
+    assert rasterize_evidence(random_scene(5), [], []).num_views == 0
+    for backend in BACKENDS:
+        evidence = rasterize_evidence(empty, [camera], [random_labels(camera, 2)], backend=backend)
+        assert (evidence.num_gaussians, evidence.num_views, evidence.nnz) == (0, 1, 0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_thousands_of_regions(backend):
+    scene, camera = random_scene(40, size=0.4), orbit_camera(0.0, width=80, height=70)
+    labels = torch.randperm(80 * 70, generator=torch.Generator().manual_seed(0)).view(70, 80).int() - 600
+    labels = labels.clamp(min=-1)
+    evidence = rasterize_evidence(scene, [camera], [labels], backend=backend)
+    assert evidence.num_regions == 5000
+    whole = total_weight(scene, camera, backend)
+    parts = evidence.rows.row_sums() + evidence.unlabeled.row_sums()
+    assert torch.allclose(parts, whole, rtol=1e-12, atol=0)
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**31))
+def test_backends_agree_and_float32_is_near_float64(seed):
+    scene = random_scene(80, seed=seed, dtype=torch.float32, size=0.5)
+    cameras = orbit(2)
+    labels = [random_labels(camera, 5, seed=seed) for camera in cameras]
+
+    def matrix(backend: str, dtype: torch.dtype) -> torch.Tensor:
+        evidence = rasterize_evidence(scene, cameras, labels, backend=backend, dtype=dtype, num_regions=[5, 5])
+        return dense(evidence.rows, 10)
+
+    exact = matrix("torch", torch.float64)
+    assert (matrix("numba", torch.float64) - exact).abs().max() < 1e-11
+    assert (matrix("numba", torch.float32) - exact).norm() < 1e-4 * exact.norm()
+    assert (matrix("torch", torch.float32) - exact).norm() < 1e-4 * exact.norm()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_bitwise_equal_between_runs_and_invariant_to_order_and_shards(backend):
+    scene = random_scene(300, seed=7, dtype=torch.float32, size=0.4)
+    cameras = orbit(4)
+    labels = [random_labels(camera, 4, seed=v) for v, camera in enumerate(cameras)]
+    counts = [4] * 4
+    whole = rasterize_evidence(scene, cameras, labels, num_regions=counts, backend=backend)
+    again = rasterize_evidence(scene, iter(cameras), (x for x in labels), num_regions=iter(counts), backend=backend)
+    shards = [rasterize_evidence(scene, [c], [x], num_regions=[4], backend=backend) for c, x in zip(cameras, labels)]
+    for other in (again, Evidence.merge(*shards)):
+        for name in ("offsets", "region", "weight", "region_view"):
+            assert torch.equal(getattr(whole, name), getattr(other, name))
+        assert torch.equal(whole.unlabeled.weight, other.unlabeled.weight)
+
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(1))
+    shuffled = GaussianScene(*(getattr(scene, name)[order] for name in ("means", "quats", "scales", "opacities")))
+    other = rasterize_evidence(shuffled, cameras, labels, num_regions=counts, backend=backend)
+    assert torch.allclose(dense(other.rows, 16), dense(whole.rows, 16)[order], rtol=1e-4, atol=1e-5)
+
+
+def test_progress_streams_and_says_how_far():
+    scene, cameras = random_scene(5), orbit(3)
+    labels = [random_labels(camera, 2) for camera in cameras]
+    calls: list[tuple[int, int | None]] = []
+    rasterize_evidence(scene, cameras, labels, progress=lambda done, total: calls.append((done, total)))
+    rasterize_evidence(scene, iter(cameras), iter(labels), progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(1, 3), (2, 3), (3, 3), (1, None), (2, None), (3, None)]
+
+
+CAMERA = orbit_camera(0.0)
+GOOD = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.int32)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"labels": [GOOD.float()]}, "labels of view 0 must be an integer tensor, got torch.float32"),
+        ({"labels": [GOOD[:, 1:]]}, r"labels of view 0 have shape \(35, 39\), but its camera is 35 x 40"),
+        ({"labels": [GOOD - 2]}, "labels of view 0 contain -2"),
+        ({"labels": []}, "labels ended after 0 views"),
+        ({"labels": [GOOD, GOOD]}, "cameras ended after 1 views"),
+        ({"num_regions": [0]}, "contain region 0, but num_regions says 0"),
+        ({"num_regions": []}, "num_regions ended after 0 views"),
+        ({"backend": "cuda"}, 'backend must be "auto", "torch" or "numba"'),
+        ({"rasterize_mode": "smooth"}, 'rasterize_mode must be "classic" or "antialiased"'),
+        ({"weight_power": 3}, "weight_power must be 0, 1 or 2, got 3"),
+    ],
+)
+def test_bad_input_is_named(kwargs, message):
+    arguments = {"labels": [GOOD], **kwargs}
+    with pytest.raises(ValueError, match=message):
+        rasterize_evidence(random_scene(3), [CAMERA], **arguments)
+    with pytest.raises(ValueError, match=r"values must be \[3, C\]"):
+        render(random_scene(3), CAMERA, torch.zeros(2, 1))
