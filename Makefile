@@ -27,6 +27,7 @@ demo: .venv/installed
 
 bench: .venv/installed
 	$(BIN)/python -m benchmarks.cpu
+	$(BIN)/python -m benchmarks.forms
 
 format: .venv/installed
 	$(BIN)/ruff check --fix .

@@ -1,4 +1,4 @@
-"""Trained captures for benchmarks: Gaussians, and cameras as splatfacto sees them (split, world transform, undistortion)."""
+"""Trained captures for benchmarks: Gaussians, and cameras as splatfacto sees them (split, transform, undistortion)."""
 
 from __future__ import annotations
 
@@ -29,6 +29,12 @@ def trained_scene(name: str) -> GaussianScene:
     return GaussianScene(means, quats, scales.exp(), opacities.sigmoid().squeeze(-1))
 
 
+def training_indices(name: str) -> list[int]:
+    """Frames, in order of their names, that nerfstudio's 90 % split trains on."""
+    count = len(json.loads((SHARED / "captures" / name / "transforms.json").read_text())["frames"])
+    return np.linspace(0, count - 1, math.ceil(count * 0.9), dtype=int).tolist()
+
+
 def training_cameras(name: str) -> list[Camera]:
     """Cameras of the 90 % training split, lens distortion taken out as nerfstudio's full-image data manager does it."""
     capture = SHARED / "captures" / name
@@ -36,10 +42,9 @@ def training_cameras(name: str) -> list[Camera]:
     run = SHARED / "captures" / "outputs" / name / "splatfacto" / "run"
     world = json.loads((run / "dataparser_transforms.json").read_text())
     frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
-    train = np.linspace(0, len(frames) - 1, math.ceil(len(frames) * 0.9), dtype=int)
     K, width, height = _undistorted_intrinsics(meta)
     cameras = []
-    for i in train:
+    for i in training_indices(name):
         pose = np.array(world["transform"] + [[0, 0, 0, 1]]) @ np.array(frames[i]["transform_matrix"])
         pose[:3, 3] *= world["scale"]
         pose[:, 1:3] *= -1  # OpenGL to OpenCV

@@ -1,0 +1,31 @@
+"""The benchmarks run and report what they promise; the errors beside the times are small."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.captures import needs_shared
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.slow
+@needs_shared
+def test_quick_cpu_benchmark(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.cpu", "--quick", "--output", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    print(done.stdout)
+    document = json.loads((tmp_path / "cpu.json").read_text())
+    assert set(document) == {"hardware", "versions", "command", "metrics"}
+    metrics = {metric["key"]: metric for metric in document["metrics"]}
+    assert all(set(metric) == {"key", "value", "unit", "error"} for metric in metrics.values())
+    assert {"fox_evidence_s", "fox_evidence_peak_gib", "fox_lift_s", "fox_refine_s"} <= set(metrics)
+    assert metrics["fox_evidence_rel_error"]["value"] < 1e-4
+    assert metrics["fox_lift_s"]["error"] < 1e-5
+    assert metrics["fox_directions_s"]["error"] < 1e-4
+    assert metrics["fox_refine_s"]["error"] < 5e-3
+    assert metrics["fox_evidence_peak_gib"]["value"] < 3
