@@ -11,72 +11,20 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
-from jaxtyping import Bool, Float, Float16, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.files import atomic_path
+from normlift_ns.core.forms import DirectionForm, EvidenceForm, Scalars, direction_form, sizes_and_bounds
 from normlift_ns.core.lift import Lifted
-from normlift_ns.core.lowrank import half_precision_error, smallest_basis
+from normlift_ns.core.lowrank import smallest_basis
 from normlift_ns.core.query import RelevancyForm, relevancy
 
 Form = Literal["evidence", "float16", "low_rank"]
 SCHEMA_VERSION = 1
-_QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
-
-
-@dataclass(frozen=True)
-class Scalars:
-    """The numbers of every Gaussian, [N] each; see `Lifted` for their meaning."""
-
-    norm: Float[Tensor, " n"]
-    c_intra: Float[Tensor, " n"]
-    c_inter: Float[Tensor, " n"]
-    n_eff: Float[Tensor, " n"]
-    reliability: Float[Tensor, " n"]
-    weight: Float[Tensor, " n"]
-    view_count: Int32[Tensor, " n"]
-
-
-@dataclass(frozen=True)
-class EvidenceForm:
-    """E and F themselves: exact, and ready for another encoder."""
-
-    evidence: Evidence
-    features: Float[Tensor, "s d"]
-
-    def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        table = (self.features.double() @ vectors.double().T).to(torch.float64)
-        length = scalars.weight.double() * scalars.norm.double()
-        sums = self.evidence.rows.matmul(table)
-        return torch.where((length > 0)[:, None], sums / length[:, None], 0.0).clamp(-1, 1).float()
-
-    def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
-        sums = self.evidence.rows.select_rows(gaussians).sums_of_unit_rows(self.features)
-        found = (scalars.norm[gaussians] > 0)[:, None]
-        return torch.where(found, sums / torch.linalg.vector_norm(sums, dim=1, keepdim=True), 0.0).float()
-
-
-@dataclass(frozen=True)
-class DirectionForm:
-    """Directions in float16, of the M Gaussians with evidence only, as they are or as coordinates in a basis."""
-
-    coordinates: Float16[Tensor, "m r"]
-    basis: Float[Tensor, "r d"] | None
-
-    def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
-        out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
-        out[scalars.norm > 0] = torch.cat([block.float() @ projected.T for block in self.coordinates.split(2**16)])
-        return out
-
-    def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
-        found = scalars.norm > 0
-        row = (found.cumsum(0) - 1)[gaussians].clamp(min=0)
-        rows = self.coordinates[row].float() if self.basis is None else self.coordinates[row].float() @ self.basis
-        return torch.where(found[gaussians][:, None], torch.nn.functional.normalize(rows, dim=1), 0.0)
 
 
 @dataclass(frozen=True)
@@ -131,31 +79,7 @@ class SemanticField:
         if form not in (*get_args(Form), "auto"):
             raise ValueError(f"form must be auto, {', '.join(get_args(Form))}; got {form!r}")
         basis = smallest_basis(lifted, tolerance)
-        with_evidence = int((lifted.norm > 0).sum())
-        evidence = lifted.evidence
-        forms: dict[str, dict[str, Any]] = {
-            "evidence": {"bytes": evidence_bytes(evidence) + 4 * lifted.features.numel(), "bound": 0.0},
-            "float16": {"bytes": 2 * with_evidence * dimension, "bound": half_precision_error(dimension)},
-        }
-        if basis is not None:
-            rank = len(basis.rows)
-            bound = basis.bound[lifted.norm > 0] + half_precision_error(rank)
-            quantiles = (
-                {
-                    str(q): float(bound.quantile(q))
-                    if bound.numel() < 2**24
-                    else float(bound.kthvalue(max(1, round(q * bound.numel()))).values)
-                    for q in _QUANTILES
-                }
-                if bound.numel()
-                else {}
-            )
-            forms["low_rank"] = {
-                "bytes": 2 * with_evidence * rank + 4 * rank * dimension,
-                "bound": quantiles.get("1.0", 0.0),
-                "rank": rank,
-                "bound_quantiles": quantiles,
-            }
+        forms = sizes_and_bounds(lifted, basis)
         if form == "auto":
             form = min(
                 (name for name, facts in forms.items() if facts["bound"] <= tolerance),
@@ -166,12 +90,12 @@ class SemanticField:
                 f"no basis keeps every Gaussian within tolerance {tolerance}; raise it, or take form float16 or "
                 "evidence"
             )
-        store = (
-            EvidenceForm(evidence, lifted.features.float())
-            if form == "evidence"
-            else _directions(lifted, basis.rows if form == "low_rank" and basis else None)
-        )
+        if form == "evidence":
+            store = EvidenceForm(lifted.evidence, lifted.features.float())
+        else:
+            store = direction_form(lifted, basis.rows if form == "low_rank" and basis is not None else None)
         manifest = {
+            **(provenance or {}),
             "schema_version": SCHEMA_VERSION,
             "num_gaussians": n,
             "dimension": dimension,
@@ -179,7 +103,6 @@ class SemanticField:
             "form": form,
             "tolerance": tolerance,
             "forms": forms,
-            **(provenance or {}),
         }
         scalars = Scalars(**{f.name: _single(getattr(lifted, f.name)) for f in fields(Scalars)})
         identity = torch.arange(n, dtype=torch.int32, device=lifted.norm.device)
@@ -300,29 +223,6 @@ class SemanticField:
 def fingerprint(means: Float[Tensor, "n 3"]) -> str:
     """BLAKE2 of the float32 bytes of the means: tells two sets of Gaussians apart."""
     return hashlib.blake2b(means.detach().float().contiguous().cpu().numpy().tobytes(), digest_size=16).hexdigest()
-
-
-def evidence_bytes(evidence: Evidence) -> int:
-    """Bytes of the evidence's arrays."""
-    blank = evidence.unlabeled
-    arrays = (
-        evidence.offsets,
-        evidence.region,
-        evidence.weight,
-        evidence.region_view,
-        blank.offsets,
-        blank.column,
-        blank.weight,
-    )
-    return sum(a.numel() * a.element_size() for a in arrays)
-
-
-def _directions(lifted: Lifted, basis: Tensor | None) -> DirectionForm:
-    blocks = []
-    for first, block in lifted.iter_directions():
-        rows = block[lifted.norm[first : first + len(block)] > 0]
-        blocks.append((rows if basis is None else torch.nn.functional.normalize(rows.double() @ basis.T, dim=1)).half())
-    return DirectionForm(torch.cat(blocks), None if basis is None else basis.float())
 
 
 def _single(values: Tensor) -> Tensor:

@@ -51,21 +51,15 @@ class Lifted:
     """The feature table, normalised, in the precision of the lift."""
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None) -> Float[Tensor, "m d"]:
-        """u_j of all or of some Gaussians, unit rows, 0 without evidence. Any subset gives the same "
-        "rows as the whole."""
+        """u_j of all or some Gaussians, unit rows, 0 without evidence. Any subset gives the same rows as the whole."""
         rows = self.evidence.rows if gaussians is None else self.evidence.rows.select_rows(gaussians)
         norm = self.norm if gaussians is None else self.norm[gaussians]
-        return torch.cat(
-            [
-                _normalized(block, norm[first : first + len(block)], self.features)
-                for first, block in rows.chunks(self.features.shape[1])
-            ]
-        )
+        blocks = (block for _, block in _directions(rows, norm, self.features))
+        return torch.cat([self.features.new_zeros(0, self.features.shape[1]), *blocks])
 
     def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
         """u_j in blocks of consecutive Gaussians, (first Gaussian, block), with bounded memory."""
-        for first, block in self.evidence.rows.chunks(self.features.shape[1]):
-            yield first, _normalized(block, self.norm[first : first + len(block)], self.features)
+        return _directions(self.evidence.rows, self.norm, self.features)
 
 
 def lift(
@@ -155,10 +149,11 @@ def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
     return segment_sum(norms, torch.searchsorted(groups, evidence.offsets))
 
 
-def _normalized(rows: SparseRows, norm: Tensor, table: Tensor) -> Tensor:
-    sums = rows.sums_of_unit_rows(table)
-    length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
-    return torch.where((norm > 0)[:, None], sums / length, 0.0)
+def _directions(rows: SparseRows, norm: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
+    for first, block in rows.chunks(table.shape[1]):
+        sums = block.sums_of_unit_rows(table)
+        length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
+        yield first, torch.where((norm[first : first + len(block)] > 0)[:, None], sums / length, 0.0)
 
 
 def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, Lifted, SemanticField, lift, relevancy
-from normlift_ns.core.field import EvidenceForm, fingerprint
+from normlift_ns.core.field import fingerprint
+from normlift_ns.core.forms import EvidenceForm
 from normlift_ns.core.lowrank import basis_of_rank, spectral_table
 from tests.captures import clip_vectors, needs_shared
 from tests.scenes import generator, random_evidence, unit_rows
