@@ -1,5 +1,6 @@
-"""Evidence E_js: how much weight Gaussian j has in image region s. Independent of any feature, "
-"it is all that rasterizing yields."""
+"""Evidence E_js: how much weight Gaussian j has in image region s. Independent of any feature, it is all that
+rasterizing yields.
+"""
 
 from __future__ import annotations
 
@@ -139,15 +140,17 @@ class Evidence:
         return torch.cat([starts.nonzero().squeeze(1), self.offsets[-1:]])
 
     def view_weights(self) -> SparseRows:
-        """W_jv: weight of Gaussian j in the labelled pixels of view v, [N, views], one entry per pair "
-        "with evidence, float64."""
+        """W_jv: weight of Gaussian j in the labelled pixels of view v, [N, views], one entry per pair with evidence,
+        float64.
+        """
         groups = self.view_group_offsets
         view = self.region_view[self.region[groups[:-1]].long()]
         return SparseRows(torch.searchsorted(groups, self.offsets), view, segment_sum(self.weight, groups))
 
     def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
-        """Columns of the given views, in their order: features[evidence.columns_of(v)] is the table of "
-        "evidence.select_views(v)."""
+        """Columns of the given views, in their order: features[evidence.columns_of(v)] is the table of
+        evidence.select_views(v).
+        """
         bounds = torch.searchsorted(
             self.region_view, torch.arange(self.num_views + 1, dtype=torch.int32, device=self.region_view.device)
         ).tolist()

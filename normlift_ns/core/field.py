@@ -1,5 +1,6 @@
-"""`SemanticField`: what a lift leaves on disk, in the smallest form that meets the asked "
-"tolerance, and how it answers text."""
+"""`SemanticField`: what a lift leaves on disk, in the smallest form that meets the asked tolerance, and how it
+answers text.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +37,9 @@ class SemanticField:
     """The refined direction of Gaussian i is that of source[i]; source[i] = i where nothing was refined."""
     store: EvidenceForm | DirectionForm
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    """What is known of the field: form, sizes and bounds of all three forms, fingerprint of the "
-    "means, provenance. JSON types only."""
+    """What is known of the field: form, sizes and bounds of all three forms, fingerprint of the means, provenance.
+    JSON types only.
+    """
 
     def __len__(self) -> int:
         return self.source.numel()
@@ -139,8 +141,9 @@ class SemanticField:
         form: RelevancyForm = "cosine",
         refined: bool = True,
     ) -> Float[Tensor, "n q"]:
-        """`query` followed by `relevancy` of module query; a Gaussian without a direction gets 0 (form "
-        ""margin": -2), never a find."""
+        """`query` followed by `relevancy` of module query; a Gaussian without a direction gets 0 (form "margin": -2),
+        never a find.
+        """
         count = len(text_vectors)
         cosine = self.query(
             text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined

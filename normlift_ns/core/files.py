@@ -10,8 +10,9 @@ from pathlib import Path
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yields a temporary name beside `path`; renames it to `path` on success, removes it on any "
-    "failure, Ctrl-C included."""
+    """Yields a temporary name beside `path`; renames it to `path` on success, removes it on any failure, Ctrl-C
+    included.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield temporary

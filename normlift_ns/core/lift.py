@@ -29,8 +29,9 @@ Unlabeled = Literal["ignore", "dilute"]
 
 @dataclass(frozen=True)
 class Lifted:
-    """What a lift knows of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all is 0 but "
-    "`view_count` and `weight`."""
+    """What a lift knows of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all is 0 but `view_count` and
+    `weight`.
+    """
 
     norm: Float[Tensor, " n"]
     """||f_j||, in 0..1."""
@@ -140,8 +141,9 @@ def _row_norms(rows: SparseRows, table: Tensor) -> Tensor:
 
 
 def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
-    """sum_v ||S_jv|| per Gaussian. A view that shows a Gaussian in one region only, the common "
-    "case, needs no vector: ||S_jv|| = E_js."""
+    """sum_v ||S_jv|| per Gaussian. A view that shows a Gaussian in one region only, the common case, needs no vector:
+    ||S_jv|| = E_js.
+    """
     groups = evidence.view_group_offsets
     norms = segment_sum(evidence.weight, groups)
     several = (groups.diff() > 1).nonzero().squeeze(1)

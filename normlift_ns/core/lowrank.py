@@ -1,5 +1,6 @@
-"""Directions in a low-rank basis of the scene's own feature table, with a bound on what that "
-"costs every Gaussian in any query."""
+"""Directions in a low-rank basis of the scene's own feature table, with a bound on what that costs every Gaussian in
+any query.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +17,9 @@ _ROUNDING = 1e-6
 
 
 def half_precision_error(dimension: int) -> float:
-    """Bound on the length of the error of a unit vector rounded to float16: 2**-11 relative, and "
-    "2**-25 per component near zero."""
+    """Bound on the length of the error of a unit vector rounded to float16: 2**-11 relative, and 2**-25 per component
+    near zero.
+    """
     return 2.0**-11 + dimension**0.5 * 2.0**-25
 
 
@@ -26,8 +28,9 @@ class Basis(NamedTuple):
 
     rows: Float64[Tensor, "r d"]
     bound: Float64[Tensor, " n"]
-    """Largest |<u_j, t> - <u'_j, t>| over all unit t, with u' the projected and renormalised "
-    "direction; 0 without evidence."""
+    """Largest |<u_j, t> - <u'_j, t>| over all unit t, with u' the projected and renormalised direction; 0 without
+    evidence.
+    """
 
 
 class SpectralTable(NamedTuple):
@@ -64,8 +67,9 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
 
 
 def smallest_basis(lifted: Lifted, tolerance: float) -> Basis | None:
-    """The basis of least rank that keeps every Gaussian's bound, float16 coordinates included, "
-    "within `tolerance`; None if none does."""
+    """The basis of least rank that keeps every Gaussian's bound, float16 coordinates included, within `tolerance`;
+    None if none does.
+    """
     table = spectral_table(lifted.features)
     low, high, best = 1, lifted.features.shape[1] + 1, None
     while low < high:  # the bound falls with the rank

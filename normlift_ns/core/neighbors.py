@@ -59,8 +59,9 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
 def _rank_gaussians(
     tree: KDTree, place_of: np.ndarray, near: np.ndarray, reach: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For every place its `count` nearest Gaussians (-1 where there are fewer) and their distances, "
-    "sorted by (distance, index)."""
+    """For every place its `count` nearest Gaussians (-1 where there are fewer) and their distances, sorted by
+    (distance, index).
+    """
     by_place = np.argsort(place_of, kind="stable")
     population = np.bincount(place_of)
     first = np.cumsum(population) - population

@@ -26,8 +26,9 @@ class RefineConfig:
     k: int = 36
     """K, number of neighbours, >= 1."""
     sigma_d: float = 3.0
-    """Width of the spatial decay, > 0, in units of the scene's median distance to the nearest "
-    "Gaussian at another place (scenes are rescaled)."""
+    """Width of the spatial decay, > 0, in units of the scene's median distance to the nearest Gaussian at another
+    place (scenes are rescaled).
+    """
     tau: float = 0.8
     """Cosine at which two directions half agree, in -1..1."""
     gamma: float = 0.05
@@ -111,8 +112,9 @@ def spatial_decay(neighbors: Neighbors, config: RefineConfig, rows: Tensor) -> F
 
 
 def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """True where neither a Gaussian nor any neighbour has R > 0: the regions that voting cannot "
-    "repair (limitation 4 of the paper)."""
+    """True where neither a Gaussian nor any neighbour has R > 0: the regions that voting cannot repair (limitation 4
+    of the paper).
+    """
     return (reliability <= 0) & (_gather(reliability, neighbors.index) <= 0).all(dim=1)
 
 

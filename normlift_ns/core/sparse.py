@@ -30,8 +30,9 @@ def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float
 
 @dataclass(frozen=True)
 class SparseRows:
-    """A sparse matrix by rows (CSR): row i holds columns column[offsets[i]:offsets[i + 1]], "
-    "ascending, with their weights."""
+    """A sparse matrix by rows (CSR): row i holds columns column[offsets[i]:offsets[i + 1]], ascending, with their
+    weights.
+    """
 
     offsets: Int64[Tensor, " rows_plus_1"]
     column: Int32[Tensor, " nnz"]
@@ -93,8 +94,9 @@ class SparseRows:
         )
 
     def chunks(self, row_size: int) -> Iterator[tuple[int, SparseRows]]:
-        """Consecutive blocks of rows, (first row, block), small enough that block rows x row_size stays "
-        "near 2**24 elements."""
+        """Consecutive blocks of rows, (first row, block), small enough that block rows x row_size stays near 2**24
+        elements.
+        """
         step = max(1, _CHUNK_ELEMENTS // max(1, row_size))
         for first in range(0, len(self), step):
             offsets = self.offsets[first : first + step + 1]
@@ -102,8 +104,9 @@ class SparseRows:
             yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
 
     def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """`matmul` with a table of unit rows; sums that nearly cancel are recomputed in float64, so "
-        "that their direction is right."""
+        """`matmul` with a table of unit rows; sums that nearly cancel are recomputed in float64, so that their
+        direction is right.
+        """
         sums = self.matmul(table)
         if table.dtype == torch.float64:
             return sums

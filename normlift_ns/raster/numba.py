@@ -1,5 +1,6 @@
-"""The compiled CPU rasterizer: the reference's sums, one thread per tile, touching only the "
-"pixels that a Gaussian reaches."""
+"""The compiled CPU rasterizer: the reference's sums, one thread per tile, touching only the pixels that a Gaussian
+reaches.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +18,9 @@ from normlift_ns.raster.projection import Projected, Tiles
 from normlift_ns.raster.settings import RasterSettings
 
 _REACH_MARGIN = 1e-2
-"""Added to the exponent at which alpha falls below min_alpha, so that rounding in a Gaussian's "
-"reach never costs a pixel."""
+"""Added to the exponent at which alpha falls below min_alpha, so that rounding in a Gaussian's reach never costs a
+pixel.
+"""
 
 
 def view_evidence(
@@ -67,8 +69,9 @@ def _inputs(projected: Projected, settings: RasterSettings):
 
 @numba.njit(cache=True)
 def _tile_labels(labels, tile, size, local, distinct):  # pragma: no cover (compiled)
-    """Numbers the labels of a tile 0, 1, … in order of appearance; fills local[pixel] and "
-    "distinct[number], returns how many."""
+    """Numbers the labels of a tile 0, 1, … in order of appearance; fills local[pixel] and distinct[number], returns
+    how many.
+    """
     height, width = labels.shape
     columns = (width + size - 1) // size
     top, left = tile // columns * size, tile % columns * size

@@ -1,5 +1,6 @@
-"""From Gaussians and a camera to depth-sorted 2D Gaussians and tile lists, exactly as gsplat "
-"1.4.0 does (utils.cuh, isect_tiles.cu)."""
+"""From Gaussians and a camera to depth-sorted 2D Gaussians and tile lists, exactly as gsplat 1.4.0 does (utils.cuh,
+isect_tiles.cu).
+"""
 
 from __future__ import annotations
 
@@ -36,8 +37,9 @@ class Projected(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """Lists of Gaussians by tile, row by row of tiles; members[offsets[t]:offsets[t + 1]] index "
-    "`Projected`, nearest first."""
+    """Lists of Gaussians by tile, row by row of tiles; members[offsets[t]:offsets[t + 1]] index `Projected`, nearest
+    first.
+    """
 
     offsets: Int64[Tensor, " tiles_plus_1"]
     members: Int32[Tensor, " intersections"]

@@ -1,5 +1,6 @@
-"""The reference rasterizer: plain torch, tile by tile, any device and precision. Slow, and the "
-"measure of every other backend."""
+"""The reference rasterizer: plain torch, tile by tile, any device and precision. Slow, and the measure of every other
+backend.
+"""
 
 from __future__ import annotations
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Constants of gsplat 1.4.0's kernels, as splatfacto calls them (fully_fused_projection_fwd.cu, "
-    "isect_tiles.cu, rasterize_to_pixels_fwd.cu)."""
+    """Constants of gsplat 1.4.0's kernels, as splatfacto calls them (fully_fused_projection_fwd.cu, isect_tiles.cu,
+    rasterize_to_pixels_fwd.cu).
+    """
 
     near_plane: float = 0.01
     """Gaussians whose centre is nearer than this (world units) are not drawn."""

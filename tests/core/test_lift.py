@@ -154,8 +154,9 @@ def test_observations_that_cancel_exactly_have_no_direction(dtype):
 @pytest.mark.parametrize("gap", [1e-1, 1e-3, 1e-4, 1e-5])
 @pytest.mark.parametrize("same_view", [True, False])
 def test_observations_that_nearly_cancel_keep_their_digits(gap, same_view):
-    """float32 features half turned against each other by all but `gap`: norm and direction as "
-    "float64 gives them for the same numbers."""
+    """float32 features half turned against each other by all but `gap`: norm and direction as float64 gives them for
+    the same numbers.
+    """
     g = generator(1)
     features = torch.nn.functional.normalize(torch.randn(1, 512, generator=g).double(), dim=1)
     other = torch.nn.functional.normalize(-features + gap * torch.randn(1, 512, generator=g).double() / 512**0.5, dim=1)

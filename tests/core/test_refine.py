@@ -98,8 +98,9 @@ def test_a_margin_that_nobody_clears_is_the_identity(config):
 
 
 def test_unreliable_neighbourhoods_stay_untouched_and_are_counted():
-    """Two clusters far apart; nobody in the second is reliable, so nothing there can be repaired "
-    "(limitation 4 of the paper)."""
+    """Two clusters far apart; nobody in the second is reliable, so nothing there can be repaired (limitation 4 of the
+    paper).
+    """
     means, u, r = scene(3)
     means[30:] += 1000
     r[30:] = 0

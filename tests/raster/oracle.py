@@ -1,5 +1,4 @@
-"""The rasterizer once more, as loops over Python floats: written from the formulas, sharing no "
-"code with the package."""
+"""The rasterizer once more, as loops over Python floats: written from the formulas, sharing no code."""
 
 from __future__ import annotations
 
