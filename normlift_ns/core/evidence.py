@@ -21,6 +21,9 @@ from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 
 _FORMAT = "normlift_ns.evidence/1"
 
+UNLABELED, MASKED = -1, -2
+"""Labels of pixels without a region, and of pixels that are no observation at all."""
+
 
 class ViewEvidence(NamedTuple):
     """Entries of one view, distinct and sorted by (gaussian, region)."""

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from normlift_ns.core.evidence import ViewEvidence
+from normlift_ns.core.evidence import UNLABELED, ViewEvidence
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.raster.projection import Projected, Tiles
 from normlift_ns.raster.settings import RasterSettings
@@ -41,7 +41,7 @@ def view_evidence(
     _fill_slots(
         offsets, tiles.members.numpy(), *arrays, label_map, first_slot, slots, weight_power, settings.tile_size, limits
     )
-    used = np.flatnonzero(slots[0])
+    used = np.flatnonzero((slots[0] > 0) & (slots[2] >= UNLABELED))
     weight, member, region = (torch.from_numpy(x[used]) for x in slots)
     gaussian, region, weight = sum_duplicates(projected.gaussian[member.long()], region + 1, weight)
     return ViewEvidence(gaussian, region - 1, weight.to(projected.opacities.dtype), num_regions)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.evidence import Evidence, ViewEvidence
+from normlift_ns.core.evidence import MASKED, UNLABELED, Evidence, ViewEvidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.raster import reference
 from normlift_ns.raster.projection import assign_tiles, project, to_world
@@ -45,7 +45,8 @@ def rasterize_evidence(
         scene: N Gaussians. Those with non-finite parameters are not drawn; they are counted in the result, with a
             warning.
         cameras: one per view.
-        labels: per view an integer tensor [height, width] of view-local region ids 0, 1, …; -1 = unlabelled.
+        labels: per view an integer tensor [height, width] of view-local region ids 0, 1, …; -1 = unlabelled;
+            -2 = masked: the pixel is no observation at all, whatever `lift` does with unlabelled ones.
         num_regions: regions (columns, feature rows) per view; by default the largest id + 1. Needed where a table has
             rows that no pixel shows.
         backend: "torch" (the reference, any device), "numba" (compiled, CPU), "auto" (by the scene's device).
@@ -79,9 +80,8 @@ def rasterize_evidence(
             regions = _check_labels(index, camera, label_map, count)
             projected = project(world, camera, settings, rasterize_mode == "antialiased")
             tiles = assign_tiles(projected, camera.width, camera.height, settings.tile_size)
-            views.append(
-                view_evidence(projected, tiles, label_map.to(scene.means.device), regions, weight_power, settings)
-            )
+            there = label_map.to(scene.means.device)
+            views.append(view_evidence(projected, tiles, there, regions, weight_power, settings))
             if progress is not None:
                 progress(index + 1, total)
     return Evidence.from_views(views, len(scene), weight_power=weight_power, num_excluded=num_excluded)
@@ -171,8 +171,8 @@ def _check_labels(index: int, camera: Camera, labels: Tensor, count: int | None)
             f"{camera.width} (height x width)"
         )
     low, high = int(labels.min()), int(labels.max())
-    if low < -1:
-        raise ValueError(f"labels of view {index} contain {low}; region ids start at 0, and -1 means unlabelled")
+    if low < MASKED:
+        raise ValueError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
     if count is not None and high >= count:
         raise ValueError(f"labels of view {index} contain region {high}, but num_regions says {count}")
-    return high + 1 if count is None else count
+    return max(high, UNLABELED) + 1 if count is None else count

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from normlift_ns.core.evidence import ViewEvidence
+from normlift_ns.core.evidence import UNLABELED, ViewEvidence
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.raster.projection import Projected, Tiles
 from normlift_ns.raster.settings import RasterSettings
@@ -46,7 +46,7 @@ def view_evidence(
         weight = torch.where(a > 0, a.double() ** weight_power, 0.0)
         region, local = labels[rows, columns].flatten().unique(return_inverse=True)
         sums = weight.new_zeros(region.numel(), member.numel()).index_add_(0, local, weight)
-        r, k = sums.nonzero(as_tuple=True)
+        r, k = (sums * (region >= UNLABELED)[:, None]).nonzero(as_tuple=True)
         found.append((projected.gaussian[member[k]], region[r], sums[r, k]))
     none = torch.zeros(0, dtype=torch.int64, device=labels.device)
     gaussian, region, weight = (torch.cat(parts) for parts in zip((none, none, none.double()), *found))

@@ -141,6 +141,25 @@ def test_no_view_and_no_gaussian():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_masked_pixels_are_no_observation(backend):
+    scene, camera = random_scene(40, size=0.4), orbit_camera(0.0)
+    labels = random_labels(camera, 3)
+    masked = labels.clone()
+    masked[:, 20:] = -2
+    evidence = rasterize_evidence(scene, [camera], [masked], num_regions=[3], backend=backend)
+    whole = rasterize_evidence(scene, [camera], [labels], num_regions=[3], backend=backend)
+    assert evidence.rows.row_sums().sum() < whole.rows.row_sums().sum()
+    assert evidence.unlabeled.row_sums().sum() < whole.unlabeled.row_sums().sum()
+    kept = torch.zeros(camera.height, camera.width, dtype=torch.float64)
+    kept[:, :20] = 1
+    _, alpha = render(scene, camera, torch.zeros(40, 1).double(), backend=backend)
+    total = evidence.rows.row_sums().sum() + evidence.unlabeled.row_sums().sum()
+    assert total.item() == pytest.approx((alpha * kept).sum().item(), rel=1e-12)
+    nothing = rasterize_evidence(scene, [camera], [torch.full_like(labels, -2)], backend=backend)
+    assert (nothing.nnz, nothing.unlabeled.weight.numel(), nothing.num_regions) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_thousands_of_regions(backend):
     scene, camera = random_scene(40, size=0.4), orbit_camera(0.0, width=80, height=70)
     labels = torch.randperm(80 * 70, generator=torch.Generator().manual_seed(0)).view(70, 80).int() - 600
@@ -207,7 +226,7 @@ GOOD = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.int32)
     [
         ({"labels": [GOOD.float()]}, "labels of view 0 must be an integer tensor, got torch.float32"),
         ({"labels": [GOOD[:, 1:]]}, r"labels of view 0 have shape \(35, 39\), but its camera is 35 x 40"),
-        ({"labels": [GOOD - 2]}, "labels of view 0 contain -2"),
+        ({"labels": [GOOD - 3]}, "labels of view 0 contain -3"),
         ({"labels": []}, "labels ended after 0 views"),
         ({"labels": [GOOD, GOOD]}, "cameras ended after 1 views"),
         ({"num_regions": [0]}, "contain region 0, but num_regions says 0"),
