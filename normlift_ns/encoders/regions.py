@@ -1,0 +1,201 @@
+"""Cutting images into regions: superpixels, a grid, or label maps from files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int32, UInt8
+from skimage.segmentation import slic
+from torch import Tensor
+
+from normlift_ns.encoders.images import read_pixels
+
+_SUFFIXES = (".png", ".npy")
+
+
+@dataclass(frozen=True)
+class Superpixels:
+    """Regions of about the same size that follow the edges of the image: SLIC on CIELAB colour and position.
+
+    Raises:
+        ValueError: a count below 1, a compactness that is not positive.
+    """
+
+    count: int = 256
+    """Superpixels per image, about; at least 1. An image gets no more than it has pixels."""
+    compactness: float = 10.0
+    """How much closeness in space counts against closeness in colour, > 0; higher gives squarer regions."""
+
+    def __post_init__(self) -> None:
+        _check_count(self.count)
+        if not self.compactness > 0:
+            raise ValueError(f"compactness of superpixels must be positive, got {self.compactness}")
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "superpixel", "count": self.count, "compactness": self.compactness}
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        return ()
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
+        found = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
+        return _compact(found, np.ones(found.shape, dtype=bool))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square cells of one size; those at the right and lower edge are cut off.
+
+    Raises:
+        ValueError: a count below 1.
+    """
+
+    count: int = 256
+    """Cells per image, about; at least 1. The side of a cell is a whole number of pixels."""
+
+    def __post_init__(self) -> None:
+        _check_count(self.count)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "grid", "count": self.count}
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        return ()
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
+        height, width = image.shape[:2]
+        side = max(1, round(math.sqrt(height * width / self.count)))
+        rows, columns = torch.arange(height) // side, torch.arange(width) // side
+        return (rows[:, None] * math.ceil(width / side) + columns).int()
+
+
+@dataclass(frozen=True)
+class LabelFiles:
+    """Label maps from a folder, one per image: PNG (grey of 1, 8 or 16 bit, or palette, whose indices count) or NPY of
+    any integer type, of the size of the image.
+
+    The map of "images/left/0001.jpg" is the first that exists of images/left/0001.png, left/0001.png and 0001.png in
+    the folder, or the same with .npy. Every value is one region, whether connected or not.
+
+    Raises:
+        FileNotFoundError: no such folder.
+    """
+
+    folder: Path
+    background: int = 0
+    """The value of pixels that belong to no region. Negative values are never a region. With -1 for the background, 0
+    is a region like any other."""
+    level: int | None = None
+    """Which map of an NPY file [levels, H, W]; None for files [H, W]."""
+    resample: bool = False
+    """Bring maps of another size to the image's by nearest neighbour, instead of refusing them."""
+
+    def __post_init__(self) -> None:
+        if not self.folder.is_dir():
+            raise FileNotFoundError(
+                f"folder of label maps {self.folder} does not exist (--regions-dir); give the folder that holds one "
+                "PNG or NPY file per image"
+            )
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "files", "background": self.background, "level": self.level, "resample": self.resample}
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        return (self.path(name),)
+
+    def path(self, name: str) -> Path:
+        """The label map of an image.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: there are a PNG and an NPY file.
+        """
+        relative = PurePath(name)
+        parts = [part for part in relative.parts if part not in ("..", relative.anchor)]
+        for first in range(len(parts)):
+            base = self.folder.joinpath(*parts[first:])
+            found = [base.with_suffix(suffix) for suffix in _SUFFIXES if base.with_suffix(suffix).is_file()]
+            if len(found) > 1:
+                raise ValueError(f"image {name} has two label maps, {found[0]} and {found[1]}; keep one of them")
+            if len(found) == 1:
+                return found[0]
+        raise FileNotFoundError(
+            f"image {name} has no label map in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
+        )
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
+        """As in `Regions`.
+
+        Raises:
+            FileNotFoundError: no label map.
+            ValueError: a map that cannot be read, has colour channels or fractional values, lacks the level, or has
+                another size than the image while `resample` is off.
+        """
+        path = self.path(name)
+        found = self._read(path)
+        height, width = image.shape[:2]
+        if found.shape != (height, width):
+            if not self.resample:
+                raise ValueError(
+                    f"label map {path} is {found.shape[1]}x{found.shape[0]} (width x height), its image {name} is "
+                    f"{width}x{height}; make label maps of the image's size (undistorting an image crops it), or "
+                    "resample them by nearest neighbour: --regions-resample True"
+                )
+            found = found[_nearest(height, found.shape[0])][:, _nearest(width, found.shape[1])]
+        return _compact(found, (found != self.background) & (found >= 0))
+
+    def _read(self, path: Path) -> np.ndarray:
+        found = _read_npy(path) if path.suffix == ".npy" else read_pixels(path)
+        if found.ndim == 3 and path.suffix == ".png":
+            raise ValueError(
+                f"label map {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "
+                "grey, 16-bit grey or palette PNG, or as NPY"
+            )
+        if found.dtype.kind not in "iub":
+            raise ValueError(
+                f"label map {path} holds {found.dtype}; expected an integer type: save it with .astype(numpy.int32)"
+            )
+        if self.level is None and found.ndim == 2:
+            return found
+        if self.level is not None and found.ndim == 3 and 0 <= self.level < len(found):
+            return found[self.level]
+        expected = "[H, W]" if self.level is None else f"[levels, H, W] with levels > {self.level}"
+        raise ValueError(
+            f"label map {path} has shape {found.shape}, expected {expected}; choose one of its levels by number with "
+            "--level, and none for maps [H, W]"
+        )
+
+
+def _check_count(count: int) -> None:
+    if count < 1:
+        raise ValueError(f"number of regions per image must be at least 1, got {count}")
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    try:
+        with path.open("rb") as file:
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(
+            f"label map {path} is damaged or no NPY file ({error}); write it again with numpy.save"
+        ) from error
+
+
+def _nearest(size: int, source_size: int) -> np.ndarray:
+    """For every pixel of a line, the pixel of a line of another size whose area holds its centre."""
+    return (2 * np.arange(size) + 1) * source_size // (2 * size)
+
+
+def _compact(found: np.ndarray, labelled: np.ndarray) -> Int32[Tensor, "h w"]:
+    """Renumbers the values of labelled pixels 0..R-1, in ascending order; -1 elsewhere."""
+    labels = np.full(found.shape, -1, dtype=np.int32)
+    labels[labelled] = np.unique(found[labelled], return_inverse=True)[1]
+    return torch.from_numpy(labels)

@@ -1,0 +1,141 @@
+"""The colour encoder against its own formulas."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.colors import XKCD_COLORS, to_rgb
+from skimage.color import lab2rgb, rgb2lab
+
+from normlift_ns.encoders.colour import SIGMA, ColourEncoder, colour_names, embed, shading_coordinates
+
+COLOUR = ColourEncoder()
+rgb = st.tuples(*[st.floats(0, 1, width=32)] * 3)
+
+
+def lab(colours) -> torch.Tensor:
+    return torch.from_numpy(rgb2lab(torch.as_tensor(colours, dtype=torch.float64).numpy()))
+
+
+def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.linalg.vector_norm(shading_coordinates(a) - shading_coordinates(b), dim=1)
+
+
+def test_the_cosine_is_the_kernel_within_the_documented_error():
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.rand(2, 4000, 3, generator=generator, dtype=torch.float64)
+    near = (a + 0.05 * torch.randn(a.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+    for pair in ((a, b), (a, near), (a**3, b**3)):  # cubes: dark colours
+        first, second = map(lab, pair)
+        kernel = torch.exp(-(distance(first, second) ** 2) / (2 * SIGMA**2))
+        error = ((embed(first) * embed(second)).sum(dim=1) - kernel).abs()
+        assert error.max() < 4e-3
+        assert error.quantile(0.99) < 1e-3
+
+
+@settings(max_examples=200, deadline=None)
+@given(rgb, rgb, rgb)
+def test_the_cosine_falls_with_the_distance(a, b, c):
+    colours = lab([a, b, c])
+    to_b, to_c = distance(colours[[0, 0]], colours[1:]).tolist()
+    vectors = embed(colours)
+    assert torch.linalg.vector_norm(vectors, dim=1).tolist() == pytest.approx([1, 1, 1], abs=1e-12)
+    if to_b + 4 < to_c < 80:
+        assert vectors[0] @ vectors[1] > vectors[0] @ vectors[2]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.tuples(*[st.floats(0.5, 1)] * 3), st.floats(0.3, 1))
+def test_shade_changes_lightness_only(colour, shade):
+    linear = torch.tensor(colour, dtype=torch.float64) ** 2.2 * 0.9
+    both = lab(torch.stack([linear, shade * linear]) ** (1 / 2.4) * 1.055 - 0.055)
+    lit, shaded = shading_coordinates(both)
+    assert shaded[1:].tolist() == pytest.approx(lit[1:].tolist(), abs=1e-3)
+    assert (shaded / lit)[0].item() == pytest.approx((both[1] / both[0])[0].item(), rel=1e-4)
+    assert both[1, 0].item() + 16 == pytest.approx((both[0, 0].item() + 16) * shade ** (1 / 3), abs=1e-3)
+
+
+def test_numbers_of_familiar_colours():
+    cosine = COLOUR.text(["red"]) @ COLOUR.text(["red", "dark red", "orange", "brown", "yellow", "blue"]).T
+    assert cosine[0].tolist() == pytest.approx([1, 0.93, 0.43, 0.22, 0.01, 0], abs=0.01)
+    cosine = COLOUR.text(["white"]) @ COLOUR.text(["grey", "black"]).T
+    assert cosine[0].tolist() == pytest.approx([0.43, 0.00], abs=0.01)
+
+
+def test_a_region_is_its_mean_cielab_colour():
+    colours = lab([(0.9, 0.1, 0.2), (0.1, 0.2, 0.7), (0.4, 0.8, 0.3)])
+    image = torch.from_numpy(lab2rgb(colours.numpy()) * 255).round().to(torch.uint8)[None].expand(2, 3, 3)
+    labels = torch.tensor([[0, 0, 1], [-1, 0, -1]], dtype=torch.int32)
+    exact = lab(image[0].double() / 255)
+    expected = embed(torch.stack([(exact[0] + 2 * exact[1]) / 3, exact[2]]))
+    torch.testing.assert_close(COLOUR.encode(image, labels), expected.float(), rtol=0, atol=1e-6)
+
+
+def test_no_region_no_row():
+    image = torch.zeros(2, 2, 3, dtype=torch.uint8)
+    assert COLOUR.encode(image, torch.full((2, 2), -1, dtype=torch.int32)).shape == (0, 343)
+
+
+def test_every_name_is_understood():
+    known = 0
+    for name in XKCD_COLORS:
+        words = name.removeprefix("xkcd:").replace("/", " ")
+        assert colour_names(words) == [words]
+        known += 1
+    assert known == 949
+
+
+def test_basic_colours_are_found_in_shade():
+    names = ["red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "grey"]
+    colour = torch.tensor([to_rgb(XKCD_COLORS[f"xkcd:{name}"]) for name in names])
+    for shade in (0.8, 0.9, 1.0):  # of sRGB: down to three fifths of the light
+        image = (colour * shade * 255).round().to(torch.uint8)[None]
+        labels = torch.arange(len(names), dtype=torch.int32)[None]
+        best = (COLOUR.encode(image, labels) @ COLOUR.text(names).T).argmax(dim=1)
+        assert [names[i] for i in best] == names
+
+
+@pytest.mark.parametrize(
+    ("prompt", "found"),
+    [
+        ("orange", ["orange"]),
+        ("dark red shoes", ["dark red"]),
+        ("Dark-Red Shoes!", ["dark red"]),
+        ("a black and white cat", ["black", "white"]),
+        ("robin's egg blue", ["robin's egg blue"]),
+        ("light gray", ["light grey"]),
+        ("blue/green", ["blue green"]),
+        ("redwood", []),
+        ("", []),
+    ],
+)
+def test_prompts_are_reduced_to_names(prompt, found):
+    assert colour_names(prompt) == found
+
+
+def test_several_names_answer_alike():
+    black, white, both = COLOUR.text(["black", "white", "a black and white cat"])
+    apart = (black @ white).item()
+    assert (both @ black).item() == pytest.approx(math.sqrt((1 + apart) / 2), abs=1e-5)
+    assert (both @ white).item() == pytest.approx((both @ black).item(), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("prompt", "message"),
+    [
+        ("darkred chair", "'darkred chair' contains no colour name.*dark red.*--encoder open_clip"),
+        ("bleu", "blue"),
+        ("7", "such as red, dark green, sky blue"),
+    ],
+)
+def test_unknown_words_list_near_names(prompt, message):
+    with pytest.raises(ValueError, match=message):
+        COLOUR.text(["red", prompt])
+
+
+@pytest.mark.parametrize("prompts", [[], [""], "red"])
+def test_prompts_are_checked(prompts):
+    with pytest.raises(ValueError):
+        COLOUR.text(prompts)
