@@ -19,12 +19,11 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.files import atomic_path
-from normlift_ns.core.forms import DirectionForm, EvidenceForm, Scalars, direction_form, sizes_and_bounds
+from normlift_ns.core.forms import DirectionForm, EvidenceForm, Form, Scalars, direction_form, sizes_and_bounds
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.lowrank import smallest_basis
 from normlift_ns.core.query import RelevancyForm, relevancy
 
-Form = Literal["evidence", "float16", "low_rank"]
 SCHEMA_VERSION = 1
 
 

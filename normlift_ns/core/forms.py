@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.lowrank import Basis, half_precision_error
 
+Form = Literal["evidence", "float16", "low_rank"]
 _QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
 
 

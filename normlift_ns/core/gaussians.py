@@ -57,6 +57,10 @@ class GaussianScene:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def to(self, device: torch.device | str) -> GaussianScene:
+        """A copy on another device."""
+        return GaussianScene(*(x.to(device) for x in (self.means, self.quats, self.scales, self.opacities)))
+
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:
         """True where all parameters are finite and the quaternion is not zero."""
