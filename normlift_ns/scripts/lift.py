@@ -1,0 +1,142 @@
+"""ns-normlift: give a trained splatfacto run semantics that can be asked."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.panel import Panel
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from normlift_ns.encoders.build import SourceOptions, make_source
+from normlift_ns.plugin.asking import ENCODER_KEYS, default_negatives
+from normlift_ns.plugin.lifting import LiftOptions, LiftResult, Report, lift_run
+from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
+
+
+@dataclass
+class NormLift:
+    """Lift 2D features onto the Gaussians of a trained splatfacto run, without training."""
+
+    load_config: Path
+    """Path to config YAML file of the trained run."""
+    data: Path | None = None
+    """Where the dataset is now, if it was moved since training."""
+    load_step: int | None = None
+    """Training step of the checkpoint; the last one by default."""
+    output_dir: Path | None = None
+    """Replaces the run's own outputs folder."""
+    timestamp: str | None = None
+    """Name of the new run directory; the present time by default."""
+    overwrite: bool = False
+    """Replace a run directory of that name."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    queries: tuple[str, ...] = ()
+    """Texts to store in the run; ns-render and ns-viewer show their relevancy."""
+    source: SourceOptions = field(default_factory=SourceOptions)
+    options: LiftOptions = field(default_factory=LiftOptions)
+
+    def main(self) -> Path:
+        """Lifts, and returns the directory of the new run."""
+        start = time.perf_counter()
+        device = choose_device(self.device)
+        source = make_source(self.source, device)
+        texts = None if len(self.queries) == 0 else source.text(self.queries)
+
+        from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s; mistakes show before)
+        from normlift_ns.plugin.queries import QueryVectors  # noqa: PLC0415
+        from normlift_ns.plugin.run_dir import run_directory, write_run  # noqa: PLC0415
+
+        run = load_run(self.load_config, data=self.data, load_step=self.load_step)
+        target = run_directory(run, output_dir=self.output_dir, timestamp=self.timestamp)
+        if target.exists() and not self.overwrite:
+            raise FileExistsError(f"{target} exists; give another --timestamp or --output-dir, or --overwrite True.")
+        CONSOLE.print(f"{len(run.scene):,} Gaussians, {len(run.train)} training views, on {device}")
+        encoder = {key: getattr(self.source, key) for key in ENCODER_KEYS}
+        with progress_bars() as report:
+            result = lift_run(
+                run, source, self.options, target.parent / ".cache", device=device, encoder=encoder, report=report
+            )
+        vectors = None
+        if texts is not None:
+            negatives = default_negatives(result.field)
+            vectors = QueryVectors(texts, source.text(negatives) if len(negatives) > 0 else None)
+        written = write_run(
+            run,
+            result.field,
+            queries=self.queries,
+            query_vectors=vectors,
+            output_dir=self.output_dir,
+            timestamp=target.name,
+            overwrite=self.overwrite,
+        )
+        CONSOLE.print(summary(result, written, time.perf_counter() - start, self.queries))
+        return written
+
+
+@contextmanager
+def progress_bars() -> Iterator[Report]:
+    """One bar per stage, with the time left."""
+    names = {"features": "2D features", "neighbors": "neighbours", "store": "choosing the form"}
+    columns = (TextColumn("{task.description:>17}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=CONSOLE) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str, ...]) -> Panel:
+    """The panel at the end: what was found, what it took, where it lies and what to type next."""
+    facts: dict[str, Any] = dict(result.field.manifest)
+    numbers = facts["statistics"]
+    chosen = facts["forms"][facts["form"]]
+    table = Table.grid(padding=(0, 2))
+    quantiles = "  ".join(f"{float(q):.0%} {value:.2f}" for q, value in numbers["reliability_quantiles"].items())
+    table.add_row("Gaussians", f"{numbers['gaussians']:,}, without evidence {numbers['zero_evidence_share']:.1%}")
+    if numbers["excluded"] > 0:
+        table.add_row("not drawn", f"{numbers['excluded']:,} with non-finite parameters")
+    table.add_row("reliability R", quantiles)
+    if "refined_share" in numbers:
+        lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"
+        table.add_row("refined", f"{numbers['refined_share']:.1%} of Gaussians; {lost}")
+    table.add_row(
+        "seconds", "  ".join(f"{name} {t:.1f}" for name, t in result.seconds.items()) + f"  total {total:.1f}"
+    )
+    table.add_row("peak memory", peak_memory())
+    table.add_row("stored as", f"{facts['form']}, {chosen['bytes'] / 1e6:.1f} MB, cosines within {chosen['bound']:.1e}")
+    others = (f"{name} {form['bytes'] / 1e6:.1f} MB" for name, form in facts["forms"].items() if name != facts["form"])
+    table.add_row("", "instead of " + ", ".join(others))
+    table.add_row("run", str(run_dir))
+    text = queries[0] if len(queries) > 0 else "…"
+    table.add_row("next", f'ns-normlift-query --load-config {run_dir / "config.yml"} --text "{text}"')
+    return Panel(table, title="[bold][green]:tada: Lifted :tada:", expand=False)
+
+
+def peak_memory() -> str:
+    """Largest memory of this process so far, and of the GPU."""
+    scale = 2**30 if sys.platform == "darwin" else 2**20
+    host = f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale:.2f} GiB"
+    return f"{host}, GPU {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB" if torch.cuda.is_available() else host
+
+
+def entrypoint() -> None:
+    """Entry point of ns-normlift."""
+    run_command(NormLift)
+
+
+if __name__ == "__main__":
+    entrypoint()

@@ -1,0 +1,107 @@
+"""ns-normlift-query: ask a lifted run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.table import Table
+
+from normlift_ns.core.files import atomic_path
+from normlift_ns.core.query import RelevancyForm
+from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
+
+
+@dataclass
+class NormLiftQuery:
+    """Ask a lifted run where things are: a table, and files on request."""
+
+    load_config: Path
+    """Path to config YAML file of the lifted run."""
+    text: tuple[str, ...]
+    """What to look for, one or several texts."""
+    negatives: tuple[str, ...] | None = None
+    """What to compare with; by default LERF's words for open_clip, none for colour."""
+    relevancy: RelevancyForm | Literal["auto"] = "auto"
+    """cosine; lerf: against each negative; margin: above the best negative. auto: lerf with negatives, else cosine."""
+    threshold: float | None = None
+    """Relevancy above which a Gaussian is selected; by default 0.5 (cosine), 0.5 (lerf) or 0.02 (margin)."""
+    min_reliability: float = 0.0
+    """Least reliability of a selected Gaussian, in 0..1."""
+    refined: bool = True
+    """Ask the refined directions."""
+    json: Path | None = None
+    """Write the table to this file."""
+    output_path: Path | None = None
+    """Write relevancy [N, Q], reliability [N], valid [N] and names to this .npz file."""
+    render_dir: Path | None = None
+    """Write pictures of the relevancy into this folder."""
+    render_views: int = 3
+    """Number of training cameras to render from, evenly spread."""
+    data: Path | None = None
+    """Where the dataset is now, if it was moved."""
+    device: str = "auto"
+    """auto, cpu or cuda: where the text encoder runs."""
+
+    def main(self) -> list[dict[str, Any]]:
+        """Asks, prints and writes; returns the rows of the table."""
+        device = choose_device(self.device)
+
+        from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
+        from normlift_ns.plugin.asking import ask, encoder_of, summarize  # noqa: PLC0415
+        from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
+
+        run = load_run(self.load_config, data=self.data)
+        field = load_field(run)
+        answer = ask(
+            field,
+            encoder_of(field, device),
+            self.text,
+            negatives=self.negatives,
+            form=self.relevancy,
+            threshold=self.threshold,
+            min_reliability=self.min_reliability,
+            refined=self.refined,
+        )
+        rows = summarize(answer, field, run.scene)
+        CONSOLE.print(_table(rows, f"{answer.form} > {answer.threshold:g}"))
+        if self.json is not None:
+            facts = {"relevancy": answer.form, "threshold": answer.threshold, "negatives": list(answer.negatives)}
+            with atomic_path(self.json) as temporary:
+                temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
+        if self.output_path is not None:
+            tensors = {"relevancy": answer.relevancy, "reliability": field.scalars.reliability, "valid": answer.valid}
+            arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
+            with atomic_path(self.output_path) as temporary, temporary.open("wb") as file:
+                np.savez(file, names=np.array(self.text), **arrays)
+        if self.render_dir is not None:
+            from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
+
+            save_overlays(run, answer, training_cameras(run, self.render_views), self.render_dir)
+        written = [path for path in (self.json, self.output_path, self.render_dir) if path is not None]
+        if len(written) > 0:
+            CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)
+        return rows
+
+
+def _table(rows: list[dict[str, Any]], rule: str) -> Table:
+    table = Table(title=f"Selected: {rule}")
+    for name in ("text", "Gaussians", "centroid", "extent", "peak relevancy", "mean reliability"):
+        table.add_column(name, justify="left" if name == "text" else "right")
+    for row in rows:
+        vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
+        numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
+        table.add_row(row["text"], f"{row['fraction']:.2%}", *vectors, *numbers)
+    return table
+
+
+def entrypoint() -> None:
+    """Entry point of ns-normlift-query."""
+    run_command(NormLiftQuery)
+
+
+if __name__ == "__main__":
+    entrypoint()
