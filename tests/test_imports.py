@@ -14,6 +14,8 @@ BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 ALLOWED = {
     "core": BASE | {"normlift_ns.core"},
     "raster": BASE | {"numba", "normlift_ns.core", "normlift_ns.raster"},
+    "plugin": BASE
+    | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "normlift_ns.core", "normlift_ns.raster", "normlift_ns.plugin"},
 }
 
 

@@ -1,0 +1,201 @@
+"""splatfacto's model with a semantic field attached: what ns-viewer, ns-render, ns-eval and ns-export load."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from gsplat.rendering import rasterization
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from torch import Tensor
+
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.plugin.appearance import shading_degree, view_colors
+from normlift_ns.plugin.lpips import LazyLpips
+from normlift_ns.plugin.queries import QueryVectors, load_queries
+from normlift_ns.plugin.views import to_camera
+from normlift_ns.raster.rasterize import render
+
+
+@dataclass
+class NormLiftModelConfig(SplatfactoModelConfig):
+    """splatfacto with the semantics that ns-normlift lifted onto its Gaussians."""
+
+    _target: type = field(default_factory=lambda: NormLiftModel)
+    semantics: Path | None = None
+    """Folder of the semantic field (the normlift/ folder of a lifted run); none: plain splatfacto."""
+    queries: tuple[str, ...] = ()
+    """Texts whose relevancy is rendered as relevancy_0, relevancy_1, ...; their vectors lie in the field's folder."""
+
+    @staticmethod
+    def upgrade(
+        config: SplatfactoModelConfig, *, semantics: Path | None = None, queries: tuple[str, ...] = ()
+    ) -> NormLiftModelConfig:
+        """The same model with a field: every field of the config is taken over."""
+        values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
+        return NormLiftModelConfig(**values, semantics=semantics, queries=queries)
+
+
+class Published(NamedTuple):
+    """What is rendered besides the colours. Never changed, only replaced: the viewer renders in other threads."""
+
+    names: tuple[str, ...] = ()
+    values: Float[Tensor, "n c"] | None = None
+
+
+class NormLiftModel(SplatfactoModel):
+    """splatfacto that loads without LPIPS weights and without CUDA, and renders scalars of its Gaussians.
+
+    On CUDA all but the scalars is stock splatfacto. On the CPU, where splatfacto cannot render, normlift_ns does.
+    """
+
+    config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
+
+    def populate_modules(self) -> None:
+        if not torch.cuda.is_available():
+            self.seed_points = None  # splatfacto moves them to CUDA; a checkpoint brings its own Gaussians
+        with _lazy_lpips():
+            super().populate_modules()
+        self._field: SemanticField | None = None
+        self._published = Published()
+
+    @property
+    def field(self) -> SemanticField | None:
+        """The attached field, on the CPU."""
+        return self._field
+
+    def load_state_dict(self, dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
+        """Loads a splatfacto or normlift checkpoint, then the field that the config names.
+
+        Raises:
+            FileNotFoundError, ValueError: no field there, a damaged one, or one of other Gaussians.
+        """
+        super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
+        if self.config.semantics is not None:
+            semantic_field = SemanticField.load(self.config.semantics, self.means)
+            self.attach(semantic_field, load_queries(self.config.semantics, self.config.queries))
+
+    def attach(self, semantic_field: SemanticField, queries: QueryVectors | None = None) -> None:
+        """Renders the reliability of a field, and the relevancy of queries, from now on."""
+        values = {"reliability": semantic_field.scalars.reliability}
+        if queries is not None:
+            relevancy = semantic_field.relevancy(
+                queries.vectors, queries.negatives, form="cosine" if queries.negatives is None else "lerf"
+            )
+            values |= {f"relevancy_{i}": relevancy[:, i] for i in range(relevancy.shape[1])}
+        self._field = semantic_field
+        self.publish(values)
+
+    def publish(self, values: Mapping[str, Float[Tensor, " n"]]) -> None:
+        """Replaces the scalars of the Gaussians that are rendered as outputs of these names.
+
+        An output is sum_j A_ij value_j, [H, W, 1]: 0 where nothing is. Safe to call while another thread renders.
+
+        Raises:
+            ValueError: values of another length.
+        """
+        for name, value in values.items():
+            if tuple(value.shape) != (self.num_points,):
+                raise ValueError(f"{name} must be [{self.num_points}], one per Gaussian, got {tuple(value.shape)}")
+        columns = [value.to(self.device, torch.float32) for value in values.values()]
+        self._published = Published(tuple(values), torch.stack(columns, dim=1) if columns else None)
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Stock outputs (rgb, depth, accumulation, background), and one [H, W, 1] for everything published.
+
+        Args:
+            camera: one camera.
+            obb_box: Gaussians outside are not drawn.
+        """
+        names, values = self._published
+        values = self.means.new_zeros(self.num_points, 0) if values is None else values.to(self.device)
+        self.set_crop(obb_box)
+        rows = None if obb_box is None else obb_box.within(self.means).reshape(-1)
+        view = _opencv(camera.to(self.device))
+        if self.device.type == "cpu":
+            outputs, scalars = self._render_on_cpu(view, values, rows)
+        else:
+            outputs = super().get_outputs_for_camera(camera, obb_box)
+            scalars = self._scalars_by_gsplat(view, values, rows)
+        return {**outputs, **{name: scalars[:, :, i : i + 1] for i, name in enumerate(names)}}
+
+    def _scene(self, rows: Tensor | None) -> GaussianScene:
+        parts = (self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
+        return GaussianScene(*(part.detach() if rows is None else part.detach()[rows] for part in parts))
+
+    def _render_on_cpu(self, view: Camera, values: Tensor, rows: Tensor | None) -> tuple[dict[str, Tensor], Tensor]:
+        """As `SplatfactoModel.get_outputs` outside training, with the values [N, C] in the same pass."""
+        scene = self._scene(rows)
+        coefficients = torch.cat([self.features_dc[:, None], self.features_rest], dim=1).detach()
+        if rows is not None:
+            coefficients, values = coefficients[rows], values[rows]
+        rgb = view_colors(scene.means, coefficients, view, shading_degree(self.config, self.step))
+        depth = scene.means @ view.world_to_camera[2, :3, None] + view.world_to_camera[2, 3]
+        image, alpha = render(
+            scene, view, torch.cat([rgb, depth, values], dim=1), rasterize_mode=self.config.rasterize_mode
+        )
+        alpha = alpha[:, :, None]
+        background = self._get_background_color()
+        expected_depth = image[:, :, 3:4] / alpha.clamp(min=1e-10)
+        outputs = {
+            "rgb": (image[:, :, :3] + (1 - alpha) * background).clamp(0, 1),
+            "depth": torch.where(alpha > 0, expected_depth, expected_depth.max()),
+            "accumulation": alpha,
+            "background": background.expand(view.height, view.width, 3),
+        }
+        return outputs, image[:, :, 4:]
+
+    def _scalars_by_gsplat(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
+        """sum_j A_ij value_j [H, W, C], rasterized as splatfacto rasterizes the colours."""
+        scene = self._scene(rows)
+        if len(scene) == 0 or values.shape[1] == 0:
+            return values.new_zeros(view.height, view.width, values.shape[1])
+        image, _, _ = rasterization(
+            *(scene.means, scene.quats, scene.scales, scene.opacities),
+            values if rows is None else values[rows],
+            view.world_to_camera[None],
+            view.K[None],
+            view.width,
+            view.height,
+            packed=False,
+            near_plane=0.01,
+            far_plane=1e10,
+            rasterize_mode=self.config.rasterize_mode,
+        )
+        return image[0]
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Stock metrics; without LPIPS where its weights cannot be had."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        if not self.lpips.available:
+            metrics = {name: value for name, value in metrics.items() if "lpips" not in name}
+        return metrics, images
+
+
+def _opencv(camera: Cameras) -> Camera:
+    pose, intrinsics = camera.camera_to_worlds.reshape(3, 4), camera.get_intrinsics_matrices().reshape(3, 3)
+    return to_camera(pose, intrinsics, int(camera.width.item()), int(camera.height.item()))
+
+
+@contextmanager
+def _lazy_lpips() -> Iterator[None]:
+    """splatfacto builds LPIPS, which downloads AlexNet, before anything else; here it gets `LazyLpips` in its place."""
+    from torchmetrics.image import lpip  # noqa: PLC0415 (import-light: this module is loaded by every ns-* command)
+
+    stock = lpip.LearnedPerceptualImagePatchSimilarity
+    lpip.LearnedPerceptualImagePatchSimilarity = LazyLpips
+    try:
+        yield
+    finally:
+        lpip.LearnedPerceptualImagePatchSimilarity = stock

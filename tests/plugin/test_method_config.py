@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields
+from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
+
+import pytest
+from nerfstudio.configs.method_configs import method_configs
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins import registry
+
+from normlift_ns.method_configs.normlift import normlift_method
+from normlift_ns.plugin.model import NormLiftModelConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+
+
+def test_nerfstudio_discovers_the_method_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    group = "nerfstudio.method_configs"
+    declared = PROJECT["project"]["entry-points"][group]
+    points = EntryPoints(EntryPoint(name, value, group) for name, value in declared.items())
+    monkeypatch.setattr(registry, "entry_points", lambda group: points.select(group=group))
+    monkeypatch.delenv("NERFSTUDIO_METHOD_CONFIGS", raising=False)
+    methods, descriptions = registry.discover_methods()
+    assert methods == {"normlift": normlift_method.config}
+    assert descriptions == {"normlift": normlift_method.description}
+
+
+def test_every_package_is_shipped() -> None:
+    root = Path(__file__).parents[2]
+    folders = {".".join(file.parent.relative_to(root).parts) for file in root.glob("normlift_ns/**/__init__.py")}
+    packages = set(PROJECT["tool"]["setuptools"]["packages"])
+    assert {"normlift_ns.plugin", "normlift_ns.method_configs"} <= packages
+    assert packages - {"normlift_ns.method_configs"} <= folders
+
+
+def test_it_trains_as_splatfacto_does() -> None:
+    ours, theirs = normlift_method.config, method_configs["splatfacto"]
+    assert isinstance(theirs, TrainerConfig)
+    different = {f.name for f in fields(TrainerConfig) if getattr(ours, f.name) != getattr(theirs, f.name)}
+    assert different == {"method_name", "pipeline"}
+    assert ours.pipeline.datamanager == theirs.pipeline.datamanager
+    assert ours.pipeline.model == NormLiftModelConfig.upgrade(theirs.pipeline.model)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", ["normlift_ns.method_configs.normlift", "nerfstudio.configs.method_configs"])
+def test_it_is_imported_in_any_order_and_pulls_in_no_encoder(first: str) -> None:
+    """nerfstudio imports it while it is being imported itself; an error there would break every ns-* command."""
+    program = (
+        f"import {first}, sys\n"
+        "import nerfstudio.configs.method_configs, normlift_ns.method_configs.normlift\n"
+        "print(sorted({'open_clip', 'numba', 'torchmetrics.image.lpip', 'open3d'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().endswith("[]")
