@@ -12,8 +12,10 @@ from jaxtyping import Float, Int
 from rich.table import Table
 from torch import Tensor
 
+from normlift_ns.core.field import SemanticField
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.plugin.asking import encoder_of
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
 from normlift_ns.scripts.shared import CONSOLE, run_command
@@ -46,11 +48,9 @@ class Demo:
 
         CONSOLE.rule("Asking it")
         config, pictures, answers = lifted / "config.yml", self.folder / "pictures", self.folder / "answers.json"
-        _show("ns-normlift-query", "--load-config", config, "--text", *TEXTS, "--render-dir", pictures, "--json", answers)
+        flags = ("--render-dir", pictures, "--json", answers)
+        _show("ns-normlift-query", "--load-config", config, "--text", *TEXTS, *flags)
         NormLiftQuery(config, TEXTS, render_dir=pictures, json=answers).main()
-
-        from normlift_ns.plugin.asking import encoder_of  # noqa: PLC0415 (after the commands that import nerfstudio)
-        from normlift_ns.core.field import SemanticField  # noqa: PLC0415
 
         CONSOLE.rule("Comparing it with the truth")
         field = SemanticField.load(lifted / "normlift")

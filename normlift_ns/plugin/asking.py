@@ -1,0 +1,124 @@
+"""Asking a lifted run: texts become relevancies of Gaussians, selections and a few numbers about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.core.query import CANONICAL_NEGATIVES, RelevancyForm
+from normlift_ns.encoders.build import SourceOptions, make_encoder
+from normlift_ns.encoders.source import Encoder
+
+ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill")
+"""Options that say which encoder made a field; they stand in its manifest."""
+THRESHOLDS: dict[RelevancyForm, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
+"""Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
+_CENTRAL = (0.05, 0.95)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a field answers to Q texts."""
+
+    texts: tuple[str, ...]
+    negatives: tuple[str, ...]
+    form: RelevancyForm
+    threshold: float
+    relevancy: Float[Tensor, "n q"]
+    valid: Bool[Tensor, " n"]
+    """Gaussians that have a direction."""
+    selected: Bool[Tensor, "n q"]
+    """Valid, above the threshold and reliable enough."""
+
+
+def encoder_of(field: SemanticField, device: str = "cpu") -> Encoder:
+    """The encoder that made the field, for texts.
+
+    Raises:
+        ValueError: the manifest names none that this version knows.
+        FileNotFoundError: its weights are not there any more.
+    """
+    stored = field.manifest.get("encoder")
+    if not isinstance(stored, Mapping) or set(stored) != set(ENCODER_KEYS):
+        raise ValueError(f"the field's manifest names no encoder (found {stored!r}); lift again with: ns-normlift")
+    return make_encoder(SourceOptions(**stored), device)
+
+
+def default_negatives(field: SemanticField) -> tuple[str, ...]:
+    """LERF's negatives for open_clip; none for the colour encoder, which knows no "object"."""
+    return CANONICAL_NEGATIVES if field.manifest["encoder"]["encoder"] == "open_clip" else ()
+
+
+def ask(
+    field: SemanticField,
+    encoder: Encoder,
+    texts: Sequence[str],
+    *,
+    negatives: Sequence[str] | None = None,
+    form: RelevancyForm | Literal["auto"] = "auto",
+    threshold: float | None = None,
+    min_reliability: float = 0.0,
+    refined: bool = True,
+) -> Answer:
+    """Relevancy and selection of every Gaussian for each text.
+
+    Args:
+        negatives: what the texts are compared with; None: `default_negatives`.
+        form: "auto": lerf with negatives, cosine without.
+        threshold: None: that of `THRESHOLDS`.
+        min_reliability: least R of a selected Gaussian, in 0..1.
+        refined: ask the refined directions.
+    Raises:
+        ValueError: a text that is empty or that the encoder does not understand; a form without its negatives.
+    """
+    negatives = tuple(default_negatives(field) if negatives is None else negatives)
+    if form == "auto":
+        form = "cosine" if len(negatives) == 0 else "lerf"
+    threshold = THRESHOLDS[form] if threshold is None else threshold
+    vectors = encoder.text(texts)
+    negative_vectors = None if len(negatives) == 0 or form == "cosine" else encoder.text(negatives)
+    relevancy = field.relevancy(vectors, negative_vectors, form=form, refined=refined)
+    valid = field.valid(refined=refined)
+    selected = (relevancy > threshold) & (valid & (field.scalars.reliability >= min_reliability))[:, None]
+    return Answer(tuple(texts), negatives, form, threshold, relevancy, valid, selected)
+
+
+def summarize(answer: Answer, field: SemanticField, scene: GaussianScene) -> list[dict[str, Any]]:
+    """Per text: fraction of Gaussians selected, centroid and extent of the selection, peak relevancy, mean reliability.
+
+    Centroid and mean reliability are weighted by W_j, what the views saw of each Gaussian; the extent is the size of
+    the box that holds the central 90 % of the selected Gaussians along each axis. Both in the scene's own units; None
+    where nothing is selected.
+    """
+    rows = []
+    for q, text in enumerate(answer.texts):
+        chosen = answer.selected[:, q]
+        means, weight = scene.means[chosen].double(), field.scalars.weight[chosen].double() + 1e-12
+        share = weight / weight.sum()
+        found = len(means) > 0
+        box = np.quantile(means.numpy(), _CENTRAL, axis=0) if found else np.zeros((2, 3))
+        reliability = field.scalars.reliability[chosen].double()
+        rows.append(
+            {
+                "text": text,
+                "fraction": float(chosen.double().mean()),
+                "centroid": (share[:, None] * means).sum(0).tolist() if found else None,
+                "extent": (box[1] - box[0]).tolist() if found else None,
+                "peak": float(answer.relevancy[answer.valid, q].max()) if bool(answer.valid.any()) else None,
+                "mean_reliability": float((share * reliability).sum()) if found else None,
+            }
+        )
+    return rows
+
+
+def pixel_relevancy(values: Float[Tensor, "h w q"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "h w q"]:
+    """Composited relevancies per unit of opacity; 0 where (almost) nothing is drawn."""
+    return torch.where(alpha[:, :, None] > 0.05, values / alpha[:, :, None].clamp(min=1e-6), 0.0)

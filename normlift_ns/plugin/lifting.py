@@ -1,0 +1,168 @@
+"""From a trained run and a source of 2D features to a semantic field: the page to read first."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import torch
+
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.forms import Form
+from normlift_ns.core.lift import Lifted, Unlabeled, lift
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.core.refine import RefineConfig, refine, unsupported
+from normlift_ns.encoders.cache import CachedFeatures
+from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.plugin.observe import BLOCK, block_evidence, see_block, spread
+
+if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
+    from normlift_ns.plugin.adapters import SourceRun
+
+Report = Callable[[str, int, int], None]
+"""Called with (stage, steps done, steps in all)."""
+
+
+@dataclass(frozen=True)
+class LiftOptions:
+    """What to lift and how. Raises ValueError for numbers out of range."""
+
+    image_source: Literal["photos", "render"] = "photos"
+    """What the encoder sees: the photographs, or the trained scene rendered from their cameras."""
+    max_views: int | None = None
+    """Use at most this many training views, evenly spread; None: all."""
+    lift_downscale: int = 1
+    """Divide the size of images and cameras by this number."""
+    beta: float = 1.0
+    """Prior strength of the reliability, in virtual views."""
+    unlabeled: Unlabeled = "ignore"
+    """Pixels without a region: ignore, or dilute as observations of nothing."""
+    weight_power: Literal[1, 2] = 1
+    """1: weights A_ij as in the paper. 2: their squares."""
+    refine: bool = True
+    """Repair unreliable Gaussians by voting among neighbours."""
+    vote: RefineConfig = field(default_factory=RefineConfig)
+    tolerance: float = 1e-3
+    """Largest error that storing may add to any cosine."""
+    form: Form | Literal["auto"] = "auto"
+    """How directions are stored; auto: the smallest form within the tolerance."""
+    reuse_evidence: bool = True
+    """Take 2D features and evidence of earlier lifts from the cache where they fit."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("max_views", self.max_views), ("lift_downscale", self.lift_downscale)):
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+class LiftResult(NamedTuple):
+    """A field and how it came about."""
+
+    field: SemanticField
+    seconds: dict[str, float]
+    """Of each stage, in their order: features, evidence, reliability, lift, neighbors, vote, store."""
+
+
+def lift_run(
+    run: SourceRun,
+    source: FeatureSource,
+    options: LiftOptions,
+    cache: Path,
+    *,
+    device: str = "cpu",
+    encoder: Mapping[str, Any],
+    report: Report = lambda stage, done, total: None,
+) -> LiftResult:
+    """Lifts 2D features onto the Gaussians of a trained run.
+
+    Args:
+        cache: folder for 2D features and evidence; made if missing, may be deleted at any time.
+        device: where to rasterize, lift and vote.
+        encoder: the options that queries need to encode texts likewise; kept in the manifest.
+        report: told of the progress.
+    Raises:
+        ValueError, FileNotFoundError: an image, a label map or an option that does not fit; the message names it.
+    """
+    stages = _Stages(report)
+    scene = run.scene.to(device)
+    indices = spread(len(run.train), options.max_views)
+    seen = CachedFeatures(source, cache / "features") if options.reuse_evidence else source
+    parts, tables = [], []
+    for start in range(0, len(indices), BLOCK):
+        chosen = indices[start : start + BLOCK]
+        with stages("features", len(indices)) as step:
+            rendered = options.image_source == "render"
+            block = see_block(run, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=step)
+            tables.extend(block.features)
+        with stages("evidence", len(indices)) as step:
+            power, reuse = options.weight_power, options.reuse_evidence
+            folder = cache / "evidence"
+            parts.append(block_evidence(run, scene, block, folder, weight_power=power, reuse=reuse, done=step))
+    with stages("reliability") as step:
+        evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+        lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+        step()
+    statistics = {"views": len(indices), "excluded": evidence.num_excluded, **_statistics(lifted)}
+    copied = None
+    if options.refine:
+        with stages("lift") as step:
+            directions = lifted.directions()
+            step()
+        with stages("neighbors") as step:
+            neighbors = nearest_neighbors(scene.means, options.vote.k)
+            step()
+        with stages("vote") as step:
+            copied = refine(scene.means, directions, lifted.reliability, options.vote, neighbors=neighbors)
+            step()
+        changed = copied != torch.arange(len(copied), device=copied.device)
+        statistics["refined_share"] = float(changed.float().mean())
+        statistics["unsupported_share"] = float(unsupported(neighbors, lifted.reliability).float().mean())
+    with stages("store") as step:
+        provenance = {
+            "source_config": str(run.location.run_dir / "config.yml"),
+            "source_step": run.step,
+            "encoder": dict(encoder),
+            "features": source.identity,
+            "options": asdict(options),
+            "statistics": statistics,
+        }
+        built = SemanticField.build(
+            lifted, scene.means, copied, tolerance=options.tolerance, form=options.form, provenance=provenance
+        )
+        step()
+    return LiftResult(built, stages.seconds)
+
+
+class _Stages:
+    """Adds up the seconds of each stage and passes on how far it is."""
+
+    def __init__(self, report: Report) -> None:
+        self.seconds: dict[str, float] = {}
+        self._report = report
+        self._done: dict[str, int] = {}
+
+    @contextmanager
+    def __call__(self, stage: str, total: int = 1) -> Iterator[Callable[[], None]]:
+        def step() -> None:
+            self._done[stage] = self._done.get(stage, 0) + 1
+            self._report(stage, self._done[stage], total)
+
+        start = time.perf_counter()
+        self._report(stage, self._done.get(stage, 0), total)
+        yield step
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _statistics(lifted: Lifted) -> dict[str, Any]:
+    found = lifted.reliability[lifted.reliability > 0].double().sort().values
+    shares = (0.05, 0.25, 0.5, 0.75, 0.95)
+    quantiles = {str(q): float(found[round(q * (len(found) - 1))]) for q in shares} if len(found) > 0 else {}
+    n = lifted.norm.numel()
+    return {"gaussians": n, "zero_evidence_share": 1 - len(found) / max(1, n), "reliability_quantiles": quantiles}

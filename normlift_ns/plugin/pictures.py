@@ -1,0 +1,69 @@
+"""Pictures of answers: the relevancy of a text as a heat map over the rendered scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.plugin.adapters import SourceRun
+from normlift_ns.plugin.asking import Answer, pixel_relevancy
+from normlift_ns.raster.rasterize import render
+
+_INCHES, _DPI = 6.0, 120
+
+
+def save_overlays(run: SourceRun, answer: Answer, cameras: dict[str, Camera], folder: Path) -> list[Path]:
+    """Writes one PNG per camera and text: the rendered scene, and where the text is found on it.
+
+    Args:
+        cameras: by the name that the files get.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, camera in cameras.items():
+        values, alpha = render(run.scene, camera, answer.relevancy, rasterize_mode=run.rasterize_mode)
+        relevancy = pixel_relevancy(values, alpha)
+        image = run.render(camera)
+        for q, text in enumerate(answer.texts):
+            paths.append(folder / f"{name}_{q}_{_file_name(text)}.png")
+            save_overlay(paths[-1], image, relevancy[:, :, q], text, answer)
+    return paths
+
+
+def save_overlay(
+    path: Path, image: UInt8[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], text: str, answer: Answer
+) -> None:
+    """A heat map over the image in grey, the more opaque the more relevant, with the text and a colour scale."""
+    height, width = relevancy.shape
+    low = {"cosine": 0.0, "lerf": 0.0, "margin": -0.1}[answer.form]
+    high = max(float(relevancy.max()), answer.threshold + 0.05)
+    figure = Figure(figsize=(_INCHES * 1.15, _INCHES * height / width + 0.5), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    grey = image.float().mean(dim=2) / 255
+    axes.imshow(grey.numpy(), cmap="gray", vmin=0, vmax=1)
+    opacity = 0.85 * ((relevancy - low) / (high - low)).clamp(0, 1) ** 0.5
+    heat = axes.imshow(relevancy.numpy(), cmap="inferno", vmin=low, vmax=high, alpha=opacity.numpy())
+    scale = figure.colorbar(heat, ax=axes, fraction=0.05)
+    scale.solids.set_alpha(1.0)  # pyright: ignore[reportOptionalMemberAccess]
+    scale.ax.axhline(answer.threshold, color="white", linewidth=1.5)
+    scale.set_label(f"relevancy ({answer.form}); selected above {answer.threshold:g}")
+    axes.set_title(text if len(text) < 60 else text[:57] + "…")
+    axes.set_axis_off()
+    figure.savefig(path)
+
+
+def _file_name(text: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in text)[:40]
+
+
+def training_cameras(run: SourceRun, count: int) -> dict[str, Camera]:
+    """`count` training cameras, evenly spread, by the stems of their images."""
+    chosen = torch.linspace(0, len(run.train) - 1, min(count, len(run.train))).round().long().tolist()
+    return {Path(run.train.names[i]).stem: run.train.cameras[i] for i in chosen}
