@@ -2,6 +2,7 @@
 
 from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture
 from normlift_ns.demo.room import DemoRoom, demo_room
+from normlift_ns.demo.run import write_splatfacto_run
 
 __all__ = [
     "DemoRoom",
@@ -11,4 +12,5 @@ __all__ = [
     "view_image",
     "view_labels",
     "write_capture",
+    "write_splatfacto_run",
 ]
