@@ -1,0 +1,16 @@
+"""The demo room, a small synthetic scene with ground truth: tensors, nerfstudio dataset, trained run."""
+
+from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture
+from normlift_ns.demo.room import DemoRoom, demo_room
+from normlift_ns.demo.run import write_splatfacto_run
+
+__all__ = [
+    "DemoRoom",
+    "demo_cameras",
+    "demo_room",
+    "held_out_cameras",
+    "view_image",
+    "view_labels",
+    "write_capture",
+    "write_splatfacto_run",
+]

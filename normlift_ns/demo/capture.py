@@ -1,0 +1,97 @@
+"""Cameras in the demo room, its images and true masks, and all of it as a nerfstudio dataset."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.demo.room import DemoRoom
+from normlift_ns.raster.rasterize import render
+
+_FIELD_OF_VIEW = 75.0
+"""Horizontal, degrees."""
+
+
+def demo_cameras(count: int = 24, width: int = 320, height: int = 240) -> list[Camera]:
+    """Cameras on a circle inside the room, at three heights in turn, looking across the table. Size in pixels."""
+    return [
+        _look((1.4, 360 * i / count, (1.0, 1.35, 1.7)[i % 3]), (0, 0, (0.55, 0.45, 0.35)[i % 3]), width, height)
+        for i in range(count)
+    ]
+
+
+def held_out_cameras(count: int = 4, width: int = 320, height: int = 240) -> list[Camera]:
+    """Cameras for evaluation, on another circle than `demo_cameras`."""
+    return [_look((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
+
+
+def view_image(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w 3"]:
+    """The room as the camera sees it, sRGB, on black."""
+    image, _ = render(room.scene, camera, room.colors)
+    return (image.clamp(0, 1) * 255).round().byte()
+
+
+def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
+    """True class of every pixel: 1 + index into `room.names`, 0 where less than half of the pixel is covered.
+
+    The class with the largest sum of compositing weights wins; floaters count for nothing.
+    """
+    one_hot = torch.nn.functional.one_hot(room.labels + 1, len(room.names) + 1)[:, 1:].to(room.scene.means.dtype)
+    shares, _ = render(room.scene, camera, one_hot)
+    return torch.where(shares.sum(dim=2) > 0.5, shares.argmax(dim=2) + 1, 0).byte()
+
+
+def write_capture(
+    room: DemoRoom, folder: Path, views: int = 24, held_out: int = 4, width: int = 320, height: int = 240
+) -> None:
+    """Writes a nerfstudio dataset with true masks; files of the same names are replaced.
+
+    transforms.json (no distortion; the held-out views, last, are its "val" and "test" split), images/0000.png …,
+    instance/0000.png … as `view_labels` gives them, and labels.json: {"labels": {"1": name, …}, "background": 0}.
+    """
+    cameras = [*demo_cameras(views, width, height), *held_out_cameras(held_out, width, height)]
+    for name in ("images", "instance"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    paths = [f"images/{i:04d}.png" for i in range(len(cameras))]
+    for path, camera in zip(paths, cameras):
+        Image.fromarray(view_image(room, camera).numpy()).save(folder / path)
+        Image.fromarray(view_labels(room, camera).numpy()).save(folder / "instance" / Path(path).name)
+    (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
+    transforms = {
+        "camera_model": "OPENCV",
+        **{"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height},
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "train_filenames": paths[:views],
+        "val_filenames": paths[views:],
+        "test_filenames": paths[views:],
+        "frames": [{"file_path": p, "transform_matrix": _opengl_pose(c).tolist()} for p, c in zip(paths, cameras)],
+    }
+    labels = {"labels": {str(i): name for i, name in enumerate(room.names, 1)}, "background": 0}
+    for name, content in (("transforms.json", transforms), ("labels.json", labels)):
+        (folder / name).write_text(json.dumps(content, indent=1))
+
+
+def _look(place: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int) -> Camera:
+    """A camera at (distance from the middle of the room, azimuth in degrees, height) that looks at a point."""
+    distance, azimuth, up = place[0], math.radians(place[1]), place[2]
+    eye = torch.tensor([distance * math.cos(azimuth), distance * math.sin(azimuth), up], dtype=torch.float64)
+    forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - eye, dim=0)
+    right = torch.nn.functional.normalize(forward.cross(eye.new_tensor([0, 0, 1]), dim=0), dim=0)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, forward.cross(right, dim=0), forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    focal = width / 2 / math.tan(math.radians(_FIELD_OF_VIEW) / 2)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(K, pose.float(), width, height)
+
+
+def _opengl_pose(camera: Camera) -> Float[Tensor, "4 4"]:
+    """Camera to world, x right, y up, z backward."""
+    return camera.world_to_camera.double().inverse() * torch.tensor([1, -1, -1, 1], dtype=torch.float64)

@@ -1,0 +1,78 @@
+"""The demo room as a splatfacto run, written by nerfstudio's own trainer but without any training."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.demo.room import DemoRoom
+
+
+def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:
+    """Writes output_dir/<name of the capture>/splatfacto/<time> as `ns-train splatfacto` does, on the CPU, in seconds.
+
+    The stock trainer sets up everything and saves its full checkpoint, optimizers and schedulers included, after one
+    step with zero gradients, which leaves the Gaussians of the room as they are. Only the weights of the LPIPS metric
+    are missing from it.
+
+    Args:
+        capture_folder: written by `write_capture`. The config names it as given here, relative or absolute.
+    Returns:
+        The run's config.yml.
+    Raises:
+        AssertionError: `capture_folder` does not exist (nerfstudio's message).
+    """
+    # Importing nerfstudio takes 20 seconds.
+    from nerfstudio.configs.method_configs import method_configs  # noqa: PLC0415
+    from nerfstudio.models.splatfacto import RGB2SH  # noqa: PLC0415
+
+    config: Any = copy.deepcopy(method_configs["splatfacto"])
+    config.data = config.pipeline.datamanager.data = capture_folder
+    config.output_dir = output_dir
+    config.machine.device_type = "cpu"
+    config.vis = "tensorboard"  # the default starts a viewer
+    config.max_num_iterations = 1
+    config.pipeline.model.num_random = len(room.scene)
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup()
+    # The metric would download its weights.
+    with patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()):
+        trainer.setup()
+    dataset = trainer.pipeline.datamanager.train_dataparser_outputs
+    dataset.save_dataparser_transform(trainer.base_dir / "dataparser_transforms.json")
+    scene = to_dataparser_world(room.scene, dataset.dataparser_transform, dataset.dataparser_scale)
+    parameters = trainer.pipeline.model.gauss_params
+    values = {
+        "means": scene.means,
+        "scales": scene.scales.log(),
+        "quats": scene.quats,
+        "opacities": scene.opacities.logit()[:, None],
+        "features_dc": RGB2SH(room.colors),
+        "features_rest": torch.zeros_like(parameters["features_rest"]),
+    }
+    for name, value in values.items():
+        parameters[name].data.copy_(value)
+        parameters[name].grad = torch.zeros_like(value)
+    trainer.optimizers.optimizer_step_all()
+    trainer.optimizers.scheduler_step_all(0)
+    trainer.save_checkpoint(0)
+    return trainer.base_dir / "config.yml"
+
+
+def to_dataparser_world(scene: GaussianScene, transform: Float[Tensor, "3 4"], scale: float) -> GaussianScene:
+    """The scene in the world of nerfstudio's dataparser, p' = scale (R p + t) with transform = [R | t]."""
+    rotation = Rotation.from_matrix(transform[:, :3].numpy())
+    means = scale * (scene.means @ transform[:, :3].T + transform[:, 3])
+    quats = (rotation * Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy())).as_quat()  # SciPy has w last
+    return GaussianScene(
+        means, torch.from_numpy(quats).roll(1, dims=1).to(means), scale * scene.scales, scene.opacities
+    )

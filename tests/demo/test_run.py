@@ -1,0 +1,103 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from normlift_ns import Camera, GaussianScene, render
+from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo.run import to_dataparser_world
+
+NUMPY_SCALARS = [type(np.dtype(float)), np.dtype, np.float64(0).__reduce__()[0]]
+"""What the learning rate in a stock checkpoint is made of."""
+
+
+def test_to_dataparser_world_moves_every_gaussian_rigidly():
+    generator = torch.Generator().manual_seed(0)
+    n = 50
+    scene = GaussianScene(
+        torch.randn(n, 3, generator=generator),
+        torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=1),
+        torch.rand(n, 3, generator=generator),
+        torch.rand(n, generator=generator),
+    )
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q
+    rotation = rotation * torch.det(rotation)
+    transform = torch.cat([rotation, torch.tensor([[0.3], [-2.0], [1.0]])], dim=1)
+    moved = to_dataparser_world(scene, transform, 0.4)
+    assert torch.allclose(moved.means, 0.4 * (scene.means @ rotation.T + transform[:, 3]), atol=1e-6)
+    expected = 0.16 * rotation @ covariances(scene) @ rotation.T
+    assert torch.allclose(covariances(moved), expected, atol=1e-6)
+    assert torch.equal(moved.opacities, scene.opacities)
+
+
+def covariances(scene: GaussianScene) -> torch.Tensor:
+    w, x, y, z = scene.quats.unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    half = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1) * scene.scales[:, None]
+    return half @ half.transpose(1, 2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoRoom, Path]:
+    folder = tmp_path_factory.mktemp("demo")
+    room = demo_room(5000)
+    write_capture(room, folder / "room", views=4, held_out=2, width=160, height=120)
+    return room, write_splatfacto_run(room, folder / "room", folder / "outputs")
+
+
+@pytest.mark.slow
+def test_run_is_complete(run: tuple[DemoRoom, Path]):
+    room, config_path = run
+    assert config_path.parts[-4:-2] == ("room", "splatfacto")
+    assert (config_path.parent / "dataparser_transforms.json").is_file()
+    [path] = (config_path.parent / "nerfstudio_models").iterdir()
+    assert path.name == "step-000000000.ckpt"
+    with pytest.raises(Exception, match="numpy"):  # as for every stock checkpoint
+        torch.load(path, weights_only=True)
+    with torch.serialization.safe_globals(NUMPY_SCALARS):
+        checkpoint = torch.load(path, weights_only=True)
+    assert set(checkpoint) == {"step", "pipeline", "optimizers", "schedulers", "scalers"}
+    groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities"}
+    assert set(checkpoint["optimizers"]) == groups
+    for name in groups:
+        value = checkpoint["pipeline"][f"_model.gauss_params.{name}"]
+        assert checkpoint["optimizers"][name]["state"][0]["exp_avg"].shape == value.shape
+        assert len(value) == len(room.scene)
+    assert not checkpoint["pipeline"]["_model.gauss_params.features_rest"].any()
+
+
+@pytest.mark.slow
+def test_gaussians_show_the_capture_in_the_world_of_the_dataparser(run: tuple[DemoRoom, Path]):
+    room, config_path = run
+    config = yaml.load(config_path.read_text(), Loader=yaml.Loader)
+    assert config.method_name == "splatfacto"
+    dataparser = config.pipeline.datamanager.dataparser
+    dataparser.data = config.pipeline.datamanager.data
+    [path] = (config_path.parent / "nerfstudio_models").iterdir()
+    with torch.serialization.safe_globals(NUMPY_SCALARS):
+        state = torch.load(path, weights_only=True)["pipeline"]
+    means, quats, scales, opacities, color = (
+        state[f"_model.gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities", "features_dc")
+    )
+    scene = GaussianScene(means, quats, scales.exp(), opacities.sigmoid()[:, 0])
+    assert not torch.allclose(means, room.scene.means, atol=0.1)
+    for split, count in (("train", 4), ("test", 2)):
+        outputs = dataparser.setup().get_dataparser_outputs(split)
+        assert len(outputs.image_filenames) == count
+        for i, file in enumerate(outputs.image_filenames):
+            image, _ = render(scene, opencv_camera(outputs.cameras[i]), color * 0.28209479177387814 + 0.5)
+            photo = torch.from_numpy(np.array(Image.open(file))) / 255
+            assert -10 * (image - photo).square().mean().log10() > 45  # PSNR; rounding to 8 bits alone gives 59
+
+
+def opencv_camera(camera) -> Camera:
+    pose = torch.eye(4)
+    pose[:3] = camera.camera_to_worlds * torch.tensor([1, -1, -1, 1])
+    return Camera(camera.get_intrinsics_matrices(), pose.inverse(), int(camera.width), int(camera.height))
