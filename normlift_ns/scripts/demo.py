@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
+from PIL import Image
 from rich.table import Table
 from torch import Tensor
 
@@ -51,6 +52,9 @@ class Demo:
         flags = ("--render-dir", pictures, "--json", answers)
         _show("ns-normlift-query", "--load-config", config, "--text", *TEXTS, *flags)
         NormLiftQuery(config, TEXTS, render_dir=pictures, json=answers).main()
+        side_by_side(
+            [pictures / f"0012_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures
+        )
 
         CONSOLE.rule("Comparing it with the truth")
         field = SemanticField.load(lifted / "normlift")
@@ -69,6 +73,17 @@ class Demo:
         (self.folder / "miou.json").write_text(json.dumps(means, indent=2) + "\n")
         CONSOLE.print(f"Pictures are in {pictures}. See it in the viewer: ns-viewer --load-config {config}")
         return means
+
+
+def side_by_side(paths: list[Path], folder: Path) -> None:
+    """Joins pictures of one height into overview.png."""
+    images = [Image.open(path).convert("RGB") for path in paths]
+    joined = Image.new("RGB", (sum(image.width for image in images), images[0].height))
+    left = 0
+    for image in images:
+        joined.paste(image, (left, 0))
+        left += image.width
+    joined.save(folder / "overview.png")
 
 
 def iou_per_class(found: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:

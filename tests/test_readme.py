@@ -1,0 +1,40 @@
+"""What the README shows works."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from normlift_ns.core.refine import RefineConfig
+from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.plugin.lifting import LiftOptions
+from normlift_ns.scripts import lift
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
+    from normlift_ns.scripts.demo import Demo  # noqa: PLC0415 (nerfstudio takes 20 s)
+
+    monkeypatch.chdir(tmp_path)
+    means = Demo().main()
+    print(means)
+    assert means["before refinement"] >= 0.85
+    assert means["after refinement"] >= 0.9
+    assert (tmp_path / "demo" / "pictures" / "overview.png").stat().st_size > 10_000
+    (script,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    assert len([line for line in script.splitlines() if line.strip() and not line.startswith(("from", "import"))]) <= 12
+    capsys.readouterr()
+    exec(compile(script, "README.md", "exec"), {})
+    shown = capsys.readouterr().out
+    assert "sky blue" in shown
+
+
+def test_options_of_the_readme_exist():
+    table = README.split("## Options of ns-normlift")[1].split("## Limits")[0]
+    named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", table)} - {"help"}
+    known = {f.name for cls in (lift.NormLift, LiftOptions, RefineConfig, SourceOptions) for f in fields(cls)}
+    assert named <= known
