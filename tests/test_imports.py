@@ -23,7 +23,7 @@ ALLOWED = {
         "huggingface_hub",
         *(f"normlift_ns.{x}" for x in ("core", "encoders")),
     },
-    "demo": BASE | {"nerfstudio", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},
+    "demo": BASE | {"nerfstudio", "matplotlib", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},
     "plugin": BASE
     | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib"}
     | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin")},

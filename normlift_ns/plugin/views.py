@@ -39,7 +39,7 @@ def to_camera(
     pose = torch.eye(4, dtype=camera_to_world.dtype, device=camera_to_world.device)
     pose[:3, :3] = rotation
     pose[:3, 3] = -rotation @ camera_to_world[:, 3]
-    return Camera(intrinsics, pose, width, height)
+    return Camera(intrinsics.to(pose.device), pose, width, height)  # nerfstudio makes intrinsics on the CPU
 
 
 class Views:
