@@ -88,14 +88,17 @@ class Evidence:
 
     @property
     def num_gaussians(self) -> int:
+        """N, those without evidence included."""
         return self.offsets.numel() - 1
 
     @property
     def num_regions(self) -> int:
+        """S, the columns: regions of all views, those that show no Gaussian included."""
         return self.region_view.numel()
 
     @property
     def nnz(self) -> int:
+        """Number of entries."""
         return self.weight.numel()
 
     @property

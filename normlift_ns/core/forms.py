@@ -39,12 +39,14 @@ class EvidenceForm:
     features: Float[Tensor, "s d"]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        table = (self.features.double() @ vectors.double().T).to(torch.float64)
+        """Cosines to unit vectors, 0 without evidence: E (F t) / (W_j ||f_j||), in float64."""
+        table = self.features.double() @ vectors.double().T
         length = scalars.weight.double() * scalars.norm.double()
         sums = self.evidence.rows.matmul(table)
         return torch.where((length > 0)[:, None], sums / length[:, None], 0.0).clamp(-1, 1).float()
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
+        """Unit directions of some Gaussians, 0 without evidence."""
         sums = self.evidence.rows.select_rows(gaussians).sums_of_unit_rows(self.features)
         found = (scalars.norm[gaussians] > 0)[:, None]
         return torch.where(found, sums / torch.linalg.vector_norm(sums, dim=1, keepdim=True), 0.0).float()
@@ -58,12 +60,14 @@ class DirectionForm:
     basis: Float[Tensor, "r d"] | None
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
+        """Cosines to unit vectors, 0 without evidence."""
         projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
         out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
         out[scalars.norm > 0] = torch.cat([block.float() @ projected.T for block in self.coordinates.split(2**16)])
         return out
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
+        """Unit directions of some Gaussians, 0 without evidence."""
         found = scalars.norm > 0
         row = (found.cumsum(0) - 1)[gaussians].clamp(min=0)
         rows = self.coordinates[row].float() if self.basis is None else self.coordinates[row].float() @ self.basis

@@ -39,6 +39,7 @@ class Surfels(NamedTuple):
 
 
 def sphere(radius: float) -> Distance:
+    """A ball around the origin."""
     return lambda p: length(p) - radius
 
 
@@ -93,6 +94,7 @@ def place(shape: Distance, x: float, y: float, z: float, turn: float = 0.0) -> D
 
 
 def union(*shapes: Distance) -> Distance:
+    """Everything that belongs to any of the shapes."""
     return lambda p: reduce(np.minimum, (shape(p) for shape in shapes))
 
 

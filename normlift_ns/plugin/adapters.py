@@ -76,6 +76,7 @@ class SourceRun:
 
     @property
     def model_config(self) -> SplatfactoModelConfig:
+        """The model's part of the config."""
         return cast(SplatfactoModelConfig, self.config.pipeline.model)
 
 

@@ -60,6 +60,7 @@ class NormLiftModel(SplatfactoModel):
     config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
 
     def populate_modules(self) -> None:
+        """As splatfacto's, without what it needs CUDA or a download for."""
         if not torch.cuda.is_available():
             self.seed_points = None  # splatfacto moves them to CUDA; a checkpoint brings its own Gaussians
         with _lazy_lpips():

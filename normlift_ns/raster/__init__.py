@@ -1,0 +1,1 @@
+"""Compositing weights as the rasterizer that trained the scene gives them."""
