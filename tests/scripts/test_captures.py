@@ -1,0 +1,94 @@
+"""The commands on the trained captures: full views, from another directory, numbers that a wrong lift would miss."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from benchmarks.captures import SHARED
+from normlift_ns import render
+from normlift_ns.plugin.adapters import SourceRun, load_run
+from normlift_ns.plugin.asking import ask, encoder_of, pixel_relevancy
+from normlift_ns.plugin.run_dir import load_field
+from tests.captures import needs_shared
+
+pytestmark = [pytest.mark.slow, needs_shared]
+
+
+def command(script: str, *flags: object, cwd: Path) -> str:
+    """What a command prints."""
+    words = [sys.executable, "-m", f"normlift_ns.scripts.{script}", *map(str, flags)]
+    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def maps(config: Path, texts: list[str], cameras: str) -> tuple[SourceRun, torch.Tensor]:
+    """Relevancy of the texts in all views of a split, [V, H, W, Q]."""
+    run = load_run(config)
+    field = load_field(run)
+    relevancy = ask(field, encoder_of(field), texts).relevancy
+    views = getattr(run, cameras).cameras
+    return run, torch.stack(
+        [pixel_relevancy(*render(run.scene, c, relevancy, rasterize_mode=run.rasterize_mode)) for c in views]
+    )
+
+
+def test_fox_is_orange_and_the_curtain_crimson(tmp_path):
+    source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
+    relative = Path(os.path.relpath(source, tmp_path))
+    flags = ("--encoder", "colour", "--output-dir", "lifted", "--timestamp", "t")
+    print(command("lift", "--load-config", relative, *flags, cwd=tmp_path))
+    config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
+    shown = command("query", "--load-config", config, "--text", "orange", "crimson", "--json", "a.json", cwd=tmp_path)
+    assert "mean reliability" in shown
+    orange, crimson = json.loads((tmp_path / "a.json").read_text())["queries"]
+    assert orange["peak"] > 0.5
+    assert crimson["peak"] > 0.6
+
+    _, values = maps(config, ["orange", "crimson"], "train")
+    head, wallpaper, curtain = (
+        (slice(180, 330), slice(250, 330)),
+        (slice(750, 930), slice(330, 480)),
+        (slice(100, 190), slice(470, 535)),
+    )
+    means = {
+        name: values[0][box].mean(dim=(0, 1)).tolist()
+        for name, box in (("head", head), ("wallpaper", wallpaper), ("curtain", curtain))
+    }
+    print(means)
+    assert means["head"][0] > 3 * means["wallpaper"][0]
+    assert means["head"][0] > 0.2
+    assert means["curtain"][1] > 3 * max(means["head"][1], means["wallpaper"][1])
+
+
+def test_mug_and_bottle_stand_out_from_the_table(tmp_path):
+    captures = SHARED / "captures"
+    source = captures / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
+    regions = ("--regions", "files", "--regions-dir", captures / "tabletop" / "instance")
+    flags = ("--encoder", "colour", *regions, "--output-dir", tmp_path, "--timestamp", "t")
+    command("lift", "--load-config", source.relative_to(captures), *flags, cwd=captures)
+    run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out")
+    names = [Path(name).stem for name in run.held_out.names]
+    truth = torch.stack(
+        [
+            torch.from_numpy(np.array(Image.open(captures / "tabletop" / "instance" / f"{name}.png")).astype(int))
+            for name in names
+        ]
+    )
+    assert len(truth) == 4
+    table = truth == 1
+    for q, label, threshold in ((0, 11, 0.25), (1, 12, 0.8)):
+        thing = truth == label
+        found = (values[..., q] > threshold) & (thing | table)
+        iou = float((found & thing).sum() / (found | thing).sum())
+        print(f"label {label}: IoU {iou:.3f} among the pixels of the thing and the table")
+        assert iou > 0.85
