@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -13,6 +13,7 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.plugin.adapters import SourceRun
 from normlift_ns.plugin.asking import Answer, pixel_relevancy
+from normlift_ns.plugin.observe import spread
 from normlift_ns.raster.rasterize import render
 
 _INCHES, _DPI = 6.0, 120
@@ -63,7 +64,18 @@ def _file_name(text: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in text)[:40]
 
 
-def training_cameras(run: SourceRun, count: int) -> dict[str, Camera]:
-    """`count` training cameras, evenly spread, by the stems of their images."""
-    chosen = torch.linspace(0, len(run.train) - 1, min(count, len(run.train))).round().long().tolist()
-    return {Path(run.train.names[i]).stem: run.train.cameras[i] for i in chosen}
+def training_cameras(run: SourceRun, names: Sequence[str] = ()) -> dict[str, Camera]:
+    """Training cameras by the stems of their images: those named, or three of them, evenly spread.
+
+    Raises:
+        ValueError: no training image of that name.
+    """
+    cameras = {Path(name).stem: camera for name, camera in zip(run.train.names, run.train.cameras)}
+    stems = list(cameras)
+    unknown = [name for name in names if name not in cameras]
+    if len(unknown) > 0:
+        raise ValueError(
+            f"--render-views: there is no training image {unknown[0]!r}; there are {len(stems)}, from {stems[0]!r} to "
+            f"{stems[-1]!r} (names without suffix; others are held out for evaluation)"
+        )
+    return {name: cameras[name] for name in names or (stems[i] for i in spread(len(stems), 3))}

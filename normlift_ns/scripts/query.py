@@ -39,8 +39,8 @@ class NormLiftQuery:
     """Write relevancy [N, Q], reliability [N], valid [N] and names to this .npz file."""
     render_dir: Path | None = None
     """Write pictures of the relevancy into this folder."""
-    render_views: int = 3
-    """Number of training cameras to render from, evenly spread."""
+    render_views: tuple[str, ...] = ()
+    """Training images from whose cameras to render, such as 0001 0042; by default three of them, evenly spread."""
     data: Path | None = None
     """Where the dataset is now, if it was moved."""
     device: str = "auto"
@@ -52,9 +52,11 @@ class NormLiftQuery:
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
         from normlift_ns.plugin.asking import ask, encoder_of, summarize  # noqa: PLC0415
+        from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data)
+        cameras = training_cameras(run, self.render_views)
         field = load_field(run)
         answer = ask(
             field,
@@ -78,9 +80,7 @@ class NormLiftQuery:
             with atomic_path(self.output_path) as temporary, temporary.open("wb") as file:
                 np.savez(file, names=np.array(self.text), **arrays)
         if self.render_dir is not None:
-            from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
-
-            save_overlays(run, answer, training_cameras(run, self.render_views), self.render_dir)
+            save_overlays(run, answer, cameras, self.render_dir)
         written = [path for path in (self.json, self.output_path, self.render_dir) if path is not None]
         if len(written) > 0:
             CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)

@@ -82,7 +82,7 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
         "--render-dir",
         tmp_path / "pictures",
     )
-    flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "2")
+    flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = capsys.readouterr().out
     assert "sky blue" in shown
@@ -105,7 +105,9 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     assert blue["extent"][0] > red["extent"][0]
 
     pictures = sorted((tmp_path / "pictures").iterdir())
-    assert len(pictures) == 4
+    assert [path.name for path in pictures] == [
+        "0003_0_red.png", "0003_1_sky_blue.png", "0007_0_red.png", "0007_1_sky_blue.png",
+    ]  # fmt: skip
     for path in pictures:
         pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
         assert (np.ptp(pixels, axis=2) > 60).mean() > 0.001, path  # something is coloured, over a grey image
@@ -194,6 +196,13 @@ def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
     field = load_field(load_run(trained.parents[2] / "normlift" / "less" / "config.yml"))
     assert field.manifest["statistics"]["views"] == 5
     assert 0 < field.manifest["statistics"]["zero_evidence_share"] < 0.5
+
+
+def test_pictures_of_an_unknown_view_are_refused(lifted, monkeypatch, capsys):
+    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "no training image '9999'; there are 12, from '0000' to '0011'" in shown
 
 
 def test_a_query_of_a_run_without_semantics_says_what_to_do(trained, monkeypatch, capsys):
