@@ -87,7 +87,7 @@ def refine(
     dtype = torch.promote_types(directions.dtype, torch.float32)
     reliability = reliability.to(dtype)
     source = torch.arange(n, dtype=torch.int32, device=means.device)
-    # Only a Gaussian with a reliable neighbour can win anything, and only if its best possible score clears the margin.
+    # Where no neighbour is reliable, nobody can win.
     active = (_gather(reliability, neighbors.index) > 0).any(dim=1).nonzero().squeeze(1)
     step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
     for i in active.split(step):
