@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Float64, Int, Int32
 from torch import Tensor
 
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
@@ -90,10 +90,11 @@ def refine(
     # Where no neighbour is reliable, nobody can win.
     active = (_gather(reliability, neighbors.index) > 0).any(dim=1).nonzero().squeeze(1)
     step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
+    width = decay_width(neighbors, config)
     for i in active.split(step):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
         r = _gather(reliability, group)
-        d = spatial_decay(neighbors, config, i).to(dtype)
+        d = spatial_decay(neighbors, width, i).to(dtype)
         u = directions[group.clamp(min=0)].to(dtype)
         g = torch.sigmoid((u @ u.transpose(1, 2) - config.tau) / config.gamma)
         score = r * (g @ (r * d)[:, :, None]).squeeze(2)
@@ -103,12 +104,16 @@ def refine(
     return source
 
 
-def spatial_decay(neighbors: Neighbors, config: RefineConfig, rows: Tensor) -> Float[Tensor, "m k_plus_1"]:
-    """d_ik of the given Gaussians, self first; 0 where a neighbour is missing."""
+def decay_width(neighbors: Neighbors, config: RefineConfig) -> Float64[Tensor, ""]:
+    """sigma_d in the units of the means: times the median spacing (1 where all Gaussians are at one place)."""
     finite = neighbors.spacing[neighbors.spacing.isfinite()]
-    unit = finite.median() if finite.numel() > 0 else neighbors.spacing.new_ones(())
+    return config.sigma_d * (finite.median() if finite.numel() > 0 else neighbors.spacing.new_ones(()))
+
+
+def spatial_decay(neighbors: Neighbors, width: Float64[Tensor, ""], rows: Int[Tensor, " m"]) -> Float64[Tensor, "m k"]:
+    """d_ik of the given Gaussians, self first, so K + 1 columns; 0 where a neighbour is missing."""
     distance = torch.cat([neighbors.distance.new_zeros(rows.numel(), 1), neighbors.distance[rows]], dim=1)
-    return torch.exp(-0.5 * (distance / (config.sigma_d * unit)) ** 2)
+    return torch.exp(-0.5 * (distance / width) ** 2)
 
 
 def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
