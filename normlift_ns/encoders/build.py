@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED
 from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.langsplat import LangSplat, Missing
 from normlift_ns.encoders.open_clip import Fill, OpenClipEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions
+from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
+from normlift_ns.encoders.text_vectors import TextVectors
 
 EncoderName = Literal["open_clip", "colour"]
 RegionsName = Literal["auto", "superpixel", "grid", "files"]
@@ -40,11 +42,16 @@ class SourceOptions:
     regions_resample: bool = False
     """Bring label maps of another size to the image's by nearest neighbour, instead of refusing them."""
     level: str | None = None
-    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]."""
+    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. langsplat: s, m, l (the
+    default), default (all of SAM's masks in one map), or sum (the vectors of all levels added up)."""
     features: FeaturesName = "none"
     """Take regions and features from features_dir instead of looking at images. langsplat: its preprocessing."""
     features_dir: Path | None = None
     """Folder of the features."""
+    features_missing: Missing = "error"
+    """Images without features: error, or skip to leave them out of the lift."""
+    text_vectors: Path | None = None
+    """NPZ file, text -> vector, to look texts up in instead of encoding them, for imported features."""
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
@@ -62,14 +69,34 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
     if options.features == "none":
         if options.features_dir is not None:
             raise ValueError(f"--features-dir {options.features_dir} is without use; add --features langsplat")
+        if options.text_vectors is not None:
+            raise ValueError(
+                f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat"
+            )
         return RegionFeatures(make_regions(options), make_encoder(options, device))
     if options.features_dir is None:
         raise ValueError(f"features {options.features!r} need their folder: give it with --features-dir")
-    raise ValueError("features langsplat cannot be read yet")
+    if options.regions != "auto" or options.regions_dir is not None:
+        raise ValueError(
+            "--regions and --regions-dir cut images up, but --features brings regions of its own; leave one out"
+        )
+    if options.encoder != "open_clip" and options.text_vectors is None:
+        raise ValueError(
+            f"encoder {options.encoder!r} did not make the features in {options.features_dir}; name the OpenCLIP model "
+            "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
+        )
+    level: Any = options.level or "l"
+    texts = make_texts(options, device)
+    return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+
+
+def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
+    """The text encoder of the options; arguments and errors as in `make_encoder` and `TextVectors`."""
+    return make_encoder(options, device) if options.text_vectors is None else TextVectors(options.text_vectors)
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
-    """The encoder of the options, which is all that a text query needs.
+    """The encoder of the options.
 
     Args:
         device: where a network runs, such as "cuda"; results are on the CPU anyway.

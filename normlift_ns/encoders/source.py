@@ -147,20 +147,24 @@ class Regions(Protocol):
         ...
 
 
-class Encoder(Protocol):
-    """A joint space of image regions and texts."""
+class TextEncoder(Protocol):
+    """What queries need."""
 
     @property
     def identity(self) -> dict[str, Any]:
         """As in `FeatureSource`."""
         ...
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
-        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level."""
-        ...
-
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """As in `FeatureSource`."""
+        ...
+
+
+class Encoder(TextEncoder, Protocol):
+    """A joint space of image regions and texts."""
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
+        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level."""
         ...
 
 
