@@ -111,25 +111,15 @@ class Evidence:
         views: Sequence[ViewEvidence], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
         """Joins the entries of all views, in their order."""
-        counts = torch.tensor([0, *(view.num_regions for view in views)])
-        first_column = counts.cumsum(0).tolist()
         device = views[0].weight.device if views else torch.device("cpu")
-        labeled = [view.region >= 0 for view in views]
-
-        def join(keep: Sequence[Tensor], columns: Sequence[Tensor]) -> SparseRows:
-            if not views:
-                empty = torch.zeros(0)
-                return SparseRows(torch.zeros(num_gaussians + 1, dtype=torch.int64), empty.int(), empty)
-            gaussian = torch.cat([view.gaussian[k].int() for view, k in zip(views, keep)])
-            weight = torch.cat([view.weight[k] for view, k in zip(views, keep)])
-            return SparseRows.from_coo(gaussian, torch.cat(list(columns)), weight, num_gaussians)
-
-        rows = join(labeled, [view.region[k].int() + first for view, k, first in zip(views, labeled, first_column)])
-        blank = [~k for k in labeled]
-        unlabeled = join(
-            blank,
-            [torch.full_like(view.gaussian[k], v, dtype=torch.int32) for v, (view, k) in enumerate(zip(views, blank))],
-        )
+        counts = torch.tensor([0, *(view.num_regions for view in views)])
+        labeled, blank = [], []
+        for v, (view, first) in enumerate(zip(views, counts.cumsum(0).tolist())):
+            keep = view.region >= 0
+            labeled.append((view.gaussian[keep], view.region[keep].int() + first, view.weight[keep]))
+            gaussian, weight = view.gaussian[~keep], view.weight[~keep]
+            blank.append((gaussian, torch.full_like(gaussian, v, dtype=torch.int32), weight))
+        rows, unlabeled = (SparseRows.stack(parts, num_gaussians, device) for parts in (labeled, blank))
         region_view = torch.repeat_interleave(torch.arange(len(views)), counts[1:]).int().to(device)
         return Evidence(
             rows.offsets, rows.column, rows.weight, region_view, unlabeled, len(views), weight_power, num_excluded
@@ -292,6 +282,5 @@ def _select_columns(rows: SparseRows, columns: Int64[Tensor, " m"], num_columns:
 
 
 def _append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
-    row = torch.cat([part.row_index() for part in parts])
-    column = torch.cat([part.column + first for part, first in zip(parts, first_column)])
-    return SparseRows.from_coo(row, column, torch.cat([part.weight for part in parts]), len(parts[0]))
+    entries = [(part.row_index(), part.column + first, part.weight) for part, first in zip(parts, first_column)]
+    return SparseRows.stack(entries, len(parts[0]), parts[0].weight.device)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int, Int32
+from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
@@ -84,13 +85,27 @@ def refine(
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
         raise ValueError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
+    width = decay_width(neighbors, config)
+    if means.device.type == "cuda" and _has_kernel(directions, config.k):
+        from normlift_ns.kernels.vote import vote  # noqa: PLC0415 (needs triton)
+
+        return vote(
+            spatial_order(means),
+            neighbors.index,
+            neighbors.distance,
+            directions.contiguous(),
+            reliability.float(),
+            tau=config.tau,
+            gamma=config.gamma,
+            width=float(width),
+            delta=config.delta,
+        )
     dtype = torch.promote_types(directions.dtype, torch.float32)
     reliability = reliability.to(dtype)
     source = torch.arange(n, dtype=torch.int32, device=means.device)
     # Where no neighbour is reliable, nobody can win.
     active = (_gather(reliability, neighbors.index) > 0).any(dim=1).nonzero().squeeze(1)
     step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
-    width = decay_width(neighbors, config)
     for i in active.split(step):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
         r = _gather(reliability, group)
@@ -102,6 +117,27 @@ def refine(
         wins = best > score[:, 0] + config.delta
         source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
     return source
+
+
+def _has_kernel(directions: Tensor, k: int) -> bool:
+    """Whether `kernels.vote` applies: up to 63 neighbours, float32 or half precision."""
+    return find_spec("triton") is not None and directions.dtype != torch.float64 and k < 64
+
+
+def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+    """All Gaussians along a Morton curve of 1,024 steps a side: neighbours in space come near each other.
+
+    A scene's far outliers would leave the rest in one cell, so that sides end at the 1st and 99th percentile.
+    """
+    sample = means[:: max(1, len(means) // 100_000)]
+    sample = sample[sample.isfinite().all(dim=1)].double()
+    if len(sample) == 0:
+        return torch.arange(len(means), device=means.device)
+    low, high = (sample.quantile(q, dim=0) for q in (0.01, 0.99))
+    cell = ((means - low) / (high - low).clamp(min=1e-12) * 1023).nan_to_num(0).clamp(0, 1023).long()
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        cell = (cell | (cell << shift)) & mask
+    return (cell[:, 0] | cell[:, 1] << 1 | cell[:, 2] << 2).argsort(stable=True)
 
 
 def decay_width(neighbors: Neighbors, config: RefineConfig) -> Float64[Tensor, ""]:

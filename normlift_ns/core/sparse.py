@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,6 +45,30 @@ class SparseRows:
         """Sorts entries given in any order; entries of the same place become one. See `sum_duplicates`."""
         row, column, weight = sum_duplicates(row, column, weight)
         return SparseRows(row_offsets(row, num_rows), column.int(), weight)
+
+    @staticmethod
+    def stack(
+        parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device
+    ) -> SparseRows:
+        """Joins (row, column, weight) lists, each sorted by row, whose columns follow each other from list to list.
+
+        Nothing is sorted: every entry goes straight to its place, behind those of its row in earlier lists.
+        """
+        dtype = parts[0][2].dtype if parts else torch.float32
+        offsets = torch.zeros(num_rows + 1, dtype=torch.int64, device=device)
+        for row, _, _ in parts:
+            offsets.index_add_(0, row + 1, torch.ones_like(row, dtype=torch.int64))
+        offsets = offsets.cumsum(0)
+        place, size = offsets[:-1].clone(), int(offsets[-1])
+        columns = torch.empty(size, dtype=torch.int32, device=device)
+        weights = torch.empty(size, dtype=dtype, device=device)
+        for row, column, weight in parts:
+            entry = torch.arange(row.numel(), device=device)
+            first = torch.where(row != row.roll(1), entry, 0) if row.numel() > 0 else entry  # of its row; 0 is always
+            target = place[row] + entry - first.cummax(0).values
+            columns[target], weights[target] = column, weight
+            place.index_add_(0, row, torch.ones_like(row, dtype=torch.int64))
+        return SparseRows(offsets, columns, weights)
 
     @staticmethod
     def add(a: SparseRows, b: SparseRows) -> SparseRows:
@@ -129,16 +153,27 @@ def sum_duplicates(
     """
     if row.numel() == 0:
         return row, column, weight
-    key = row.long() * (int(column.max()) + 1) + column
+    columns = int(column.max()) + 1
+    key, summed = sum_equal_keys(row.long() * columns + column, weight)
+    row_of = torch.div(key, columns, rounding_mode="floor")
+    return row_of.to(row.dtype), (key - row_of * columns).to(column.dtype), summed
+
+
+def sum_equal_keys(key: Int[Tensor, " m"], weight: Float[Tensor, " m"]) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
+    """Distinct keys in ascending order, each with the sum of its weights, added up in float64 in the order given.
+
+    >>> sum_equal_keys(torch.tensor([7, 5, 7]), torch.tensor([1.0, 2.0, 4.0]))
+    (tensor([5, 7]), tensor([2., 5.]))
+    """
     key, order = key.sort(stable=True)
+    weight = weight[order]
     starts = torch.ones_like(key, dtype=torch.bool)
     starts[1:] = key[1:] != key[:-1]
-    if bool(starts.all()):
-        return row[order], column[order], weight[order]
     first = starts.nonzero().squeeze(1)
-    place = order[first]
-    summed = segment_sum(weight[order], torch.cat([first, first.new_tensor([key.numel()])]))
-    return row[place], column[place], summed.to(weight.dtype)
+    if first.numel() == key.numel():
+        return key, weight
+    summed = segment_sum(weight, torch.cat([first, first.new_tensor([key.numel()])]))
+    return key[first], summed.to(weight.dtype)
 
 
 def row_offsets(row: Int[Tensor, " nnz"], num_rows: int) -> Int64[Tensor, " rows_plus_1"]:
