@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Float64, Int, Int32, Int64
+from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -25,14 +25,15 @@ UNLABELED, MASKED = -1, -2
 """Labels of pixels without a region, and of pixels that are no observation at all."""
 
 
-class ViewEvidence(NamedTuple):
-    """Entries of one view, distinct and sorted by (gaussian, region)."""
+class Entries(NamedTuple):
+    """What a rasterizer finds in one or a few views: distinct places, sorted by (gaussian, column)."""
 
     gaussian: Int[Tensor, " nnz"]
-    region: Int[Tensor, " nnz"]
-    """View-local region id, -1 for unlabelled pixels."""
+    column: Int[Tensor, " nnz"]
+    """View by view, a column for the unlabelled pixels and then one per region."""
     weight: Float[Tensor, " nnz"]
-    num_regions: int
+    num_regions: tuple[int, ...]
+    """Of each view."""
 
 
 @dataclass(frozen=True)
@@ -107,23 +108,26 @@ class Evidence:
         return SparseRows(self.offsets, self.region, self.weight)
 
     @staticmethod
-    def from_views(
-        views: Sequence[ViewEvidence], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
+    def from_entries(
+        parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
         """Joins the entries of all views, in their order."""
-        device = views[0].weight.device if views else torch.device("cpu")
-        counts = torch.tensor([0, *(view.num_regions for view in views)])
+        device = parts[0].weight.device if parts else torch.device("cpu")
+        counts = [count for part in parts for count in part.num_regions]
         labeled, blank = [], []
-        for v, (view, first) in enumerate(zip(views, counts.cumsum(0).tolist())):
-            keep = view.region >= 0
-            labeled.append((view.gaussian[keep], view.region[keep].int() + first, view.weight[keep]))
-            gaussian, weight = view.gaussian[~keep], view.weight[~keep]
-            blank.append((gaussian, torch.full_like(gaussian, v, dtype=torch.int32), weight))
-        rows, unlabeled = (SparseRows.stack(parts, num_gaussians, device) for parts in (labeled, blank))
-        region_view = torch.repeat_interleave(torch.arange(len(views)), counts[1:]).int().to(device)
+        first, view = 0, 0
+        for part in parts:
+            is_region, new = _column_table(part.num_regions, first, view)
+            is_region, new = is_region.to(device)[part.column], new.to(device)[part.column]
+            for found, keep in ((labeled, is_region), (blank, ~is_region)):
+                found.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
+            first, view = first + sum(part.num_regions), view + len(part.num_regions)
+        rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
+        region_view = torch.repeat_interleave(torch.arange(view), torch.tensor(counts, dtype=torch.int64))
         return Evidence(
-            rows.offsets, rows.column, rows.weight, region_view, unlabeled, len(views), weight_power, num_excluded
-        )
+            rows.offsets, rows.column, rows.weight, region_view.int().to(device), unlabeled, view, weight_power,
+            num_excluded,
+        )  # fmt: skip
 
     @cached_property
     def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
@@ -167,12 +171,51 @@ class Evidence:
         """
         columns = self.columns_of(views)
         chosen = torch.tensor(self._checked_views(views), dtype=torch.int64, device=columns.device)
-        rows = _select_columns(self.rows, columns, self.num_regions)
-        unlabeled = _select_columns(self.unlabeled, chosen, self.num_views)
+        rows = self.rows.select_columns(columns, self.num_regions)
+        unlabeled = self.unlabeled.select_columns(chosen, self.num_views)
         new_view = torch.full((self.num_views,), -1, dtype=torch.int32, device=columns.device)
         new_view[chosen] = torch.arange(chosen.numel(), dtype=torch.int32, device=columns.device)
         region_view = new_view[self.region_view[columns].long()]
         return self._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
+
+    def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
+        """The evidence of coarser regions, without rasterizing: E'_jt = sum over levels and the columns s of t of E_js.
+
+        Rasterized on the cells of a partition, evidence becomes that of any regions made of whole cells, exactly but
+        for rounding: sums of A_ij ** weight_power add up whatever the power. What maps to -1 joins the unlabelled
+        weight of its view. With several levels every pixel is observed once per level, so that W_jv, unlabelled weight
+        included, counts it as often; N_eff and R do not change with the scale of W.
+
+        Args:
+            columns: the new column of every column, one row per level; -1: none.
+            region_view: view of every new column, non-decreasing.
+        Raises:
+            ValueError: a new column that does not exist, or of another view than its old one.
+        """
+        if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
+            raise ValueError(
+                f"columns must be [levels, {self.num_regions}] with values in -1..{len(region_view) - 1}, got "
+                f"{tuple(columns.shape)}"
+            )
+        columns, region_view = (x.to(self.region_view.device) for x in (columns.long(), region_view))
+        level, column = (columns >= 0).nonzero(as_tuple=True)
+        if not torch.equal(region_view[columns[level, column]], self.region_view[column]):
+            raise ValueError("a new column must be of the same view as the columns that it joins")
+        if torch.equal(columns, torch.arange(len(region_view), device=columns.device)[None]):
+            return self
+        old = self.region.long()
+        new = columns[:, old]
+        kept = new >= 0
+        row, view, weight = (x.expand_as(new) for x in (self.rows.row_index(), self.region_view[old], self.weight))
+        rows = SparseRows.from_coo(row[kept], new[kept], weight[kept], self.num_gaussians)
+        blank = self.unlabeled
+        unlabeled = SparseRows.from_coo(
+            torch.cat([blank.row_index(), row[~kept]]),
+            torch.cat([blank.column, view[~kept]]),
+            torch.cat([blank.weight * len(columns), weight[~kept]]),
+            self.num_gaussians,
+        )
+        return self._with(rows, region_view=region_view, unlabeled=unlabeled)
 
     def _with(self, rows: SparseRows, **changes: Any) -> Evidence:
         return replace(self, offsets=rows.offsets, region=rows.column, weight=rows.weight, **changes)
@@ -192,8 +235,8 @@ class Evidence:
                 raise ValueError(f"Evidence.merge: parts must agree in {name}, found {values}")
         views = torch.tensor([0, *(part.num_views for part in parts)]).cumsum(0).tolist()
         regions = torch.tensor([0, *(part.num_regions for part in parts)]).cumsum(0).tolist()
-        rows = _append_columns([part.rows for part in parts], regions)
-        unlabeled = _append_columns([part.unlabeled for part in parts], views)
+        rows = SparseRows.append_columns([part.rows for part in parts], regions)
+        unlabeled = SparseRows.append_columns([part.unlabeled for part in parts], views)
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
         return parts[0]._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
@@ -272,15 +315,13 @@ class Evidence:
         )
 
 
-def _select_columns(rows: SparseRows, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:
-    """Keeps the given columns and renumbers them in the given order."""
-    new = torch.full((num_columns,), -1, dtype=torch.int64, device=columns.device)
-    new[columns] = torch.arange(columns.numel(), device=columns.device)
-    column = new[rows.column.long()]
-    keep = column >= 0
-    return SparseRows.from_coo(rows.row_index()[keep], column[keep], rows.weight[keep], len(rows))
-
-
-def _append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
-    entries = [(part.row_index(), part.column + first, part.weight) for part, first in zip(parts, first_column)]
-    return SparseRows.stack(entries, len(parts[0]), parts[0].weight.device)
+def _column_table(
+    num_regions: Sequence[int], first_region: int, first_view: int
+) -> tuple[Bool[Tensor, " columns"], Int32[Tensor, " columns"]]:
+    """Of every column of `Entries`: whether it is a region, and the number of that region, or else of the view."""
+    start = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
+    is_region = torch.ones(int(start[-1]), dtype=torch.bool)
+    is_region[start[:-1]] = False
+    new = first_region + is_region.cumsum(0) - 1
+    new[~is_region] = first_view + torch.arange(len(num_regions))
+    return is_region, new.int()

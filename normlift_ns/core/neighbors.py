@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +9,8 @@ import torch
 from jaxtyping import Float, Float64, Int32
 from scipy.spatial import KDTree
 from torch import Tensor
+
+from normlift_ns.core.gpu import kernels_apply
 
 
 class Neighbors(NamedTuple):
@@ -36,7 +37,7 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     """
     if k < 1:
         raise ValueError(f"k must be at least 1, got {k}")
-    found = _on_gpu(means.detach(), k) if means.device.type == "cuda" and find_spec("triton") is not None else None
+    found = _on_gpu(means.detach(), k) if kernels_apply(means) else None
     return _on_cpu(means, k) if found is None else found
 
 

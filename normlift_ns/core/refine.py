@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 
 _CHUNK_ELEMENTS = 2**24
+_MOST_NEIGHBORS = 63
+"""Of `kernels.vote`."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def refine(
     if tuple(neighbors.index.shape) != (n, config.k):
         raise ValueError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
     width = decay_width(neighbors, config)
-    if means.device.type == "cuda" and _has_kernel(directions, config.k):
+    if kernels_apply(means) and directions.dtype != torch.float64 and config.k <= _MOST_NEIGHBORS:
         from normlift_ns.kernels.vote import vote  # noqa: PLC0415 (needs triton)
 
         return vote(
@@ -117,11 +119,6 @@ def refine(
         wins = best > score[:, 0] + config.delta
         source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
     return source
-
-
-def _has_kernel(directions: Tensor, k: int) -> bool:
-    """Whether `kernels.vote` applies: up to 63 neighbours, float32 or half precision."""
-    return find_spec("triton") is not None and directions.dtype != torch.float64 and k < 64
 
 
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:

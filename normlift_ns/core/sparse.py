@@ -10,9 +10,12 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from normlift_ns.core.gpu import kernels_apply
+
 CANCELLED = 1e-3
 """Below this share of its weight a vector sum is recomputed in float64: its float32 digits have cancelled."""
 _CHUNK_ELEMENTS = 2**24
+_FEW_COLUMNS = 32
 
 
 def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
@@ -25,6 +28,10 @@ def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float
     """
     if values.numel() == 0:
         return torch.zeros(offsets.numel() - 1, dtype=torch.float64, device=values.device)
+    if kernels_apply(values):
+        from normlift_ns.kernels import sums  # noqa: PLC0415 (needs triton)
+
+        return sums.segment_sum(values, offsets)
     return torch.segment_reduce(values.double(), "sum", offsets=offsets, initial=0.0)
 
 
@@ -57,17 +64,17 @@ class SparseRows:
         dtype = parts[0][2].dtype if parts else torch.float32
         offsets = torch.zeros(num_rows + 1, dtype=torch.int64, device=device)
         for row, _, _ in parts:
-            offsets.index_add_(0, row + 1, torch.ones_like(row, dtype=torch.int64))
+            offsets[1:] += torch.bincount(row, minlength=num_rows)
         offsets = offsets.cumsum(0)
         place, size = offsets[:-1].clone(), int(offsets[-1])
         columns = torch.empty(size, dtype=torch.int32, device=device)
         weights = torch.empty(size, dtype=dtype, device=device)
         for row, column, weight in parts:
-            entry = torch.arange(row.numel(), device=device)
-            first = torch.where(row != row.roll(1), entry, 0) if row.numel() > 0 else entry  # of its row; 0 is always
-            target = place[row] + entry - first.cummax(0).values
+            count = torch.bincount(row, minlength=num_rows)
+            behind = place - (count.cumsum(0) - count)  # what to add to the number of an entry in its list
+            target = torch.arange(row.numel(), device=device) + behind[row]
             columns[target], weights[target] = column, weight
-            place.index_add_(0, row, torch.ones_like(row, dtype=torch.int64))
+            place += count
         return SparseRows(offsets, columns, weights)
 
     @staticmethod
@@ -102,10 +109,29 @@ class SparseRows:
         )
         return SparseRows(offsets, self.column[entry], self.weight[entry])
 
+    def select_columns(self, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:
+        """The given columns, distinct, of `num_columns`, renumbered in the given order."""
+        new = torch.full((num_columns,), -1, dtype=torch.int64, device=columns.device)
+        new[columns] = torch.arange(columns.numel(), device=columns.device)
+        column = new[self.column.long()]
+        keep = column >= 0
+        return SparseRows.from_coo(self.row_index()[keep], column[keep], self.weight[keep], len(self))
+
+    @staticmethod
+    def append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
+        """Matrices of the same rows side by side; the columns of each start at its `first_column`."""
+        entries = [(part.row_index(), part.column + first, part.weight) for part, first in zip(parts, first_column)]
+        return SparseRows.stack(entries, len(parts[0]), parts[0].weight.device)
+
     def matmul(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
         """Dense product with a table, in the table's precision; all rows at once."""
         if self.weight.numel() == 0:
             return table.new_zeros(len(self), table.shape[1])
+        if kernels_apply(table) and table.shape[1] <= _FEW_COLUMNS:
+            from normlift_ns.kernels.sums import product  # noqa: PLC0415 (needs triton)
+
+            columns = [product(self.offsets, self.column, self.weight, x.contiguous()) for x in table.T]
+            return torch.stack(columns, dim=1)
         # An embedding bag is exactly this product: gather rows, scale, add. It is threaded on CPU, deterministic on
         # GPU, and needs no MKL.
         return embedding_bag(

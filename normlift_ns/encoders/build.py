@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED
 from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.langsplat import LangSplat, Missing
 from normlift_ns.encoders.open_clip import Fill, OpenClipEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.source import Encoder, RegionFeatures, Regions
+from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
+from normlift_ns.encoders.text_vectors import TextVectors
 
 EncoderName = Literal["open_clip", "colour"]
 RegionsName = Literal["auto", "superpixel", "grid", "files"]
+FeaturesName = Literal["none", "langsplat"]
 
 
 @dataclass(frozen=True)
@@ -38,17 +41,62 @@ class SourceOptions:
     """The value in label maps that means no region; negative values never mean one."""
     regions_resample: bool = False
     """Bring label maps of another size to the image's by nearest neighbour, instead of refusing them."""
-    level: int | None = None
-    """Which map of NPY label files that hold several, [levels, H, W]."""
+    level: str | None = None
+    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. langsplat: s, m, l (the
+    default), default (all of SAM's masks in one map), or sum (the vectors of all levels added up)."""
+    features: FeaturesName = "none"
+    """Take regions and features from features_dir instead of looking at images. langsplat: its preprocessing."""
+    features_dir: Path | None = None
+    """Folder of the features."""
+    features_missing: Missing = "error"
+    """Images without features: error, or skip to leave them out of the lift."""
+    text_vectors: Path | None = None
+    """NPZ file, text -> vector, to look texts up in instead of encoding them, for imported features."""
 
 
-def make_source(options: SourceOptions, device: str = "cpu") -> RegionFeatures:
-    """Regions and encoder of the options, joined; arguments and errors as in `make_regions` and `make_encoder`."""
-    return RegionFeatures(make_regions(options), make_encoder(options, device))
+def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
+    """Regions and encoder of the options, joined, or the features of a folder.
+
+    Args:
+        device: as in `make_encoder`.
+    Raises:
+        ValueError: as `make_regions` and `make_encoder`; features without a folder, or a folder without features.
+        FileNotFoundError: as those; the folder does not exist.
+    """
+    if options.features not in get_args(FeaturesName):
+        known = ", ".join(get_args(FeaturesName))
+        raise ValueError(f"unknown features {options.features!r}; --features is one of {known}")
+    if options.features == "none":
+        if options.features_dir is not None:
+            raise ValueError(f"--features-dir {options.features_dir} is without use; add --features langsplat")
+        if options.text_vectors is not None:
+            raise ValueError(
+                f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat"
+            )
+        return RegionFeatures(make_regions(options), make_encoder(options, device))
+    if options.features_dir is None:
+        raise ValueError(f"features {options.features!r} need their folder: give it with --features-dir")
+    if options.regions != "auto" or options.regions_dir is not None:
+        raise ValueError(
+            "--regions and --regions-dir cut images up, but --features brings regions of its own; leave one out"
+        )
+    if options.encoder != "open_clip" and options.text_vectors is None:
+        raise ValueError(
+            f"encoder {options.encoder!r} did not make the features in {options.features_dir}; name the OpenCLIP model "
+            "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
+        )
+    level: Any = options.level or "l"
+    texts = make_texts(options, device)
+    return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+
+
+def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
+    """The text encoder of the options; arguments and errors as in `make_encoder` and `TextVectors`."""
+    return make_encoder(options, device) if options.text_vectors is None else TextVectors(options.text_vectors)
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
-    """The encoder of the options, which is all that a text query needs.
+    """The encoder of the options.
 
     Args:
         device: where a network runs, such as "cuda"; results are on the CPU anyway.
@@ -80,8 +128,15 @@ def make_regions(options: SourceOptions) -> Regions:
             raise ValueError(
                 'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
             )
-        return LabelFiles(options.regions_dir, options.regions_background, options.level, options.regions_resample)
+        level = _number(options.level)
+        return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
     for flag, value in (("--regions-dir", options.regions_dir), ("--level", options.level)):
         if value is not None:
             raise ValueError(f'{flag} {value} is for --regions files, not for "{kind}"; leave one of the two out')
     return Superpixels(options.region_count) if kind == "superpixel" else Grid(options.region_count)
+
+
+def _number(level: str | None) -> int | None:
+    if level is not None and not (level.isascii() and level.isdigit()):
+        raise ValueError(f"--level of --regions files is the number of a map, 0, 1, ...; got {level!r}")
+    return None if level is None else int(level)

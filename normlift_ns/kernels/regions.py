@@ -26,7 +26,7 @@ class RegionSums(NamedTuple):
     """Nonzero sums, one per tile, Gaussian and region, ordered by tile: places occur as often as tiles show them."""
 
     key: Int[Tensor, " m"]
-    """member * (most regions + 1) + label + 1."""
+    """gaussian * columns + column."""
     weight: Float32[Tensor, " m"]
 
 
@@ -58,8 +58,8 @@ def _number_labels(labels, local, table, counts, width, height, tiles_across, ti
 
 @triton.jit
 def _sum_regions(
-    means2d, conics, opacities, members, offsets, local, table, counts, base, out_weight, out_key,
-    first_tile, first_slot, columns, tiles_across, tiles, max_alpha, min_alpha, min_transmittance,
+    means2d, conics, opacities, members, offsets, local, table, counts, base, first_column, out_weight, out_key,
+    gaussians, first_tile, first_slot, columns, tiles_across, tiles, max_alpha, min_alpha, min_transmittance,
     POWER: tl.constexpr, TILE: tl.constexpr, UNROLL: tl.constexpr,
 ):  # fmt: skip
     tile = first_tile + tl.program_id(0).to(tl.int64)
@@ -69,6 +69,8 @@ def _sum_regions(
         y, x = _pixels((tile % tiles).to(tl.int32), tiles_across, TILE)
         px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
         number = tl.load(local + tile * TILE * TILE + tl.arange(0, TILE * TILE)).to(tl.int32)
+        view = tile // tiles
+        column = tl.load(first_column + view) + 1  # of label 0
         only = tl.load(table + tile * TILE * TILE)
         slot = tl.load(base + tile) - first_slot
         T = tl.where(number >= 0, 1.0, 0.0)  # transmittance; a finished pixel has none
@@ -106,7 +108,7 @@ def _sum_regions(
                     weight = tl.where(weight > 0, 1.0, 0.0)
                 total = tl.sum(weight, axis=0)
                 if total > 0:
-                    place = m.to(tl.int64) * columns + 1
+                    place = (m - view * gaussians) * columns + column
                     if count == 1:
                         tl.store(out_weight + slot, total)
                         tl.store(out_key + slot, (place + only).to(out_key.dtype.element_ty))
@@ -129,8 +131,9 @@ def region_sums(
     members: Int32[Tensor, " intersections"],
     offsets: Int[Tensor, " tiles_plus_1"],
     labels: Int32[Tensor, "views h w"],
+    first_column: Int32[Tensor, " views"],
     *,
-    most_regions: int,
+    columns: int,
     tile_size: int,
     max_alpha: float,
     min_alpha: float,
@@ -140,10 +143,11 @@ def region_sums(
     """Sums of A_ij ** weight_power over the pixels of each region in each tile, for views of one size.
 
     Args:
-        means2d, conics, opacities: projected Gaussians, in pixels; of any number of views.
+        means2d, conics, opacities: projected Gaussians in pixels, those of the first view, of the second, ...
         members: indices of Gaussians by tile, nearest first.
         offsets: tile t of all views (view by view, row by row) holds members[offsets[t]:offsets[t + 1]].
-        labels: region of every pixel, below `most_regions`; -1: unlabelled, summed like a region; below -1: no pixel.
+        labels: region of every pixel; -1: unlabelled, summed like a region; below -1: no pixel.
+        first_column: of each view, where its unlabelled pixels go; its regions follow. `columns`: of all views.
         tile_size: a power of two.
     """
     views, height, width = labels.shape
@@ -152,17 +156,17 @@ def region_sums(
     local = torch.empty(views * tiles, pixels, dtype=torch.int16, device=device)
     table = torch.empty(views * tiles, pixels, dtype=torch.int32, device=device)
     counts = torch.empty(views * tiles, dtype=torch.int32, device=device)
-    grid, columns = (views * tiles,), most_regions + 1
-    _number_labels[grid](labels, local, table, counts, width, height, across, tiles, TILE=tile_size, num_warps=1)
+    gaussians = len(means2d) // views
+    _number_labels[(views * tiles,)](labels, local, table, counts, width, height, across, tiles, TILE=tile_size, num_warps=1)
 
     slots = torch.cat([counts.new_zeros(1), counts * offsets.diff()]).cumsum(0)  # slot of the first Gaussian of each tile
     parts = [_no_sums(device)]
     for first, last, low, high in _chunks(slots):
         weight = torch.zeros(high - low, device=device)
-        key = torch.empty(high - low, dtype=_key_type(len(means2d) * columns), device=device)
+        key = torch.empty(high - low, dtype=_key_type(gaussians * columns), device=device)
         _sum_regions[(last - first,)](
-            means2d, conics, opacities, members, offsets, local, table, counts, slots, weight, key,
-            first, low, columns, across, tiles, max_alpha, min_alpha, min_transmittance,
+            means2d, conics, opacities, members, offsets, local, table, counts, slots, first_column, weight, key,
+            gaussians, first, low, columns, across, tiles, max_alpha, min_alpha, min_transmittance,
             POWER=weight_power, TILE=tile_size, UNROLL=_UNROLL, num_warps=1,
         )  # fmt: skip
         found = weight.nonzero().squeeze(1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 import triton
 import triton.language as tl
@@ -57,20 +59,21 @@ def vote(
     gamma: float,
     width: float,
     delta: float,
+    precision: Literal["tf32", "tf32x3", "ieee"] = "tf32x3",
 ) -> Int32[Tensor, " n"]:
     """Index of the Gaussian whose direction each one takes; formulas in `core.refine`.
 
     Args:
         order: in which Gaussians vote; neighbours in space should vote one after the other, since they read the same.
         neighbors: nearest first, -1 for none; at most MOST_NEIGHBORS.
-        directions: unit rows or 0. float16 and bfloat16 are multiplied on tensor cores and added in float32; float32
-            is multiplied in float32.
+        directions: unit rows or 0, multiplied on tensor cores and added in float32.
         width: sigma_d, in the units of `distance`.
+        precision: of products of float32 directions: rounded to 11 bits, in three such parts, or unrounded.
     """
     n, k = neighbors.shape
     source = torch.arange(n, dtype=torch.int32, device=neighbors.device)
     _vote[(n,)](
         order, neighbors, distance, directions, reliability, source, directions.shape[1], k, tau, gamma, width, delta,
-        GROUP=GROUP, SLICE=_SLICE, PRECISION="ieee", num_warps=4,
+        GROUP=GROUP, SLICE=_SLICE, PRECISION=precision, num_warps=4,
     )  # fmt: skip
     return source

@@ -16,8 +16,9 @@ import torch
 from jaxtyping import Float32, Int32
 from torch import Tensor
 
-from normlift_ns.core.evidence import ViewEvidence
+from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.raster.settings import RasterSettings
 
 _CHANNELS = 32
@@ -100,8 +101,8 @@ def views_evidence(
     antialiased: bool,
     weight_power: int,
     settings: RasterSettings,
-) -> Iterator[ViewEvidence]:
-    """Evidence of every view, from gsplat's forward and backward pass alone.
+) -> Entries:
+    """Entries of some views, from gsplat's forward and backward pass alone.
 
     Raises:
         ValueError: weight_power other than 1, which a gradient cannot give; and as `project_views`.
@@ -110,14 +111,13 @@ def views_evidence(
         raise ValueError(
             f'backend "gsplat" sums A_ij alone, weight_power {weight_power} is not a gradient; use backend="triton"'
         )
+    parts, before = [], 0
     for camera, label_map, count in zip(cameras, labels, num_regions):
-        parts = []
         for first, gradient in _gradients(scene, camera, label_map, count, antialiased, settings):
             gaussian, column = gradient.nonzero(as_tuple=True)
-            parts.append((gaussian, column + first, gradient[gaussian, column]))
-        gaussian, region, weight = (torch.cat(part) for part in zip(*parts))
-        order = torch.argsort(gaussian * (count + 1) + region)
-        yield ViewEvidence(gaussian[order].int(), region[order].int() - 1, weight[order], count)
+            parts.append((gaussian, before + first + column, gradient[gaussian, column]))
+        before += count + 1
+    return Entries(*sum_duplicates(*(torch.cat(part) for part in zip(*parts))), tuple(num_regions))
 
 
 def _gradients(

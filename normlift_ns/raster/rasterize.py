@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import groupby, islice, zip_longest
 from typing import Any, Literal, get_args
 
@@ -14,8 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.evidence import MASKED, UNLABELED, Evidence, ViewEvidence
+from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gpu import has_triton
 from normlift_ns.raster import reference
 from normlift_ns.raster.projection import assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
@@ -82,17 +82,19 @@ def rasterize_evidence(
             f"{num_excluded} of {len(scene)} Gaussians have non-finite parameters and are not drawn", stacklevel=2
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
-    views: list[ViewEvidence] = []
+    parts: list[Entries] = []
+    done = 0
     with torch.no_grad():
         for flight in _flights(_zip_views(cameras, labels, num_regions), in_flight):
-            checked = [_check_labels(len(views) + i, *view) for i, view in enumerate(flight)]
+            checked = [_check_labels(done + i, *view) for i, view in enumerate(flight)]
             there = [labels.to(scene.means.device, torch.int32) for _, labels, _ in flight]
             seen = [camera for camera, _, _ in flight]
-            for view in views_evidence(seen, there, checked, rasterize_mode == "antialiased", weight_power, settings):
-                views.append(view)
+            parts.append(views_evidence(seen, there, checked, rasterize_mode == "antialiased", weight_power, settings))
+            for _ in flight:
+                done += 1
                 if progress is not None:
-                    progress(len(views), total)
-    return Evidence.from_views(views, len(scene), weight_power=weight_power, num_excluded=num_excluded)
+                    progress(done, total)
+    return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
 def render(
@@ -135,11 +137,11 @@ def _check_mode(rasterize_mode: str) -> None:
 
 def _choose_evidence(
     backend: str, scene: GaussianScene, dtype: torch.dtype
-) -> tuple[Callable[..., Iterable[ViewEvidence]], int]:
+) -> tuple[Callable[..., Entries], int]:
     """How some views of one size are summed, and how many at once."""
     on_gpu = scene.means.device.type == "cuda"
     if backend == "auto" and on_gpu and dtype == scene.means.dtype == torch.float32:
-        backend = "gsplat" if find_spec("triton") is None else "triton"
+        backend = "triton" if has_triton() else "gsplat"
     if backend in ("gsplat", "triton"):
         if dtype != torch.float32:
             raise ValueError(f'backend "{backend}" computes in float32, not in {dtype}; use backend="torch"')
@@ -155,10 +157,10 @@ def _choose_evidence(
         antialiased: bool,
         weight_power: int,
         settings: RasterSettings,
-    ) -> list[ViewEvidence]:
+    ) -> Entries:
         projected = project(world, cameras[0], settings, antialiased)
         tiles = assign_tiles(projected, cameras[0].width, cameras[0].height, settings.tile_size)
-        return [module.view_evidence(projected, tiles, labels[0], num_regions[0], weight_power, settings)]
+        return module.view_evidence(projected, tiles, labels[0], num_regions[0], weight_power, settings)
 
     return one_view, 1
 
@@ -215,7 +217,7 @@ def _check_labels(index: int, camera: Camera, labels: Tensor, count: int | None)
             f"labels of view {index} have shape {tuple(labels.shape)}, but its camera is {camera.height} x "
             f"{camera.width} (height x width)"
         )
-    low, high = int(labels.min()), int(labels.max())
+    low, high = torch.stack(labels.aminmax()).tolist()
     if low < MASKED:
         raise ValueError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
     if count is not None and high >= count:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Int32
 from torch import Tensor
 
-from normlift_ns.core.evidence import ViewEvidence
+from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.sparse import sum_equal_keys
-from normlift_ns.kernels.regions import RegionSums, region_sums
+from normlift_ns.kernels.regions import region_sums
 from normlift_ns.raster.gsplat import project_views
 from normlift_ns.raster.settings import RasterSettings
 
@@ -24,39 +24,31 @@ def views_evidence(
     antialiased: bool,
     weight_power: int,
     settings: RasterSettings,
-) -> Iterator[ViewEvidence]:
-    """Evidence of some views of one size, all in flight at once; bitwise the same on every run.
+) -> Entries:
+    """Entries of some views of one size, all in flight at once; bitwise the same on every run.
 
     Raises:
         ValueError: as `project_views`.
     """
     seen = project_views(scene, cameras, antialiased, settings)
     offsets = torch.cat([seen.offsets.flatten(), seen.offsets.new_tensor([len(seen.members)])])
-    found = region_sums(
+    first = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
+    columns = int(first[-1])
+    key, weight = region_sums(
         seen.means2d.flatten(0, 1),
         seen.conics.flatten(0, 1),
         seen.opacities.flatten(),
         seen.members,
         offsets,
         torch.stack(list(labels)),
-        most_regions=max(num_regions),
+        first[:-1].int().to(offsets.device),
+        columns=columns,
         tile_size=settings.tile_size,
         max_alpha=settings.max_alpha,
         min_alpha=settings.min_alpha,
         min_transmittance=settings.min_transmittance,
         weight_power=weight_power,
     )
-    return split_views(found, len(scene), num_regions)
-
-
-def split_views(found: RegionSums, num_gaussians: int, num_regions: Sequence[int]) -> Iterator[ViewEvidence]:
-    """Adds up what tiles found of the same Gaussian and region, view by view; `member` is view * N + Gaussian."""
-    columns = max(num_regions) + 1
-    key, weight = sum_equal_keys(*found)
-    starts = torch.arange(len(num_regions) + 1, device=key.device) * (num_gaussians * columns)
-    bounds = torch.searchsorted(key.long(), starts).tolist()
-    member = torch.div(key, columns, rounding_mode="floor")
-    region = (key - member * columns).int() - 1
-    for view, count in enumerate(num_regions):
-        part = slice(bounds[view], bounds[view + 1])
-        yield ViewEvidence((member[part] - view * num_gaussians).int(), region[part], weight[part], count)
+    key, weight = sum_equal_keys(key, weight)
+    gaussian = torch.div(key, columns, rounding_mode="floor")
+    return Entries(gaussian.int(), (key - gaussian * columns).int(), weight, tuple(num_regions))
