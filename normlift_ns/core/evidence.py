@@ -123,9 +123,9 @@ class Evidence:
                 found.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
             first, view = first + sum(part.num_regions), view + len(part.num_regions)
         rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
-        region_view = torch.repeat_interleave(torch.arange(view), torch.tensor(counts, dtype=torch.int64))
+        region_view = torch.tensor([v for v, count in enumerate(counts) for _ in range(count)], dtype=torch.int32)
         return Evidence(
-            rows.offsets, rows.column, rows.weight, region_view.int().to(device), unlabeled, view, weight_power,
+            rows.offsets, rows.column, rows.weight, region_view.to(device), unlabeled, view, weight_power,
             num_excluded,
         )  # fmt: skip
 

@@ -184,9 +184,7 @@ def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
     return segment_sum(norms, torch.searchsorted(groups, evidence.offsets))
 
 
-def _directions(
-    rows: SparseRows, norm: Tensor, table: Tensor, dtype: torch.dtype
-) -> Iterator[tuple[int, Tensor]]:
+def _directions(rows: SparseRows, norm: Tensor, table: Tensor, dtype: torch.dtype) -> Iterator[tuple[int, Tensor]]:
     on_gpu = kernels_apply(table) and table.dtype == torch.float32
     for first, block in rows.chunks(table.shape[1]):
         known = norm[first : first + len(block)]

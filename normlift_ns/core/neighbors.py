@@ -13,6 +13,10 @@ from torch import Tensor
 from normlift_ns.core.gpu import kernels_apply
 
 
+_MOST_UNSURE = 1000
+"""Gaussians whose neighbours a GPU finds by looking at all others; with more of them the CPU's tree is faster."""
+
+
 class Neighbors(NamedTuple):
     """The K nearest other Gaussians of each Gaussian, nearest first, equal distances by index."""
 
@@ -29,7 +33,7 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
 
     On the CPU by a k-d tree over the distinct places: any number of Gaussians may share one, while a tree over all of
     them would need all pairs to answer ties in a fixed order. On a GPU by `kernels.nearest`, which certifies its
-    answer; where it cannot (more ties than it keeps candidates) the CPU answers.
+    answer; where it cannot (more ties than it keeps candidates) all distances are looked at, or the CPU answers.
     A Gaussian whose mean is not finite has no neighbours and is nobody's neighbour.
 
     Raises:
@@ -48,9 +52,14 @@ def _on_gpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors | None:
     finite = means.isfinite().all(dim=1).nonzero().squeeze(1)
     if means.dtype != torch.float32 or k > nearest.MOST_NEIGHBORS or finite.numel() == 0:
         return None
-    found = nearest.nearest(means if finite.numel() == len(means) else means[finite], k)
-    if not bool(found.certain.all()):
+    points = means if finite.numel() == len(means) else means[finite]
+    found = nearest.nearest(points, k)
+    unsure = (~found.certain).nonzero().squeeze(1)
+    if unsure.numel() > _MOST_UNSURE:
         return None
+    if unsure.numel() > 0:
+        for array, exact in zip(found, nearest.nearest_of_rows(points, unsure, k)):
+            array[unsure] = exact
     if finite.numel() == len(means):
         return Neighbors(found.index, found.distance, found.spacing)
     n = len(means)

@@ -54,14 +54,13 @@ class SparseRows:
         return SparseRows(row_offsets(row, num_rows), column.int(), weight)
 
     @staticmethod
-    def stack(
-        parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device
-    ) -> SparseRows:
+    def stack(parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device) -> SparseRows:
         """Joins (row, column, weight) lists, each sorted by row, whose columns follow each other from list to list.
 
         Nothing is sorted: every entry goes straight to its place, behind those of its row in earlier lists.
         """
         dtype = parts[0][2].dtype if parts else torch.float32
+        parts = [part for part in parts if part[0].numel() > 0]
         offsets = torch.zeros(num_rows + 1, dtype=torch.int64, device=device)
         for row, _, _ in parts:
             offsets[1:] += torch.bincount(row, minlength=num_rows)
@@ -185,7 +184,9 @@ def sum_duplicates(
     return row_of.to(row.dtype), (key - row_of * columns).to(column.dtype), summed
 
 
-def sum_equal_keys(key: Int[Tensor, " m"], weight: Float[Tensor, " m"]) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
+def sum_equal_keys(
+    key: Int[Tensor, " m"], weight: Float[Tensor, " m"]
+) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
     """Distinct keys in ascending order, each with the sum of its weights, added up in float64 in the order given.
 
     >>> sum_equal_keys(torch.tensor([7, 5, 7]), torch.tensor([1.0, 2.0, 4.0]))

@@ -21,6 +21,8 @@ SLOTS = 64
 SPARE = 4
 """Candidates kept beyond K, so that float32 may confuse the last few."""
 MOST_NEIGHBORS = SLOTS - SPARE
+_PAIRS = 2**24
+"""Distances at once, of 8 bytes and as much again for their parts."""
 _LEAVES = 2**14
 """Leaves at once: half a million points, 320 bytes each at K = 36."""
 
@@ -78,14 +80,16 @@ def _box(nodes: Float32[Tensor, "nodes m 3"]) -> tuple[Float32[Tensor, "nodes 3"
     return nodes.amin(dim=1), torch.where(nodes.isinf(), -torch.inf, nodes).amax(dim=1)
 
 
-def _ascending_bits(x: Float32[Tensor, "..."]) -> Int64[Tensor, "..."]:
+def _ascending_bits(x: Tensor) -> Tensor:
     """Integers 0 <= b < 2 ** 32 in the order of the numbers."""
     bits = (x + 0.0).view(torch.int32).long()  # + 0.0: no negative zero
     return torch.where(bits < 0, -(bits & 0x7FFFFFFF), bits) + (1 << 31)
 
 
 @triton.jit
-def _search(points, boxes, index, candidates, first_leaf, leaves, stride, wanted, LEAF: tl.constexpr, SLOTS: tl.constexpr):
+def _search(
+    points, boxes, index, candidates, first_leaf, leaves, stride, wanted, LEAF: tl.constexpr, SLOTS: tl.constexpr
+):
     """Keeps the `wanted` nearest points of each point of a leaf: candidates[slot, point], float32 bits and position."""
     leaf = first_leaf + tl.program_id(0)
     lane = tl.arange(0, LEAF)
@@ -112,7 +116,11 @@ def _search(points, boxes, index, candidates, first_leaf, leaves, stride, wanted
         else:
             if near:
                 other = (node - leaves) * LEAF + lane
-                ox, oy, oz = tl.load(points + 3 * other), tl.load(points + 3 * other + 1), tl.load(points + 3 * other + 2)
+                ox, oy, oz = (
+                    tl.load(points + 3 * other),
+                    tl.load(points + 3 * other + 1),
+                    tl.load(points + 3 * other + 2),
+                )
                 there = tl.load(index + other) >= 0
                 ex, ey, ez = ox[:, None] - x[None, :], oy[:, None] - y[None, :], oz[:, None] - z[None, :]
                 square = ex * ex + ey * ey + ez * ez
@@ -173,7 +181,7 @@ def _rank(
         full = tl.sum(found.to(tl.int32), axis=0) == wanted
         worst = tl.max(tl.where(found, (key >> 32).to(tl.int32).to(tl.float32, bitcast=True), 0.0), axis=0)
         last = tl.max(tl.where(keep & found, distance, 0.0), axis=0)
-        horizon = tl.sqrt(worst.to(tl.float64)) * 0.999999
+        horizon = tl.sqrt(worst.to(tl.float64)) * (1 - 3e-7)
         certain = (full == 0) | ((last < horizon) & (elsewhere < float("inf")))
         tl.store(out_certain + me, certain.to(tl.int8))
 
@@ -205,3 +213,31 @@ def nearest(points: Float32[Tensor, "n 3"], k: int) -> Found:
             tree.points, tree.index, candidates, *found, first * LEAF, stride, wanted, k, SLOTS=SLOTS, num_warps=1
         )
     return found._replace(certain=found.certain.bool())
+
+
+def nearest_of_rows(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> Found:
+    """The K nearest other points of some points by looking at all: for the few that `nearest` is not sure of."""
+    exact, parts = points.double(), []
+    n = len(points)
+    for some in rows.split(max(1, _PAIRS // n)):
+        distance = torch.linalg.vector_norm(exact[some, None] - exact, dim=2)
+        distance[torch.arange(len(some), device=rows.device), some] = torch.inf
+        spacing = torch.where(distance > 0, distance, torch.inf).amin(dim=1)
+        last = distance.topk(min(k, n), largest=False).values[:, -1:]
+        row, index = (distance <= last).nonzero(as_tuple=True)  # by row, then index; more than K where they tie
+        order = distance[row, index].sort(stable=True).indices
+        order = order[row[order].sort(stable=True).indices]
+        row, index = row[order], index[order]
+        rank = torch.arange(len(row), device=rows.device) - torch.searchsorted(row, row)
+        keep = (rank < k) & (distance[row, index] < torch.inf)
+        place = (row[keep], rank[keep])
+        found = Found(
+            torch.full((len(some), k), -1, dtype=torch.int32, device=rows.device),
+            torch.full((len(some), k), torch.inf, device=rows.device),
+            spacing,
+            torch.ones(len(some), dtype=torch.bool, device=rows.device),
+        )
+        found.index[place] = index[keep].int()
+        found.distance[place] = distance[row, index][keep].float()
+        parts.append(found)
+    return Found(*(torch.cat(x) for x in zip(*parts)))

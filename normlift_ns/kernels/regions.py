@@ -1,8 +1,8 @@
 """Sums of compositing weights by (Gaussian, region): one program of a single warp per tile, no atomics.
 
-A program holds the pixels of its tile in registers and walks through the Gaussians, nearest first, with exactly the
-arithmetic of gsplat 1.4.0's rasterize_to_pixels_fwd.cu. For every (Gaussian, region in the tile) it owns one slot of the
-output, so that the result does not depend on the order in which programs run.
+A program holds the pixels of its tile in registers and walks through the Gaussians, nearest first, with the arithmetic
+of gsplat 1.4.0's rasterize_to_pixels_fwd.cu. For every (Gaussian, region in the tile) it owns one slot of the output,
+so that the result does not depend on the order in which programs run.
 """
 
 from __future__ import annotations
@@ -157,9 +157,13 @@ def region_sums(
     table = torch.empty(views * tiles, pixels, dtype=torch.int32, device=device)
     counts = torch.empty(views * tiles, dtype=torch.int32, device=device)
     gaussians = len(means2d) // views
-    _number_labels[(views * tiles,)](labels, local, table, counts, width, height, across, tiles, TILE=tile_size, num_warps=1)
+    _number_labels[(views * tiles,)](
+        labels, local, table, counts, width, height, across, tiles, TILE=tile_size, num_warps=1
+    )
 
-    slots = torch.cat([counts.new_zeros(1), counts * offsets.diff()]).cumsum(0)  # slot of the first Gaussian of each tile
+    slots = torch.cat([counts.new_zeros(1), counts * offsets.diff()]).cumsum(
+        0
+    )  # slot of the first Gaussian of each tile
     parts = [_no_sums(device)]
     for first, last, low, high in _chunks(slots):
         weight = torch.zeros(high - low, device=device)
@@ -175,13 +179,15 @@ def region_sums(
 
 
 def _chunks(slots: Int[Tensor, " tiles_plus_1"]) -> list[tuple[int, int, int, int]]:
-    """Runs of tiles of at most _MOST_SLOTS slots, unless one tile has more: first and last tile, first and last slot."""
+    """Runs of tiles of at most _MOST_SLOTS slots, or of one tile: first and last tile, first and last slot."""
     total = int(slots[-1])
     if total <= _MOST_SLOTS:
         return [(0, len(slots) - 1, 0, total)] if total > 0 else []
     bounds = torch.arange(0, total + _MOST_SLOTS, _MOST_SLOTS, device=slots.device)
     tile = torch.cat([torch.searchsorted(slots, bounds, right=True) - 1, slots.new_tensor([len(slots) - 1])]).unique()
-    return [(first, last, low, high) for (first, low), (last, high) in pairwise(zip(tile.tolist(), slots[tile].tolist()))]
+    return [
+        (first, last, low, high) for (first, low), (last, high) in pairwise(zip(tile.tolist(), slots[tile].tolist()))
+    ]
 
 
 def _no_sums(device: torch.device) -> RegionSums:

@@ -65,9 +65,7 @@ def project_views(
     opacities = opacities * compensations if antialiased else opacities.contiguous()
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
     _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down, n_cameras=len(cameras))
-    return Projections(
-        means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down)
-    )
+    return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
 
 
 def check_usable(scene: GaussianScene, settings: RasterSettings) -> None:
@@ -127,9 +125,9 @@ def _gradients(
 
     The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py).
     """
-    from gsplat.cuda._backend import _C  # noqa: PLC0415 (needs a GPU)
-
     seen = project_views(scene, [camera], antialiased, settings)
+    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
+
     colors = torch.zeros(1, len(scene), _CHANNELS, device=scene.means.device)
     drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
     lists = (settings.tile_size, seen.offsets, seen.members)
@@ -138,7 +136,5 @@ def _gradients(
     for first in range(0, count + 1, _CHANNELS):
         channels = torch.arange(first, first + _CHANNELS, device=column.device)
         one_hot = (column[None, :, :, None] == channels).float()
-        gradients = _C.rasterize_to_pixels_bwd(
-            *drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False
-        )
+        gradients = _C.rasterize_to_pixels_bwd(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
         yield first, gradients[3][0]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.gpu import has_triton
+from normlift_ns.core.gpu import has_triton, in_parts
 from normlift_ns.raster import reference
 from normlift_ns.raster.projection import assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
@@ -27,6 +27,7 @@ _IN_FLIGHT = 8
 """Most views at once on a GPU."""
 _FLIGHT_ELEMENTS = 2**24
 """Views in flight times Gaussians, about: each takes 60 bytes."""
+_ADVICE = "rasterize at a fraction of the resolution (ns-normlift --lift-downscale 2), or on the CPU (--device cpu)"
 
 
 def rasterize_evidence(
@@ -86,10 +87,17 @@ def rasterize_evidence(
     done = 0
     with torch.no_grad():
         for flight in _flights(_zip_views(cameras, labels, num_regions), in_flight):
-            checked = [_check_labels(done + i, *view) for i, view in enumerate(flight)]
-            there = [labels.to(scene.means.device, torch.int32) for _, labels, _ in flight]
-            seen = [camera for camera, _, _ in flight]
-            parts.append(views_evidence(seen, there, checked, rasterize_mode == "antialiased", weight_power, settings))
+            checked = [
+                (camera, there, _check_labels(done + i, camera, there, count))
+                for i, (camera, there, count) in enumerate(flight)
+            ]
+
+            def sums(views: Sequence[tuple[Camera, Tensor, int]]) -> Entries:
+                seen, maps, counts = zip(*views)
+                there = [labels.to(scene.means.device, torch.int32) for labels in maps]
+                return views_evidence(seen, there, counts, rasterize_mode == "antialiased", weight_power, settings)
+
+            parts += in_parts(sums, checked, _ADVICE)
             for _ in flight:
                 done += 1
                 if progress is not None:
@@ -135,9 +143,7 @@ def _check_mode(rasterize_mode: str) -> None:
         raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
 
 
-def _choose_evidence(
-    backend: str, scene: GaussianScene, dtype: torch.dtype
-) -> tuple[Callable[..., Entries], int]:
+def _choose_evidence(backend: str, scene: GaussianScene, dtype: torch.dtype) -> tuple[Callable[..., Entries], int]:
     """How some views of one size are summed, and how many at once."""
     on_gpu = scene.means.device.type == "cuda"
     if backend == "auto" and on_gpu and dtype == scene.means.dtype == torch.float32:
