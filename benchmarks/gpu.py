@@ -3,7 +3,7 @@
     python -m benchmarks.gpu            fox, tabletop, rooms of 0.48, 1.93 and 10 million Gaussians, growth
     python -m benchmarks.gpu --quick    fox and tabletop only
 
-Every time is that of the second of two equal runs, the GPU waited for on both sides.
+Every time is the median of three runs after a first one, the GPU waited for on both sides.
 """
 
 from __future__ import annotations
@@ -58,13 +58,16 @@ class Case:
 
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of the second of two runs, and its result."""
-    run()
-    torch.cuda.synchronize()
-    start = time.perf_counter()
-    result = run()
-    torch.cuda.synchronize()
-    return time.perf_counter() - start, result
+    """Median seconds of three runs after a first one, and the result of the last."""
+    result, seconds = run(), []
+    for _ in range(3):
+        del result
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        result = run()
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return sorted(seconds)[1], result
 
 
 def features(rows: int, device: str = "cuda") -> torch.Tensor:
@@ -142,14 +145,13 @@ def measure(report: Report, case: Case) -> None:
         evidence_gib = torch.cuda.max_memory_allocated() / 2**30
         table = features(evidence.num_regions)
         reliability_s, lifted = timed(lambda: lift(evidence, table))
-        directions_s, directions = timed(lambda: lifted.directions(dtype=torch.float16))
+        directions_s, _ = timed(lambda: lifted.directions(dtype=torch.float16))
         config = RefineConfig()
         neighbors_s, neighbors = timed(lambda: nearest_neighbors(case.scene.means, config.k))
         vote_s, source = timed(
-            lambda: refine(case.scene.means, directions, lifted.reliability, config, neighbors=neighbors)
+            lambda: refine(case.scene.means, lifted.directions, lifted.reliability, config, neighbors=neighbors)
         )
         peak_gib = torch.cuda.max_memory_allocated() / 2**30
-        del directions
         field = query_field(lifted, source)
         query_s, _ = timed(lambda: field.query(table[:1]))
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,23 +60,25 @@ def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
     dtype = torch.float64 if exact else torch.float32
     evidence = case.evidence(dtype=dtype)
     lifted = lift(evidence, table.to(dtype))
-    directions = lifted.directions(dtype=torch.float16 if precision == "half" else None)
     config, means = RefineConfig(), case.scene.means
     neighbors = nearest_neighbors(means, config.k)
-    if precision in ("float32", "tf32"):
-        source = vote(
-            spatial_order(means), neighbors.index, neighbors.distance, directions, lifted.reliability,
+    if precision == "tf32":
+        directions = lifted.directions()
+        source, row_of = (torch.arange(len(means), dtype=torch.int32, device=means.device) for _ in range(2))
+        vote(
+            spatial_order(means), neighbors.index, neighbors.distance, directions, row_of, lifted.reliability, source,
             tau=config.tau, gamma=config.gamma, width=float(decay_width(neighbors, config)), delta=config.delta,
-            precision="ieee" if precision == "float32" else "tf32",
+            precision="tf32",
         )  # fmt: skip
     else:
-        source = refine(means, directions, lifted.reliability, config, neighbors=neighbors)
-    return Outcome(directions[source.long()], lifted.norm[source.long()] > 0), (lifted, source)
+        read = partial(lifted.directions, dtype=torch.float16) if precision == "half" else lifted.directions
+        source = refine(means, read, lifted.reliability, config, neighbors=neighbors)
+    return Outcome(lifted.directions(source.long()), lifted.norm[source.long()] > 0), (lifted, source)
 
 
 def low_rank(case: Case, table: torch.Tensor) -> tuple[Outcome, Any]:
-    """The half-precision lift, stored in a basis that changes no cosine by more than 5e-2."""
-    _, (lifted, source) = run(case, table, "half")
+    """The default lift, stored in a basis that changes no cosine by more than 5e-2."""
+    _, (lifted, source) = run(case, table, "float32")
     field = SemanticField.build(lifted, case.scene.means, source, tolerance=5e-2, form="low_rank")
     return Outcome(field.directions(), field.valid()), None
 
@@ -108,8 +111,8 @@ def main(output: Path) -> None:
         "tf32": lambda: run(case, table, "tf32"),
         "half": lambda: run(case, table, "half"),
         "low_rank": lambda: low_rank(case, table),
-        "half_resolution": lambda: run(small, table, "half"),
-        "every_second_view": lambda: run(fewer, table[columns.cuda()], "half"),
+        "half_resolution": lambda: run(small, table, "float32"),
+        "every_second_view": lambda: run(fewer, table[columns.cuda()], "float32"),
     }
     exact = None
     for name, preset in presets.items():

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
-from normlift_ns.core.sparse import CANCELLED, SparseRows, segment_sum
+from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, SparseRows, segment_sum
 
 Unlabeled = Literal["ignore", "dilute"]
 
@@ -60,16 +60,37 @@ class Lifted:
         Args:
             dtype: of the result; half precision needs half the memory, and no more than it on the way.
         """
-        rows = self.evidence.rows if gaussians is None else self.evidence.rows.select_rows(gaussians)
-        norm = self.norm if gaussians is None else self.norm[gaussians]
-        found = self.features.new_empty(len(rows), self.features.shape[1], dtype=dtype)
-        for first, block in _directions(rows, norm, self.features, found.dtype):
-            found[first : first + len(block)] = block
+        dtype = dtype or self.features.dtype
+        n, device = self.evidence.num_gaussians, self.features.device
+        gaussians = torch.arange(n, device=device) if gaussians is None else gaussians
+        found = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
+        first = 0
+        for rows in gaussians.split(self._step):
+            found[first : first + len(rows)] = self._directions(rows, dtype)
+            first += len(rows)
         return found
 
     def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
         """u_j in blocks of consecutive Gaussians, (first Gaussian, block), with bounded memory."""
-        return _directions(self.evidence.rows, self.norm, self.features, self.features.dtype)
+        n, device = self.evidence.num_gaussians, self.features.device
+        for first in range(0, n, self._step):
+            rows = torch.arange(first, min(n, first + self._step), device=device)
+            yield first, self._directions(rows, self.features.dtype)
+
+    @property
+    def _step(self) -> int:
+        return max(1, CHUNK_ELEMENTS // max(1, self.features.shape[1]))
+
+    def _directions(self, gaussians: Tensor, dtype: torch.dtype) -> Tensor:
+        rows, table = self.evidence.rows, self.features
+        if _has_kernel(table):
+            from normlift_ns.kernels.sums import unit_sums  # noqa: PLC0415 (needs triton)
+
+            arrays = (rows.offsets, rows.column, rows.weight, table, self.norm)
+            return unit_sums(gaussians.long(), *arrays, dtype, CANCELLED)
+        sums = rows.select_rows(gaussians).sums_of_unit_rows(table)
+        length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
+        return torch.where((self.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
 
 
 class _Sums(NamedTuple):
@@ -150,7 +171,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
 
 
 def _sums(evidence: Evidence, table: Tensor) -> _Sums:
-    if kernels_apply(table) and table.dtype == torch.float32:
+    if _has_kernel(table):
         from normlift_ns.kernels.sums import row_norms  # noqa: PLC0415 (needs triton)
 
         rows = evidence.rows
@@ -184,18 +205,8 @@ def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
     return segment_sum(norms, torch.searchsorted(groups, evidence.offsets))
 
 
-def _directions(rows: SparseRows, norm: Tensor, table: Tensor, dtype: torch.dtype) -> Iterator[tuple[int, Tensor]]:
-    on_gpu = kernels_apply(table) and table.dtype == torch.float32
-    for first, block in rows.chunks(table.shape[1]):
-        known = norm[first : first + len(block)]
-        if on_gpu:
-            from normlift_ns.kernels.sums import unit_sums  # noqa: PLC0415 (needs triton)
-
-            yield first, unit_sums(block.offsets, block.column, block.weight, table, known, dtype, CANCELLED)
-            continue
-        sums = block.sums_of_unit_rows(table)
-        length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
-        yield first, torch.where((known > 0)[:, None], sums / length, 0.0).to(dtype)
+def _has_kernel(table: Tensor) -> bool:
+    return kernels_apply(table) and table.dtype == torch.float32
 
 
 def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from normlift_ns.core.gpu import kernels_apply
 
-
 _MOST_UNSURE = 1000
 """Gaussians whose neighbours a GPU finds by looking at all others; with more of them the CPU's tree is faster."""
 

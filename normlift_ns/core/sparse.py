@@ -14,7 +14,8 @@ from normlift_ns.core.gpu import kernels_apply
 
 CANCELLED = 1e-3
 """Below this share of its weight a vector sum is recomputed in float64: its float32 digits have cancelled."""
-_CHUNK_ELEMENTS = 2**24
+CHUNK_ELEMENTS = 2**24
+"""Of a dense array that is made block by block."""
 _FEW_COLUMNS = 32
 
 
@@ -146,7 +147,7 @@ class SparseRows:
         """Consecutive blocks of rows, (first row, block), small enough that block rows x row_size stays near 2**24
         elements.
         """
-        step = max(1, _CHUNK_ELEMENTS // max(1, row_size))
+        step = max(1, CHUNK_ELEMENTS // max(1, row_size))
         for first in range(0, len(self), step):
             offsets = self.offsets[first : first + step + 1]
             low, high = int(offsets[0]), int(offsets[-1])

@@ -160,8 +160,8 @@ def row_norms(
 
 
 @triton.jit
-def _unit_sums(offsets, column, weight, table, known, out, dimension, cancelled, BLOCK: tl.constexpr):
-    j = tl.program_id(0)
+def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, cancelled, BLOCK: tl.constexpr):
+    j = tl.load(rows + tl.program_id(0))
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     d = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float32)
@@ -178,10 +178,11 @@ def _unit_sums(offsets, column, weight, table, known, out, dimension, cancelled,
             total = (exact / tl.sqrt(tl.sum(exact * exact, axis=0))).to(tl.float32)
         else:
             total = total / norm
-    tl.store(out + j.to(tl.int64) * dimension + d, total.to(out.dtype.element_ty), mask=d < dimension)
+    tl.store(out + tl.program_id(0).to(tl.int64) * dimension + d, total.to(out.dtype.element_ty), mask=d < dimension)
 
 
 def unit_sums(
+    rows: Int64[Tensor, " m"],
     offsets: Int64[Tensor, " n_plus_1"],
     column: Int32[Tensor, " nnz"],
     weight: Float32[Tensor, " nnz"],
@@ -189,12 +190,13 @@ def unit_sums(
     known: Float32[Tensor, " n"],
     dtype: torch.dtype,
     cancelled: float,
-) -> Float[Tensor, "n d"]:
-    """sum_s E_js F_s as unit rows of `dtype`; 0 where `known` is 0."""
-    n, dimension = len(offsets) - 1, table.shape[1]
-    out = torch.empty(n, dimension, dtype=dtype, device=table.device)
-    _unit_sums[(n,)](
-        offsets, column, weight, table, known, out, dimension, cancelled,
-        BLOCK=triton.next_power_of_2(dimension), num_warps=1,
-    )  # fmt: skip
+) -> Float[Tensor, "m d"]:
+    """sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 where `known` is 0."""
+    dimension = table.shape[1]
+    out = torch.empty(len(rows), dimension, dtype=dtype, device=table.device)
+    if len(rows) > 0:
+        _unit_sums[(len(rows),)](
+            rows, offsets, column, weight, table, known, out, dimension, cancelled,
+            BLOCK=triton.next_power_of_2(dimension), num_warps=1,
+        )  # fmt: skip
     return out

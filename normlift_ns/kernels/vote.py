@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-import torch
 import triton
 import triton.language as tl
 from jaxtyping import Float, Float32, Int, Int32
@@ -17,7 +16,7 @@ _SLICE = 64
 
 @triton.jit
 def _vote(
-    order, neighbors, distance, directions, reliability, source, dimension, k, tau, gamma, width, delta,
+    order, neighbors, distance, directions, row_of, reliability, source, dimension, k, tau, gamma, width, delta,
     GROUP: tl.constexpr, SLICE: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     i = tl.load(order + tl.program_id(0)).to(tl.int64)
@@ -30,11 +29,12 @@ def _vote(
     if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else nobody can win
         d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
         weight = r * tl.exp(-0.5 * d * d)
+        row = tl.load(row_of + member, mask=there, other=0).to(tl.int64) * dimension
         cosine = tl.zeros([GROUP, GROUP], tl.float32)
         for first in range(0, dimension, SLICE):
             column = first + tl.arange(0, SLICE)
             part = tl.load(
-                directions + member[:, None] * dimension + column[None, :],
+                directions + row[:, None] + column[None, :],
                 mask=there[:, None] & (column < dimension)[None, :],
                 other=0.0,
             )
@@ -49,31 +49,32 @@ def _vote(
 
 
 def vote(
-    order: Int[Tensor, " n"],
+    voters: Int[Tensor, " v"],
     neighbors: Int32[Tensor, "n k"],
     distance: Float[Tensor, "n k"],
-    directions: Float[Tensor, "n d"],
+    directions: Float[Tensor, "m d"],
+    row_of: Int32[Tensor, " n"],
     reliability: Float32[Tensor, " n"],
+    source: Int32[Tensor, " n"],
     *,
     tau: float,
     gamma: float,
     width: float,
     delta: float,
     precision: Literal["tf32", "tf32x3", "ieee"] = "tf32x3",
-) -> Int32[Tensor, " n"]:
-    """Index of the Gaussian whose direction each one takes; formulas in `core.refine`.
+) -> None:
+    """Writes to `source` whose direction each of the voters takes; formulas in `core.refine`.
 
     Args:
-        order: in which Gaussians vote; neighbours in space should vote one after the other, since they read the same.
+        voters: neighbours in space should stand near each other, since they read the same.
         neighbors: nearest first, -1 for none; at most MOST_NEIGHBORS.
         directions: unit rows or 0, multiplied on tensor cores and added in float32.
+        row_of: the row of a Gaussian's direction; those of voters and their neighbours are read.
         width: sigma_d, in the units of `distance`.
         precision: of products of float32 directions: rounded to 11 bits, in three such parts, or unrounded.
     """
-    n, k = neighbors.shape
-    source = torch.arange(n, dtype=torch.int32, device=neighbors.device)
-    _vote[(n,)](
-        order, neighbors, distance, directions, reliability, source, directions.shape[1], k, tau, gamma, width, delta,
-        GROUP=GROUP, SLICE=_SLICE, PRECISION=precision, num_warps=4,
-    )  # fmt: skip
-    return source
+    if len(voters) > 0:
+        _vote[(len(voters),)](
+            voters, neighbors, distance, directions, row_of, reliability, source, directions.shape[1],
+            neighbors.shape[1], tau, gamma, width, delta, GROUP=GROUP, SLICE=_SLICE, PRECISION=precision, num_warps=4,
+        )  # fmt: skip

@@ -54,7 +54,7 @@ class LiftOptions:
     form: Form | Literal["auto"] = "auto"
     """How directions are stored; auto: the smallest form within the tolerance."""
     precision: Literal["standard", "double"] = "standard"
-    """standard: float32, and float16 directions in the vote on a GPU. double: float64 throughout, slow on a GPU."""
+    """standard: float32, added up in float64 where digits cancel. double: float64 throughout, slow on a GPU."""
     reuse_evidence: bool = True
     """Take 2D features and evidence of earlier lifts from the cache where they fit."""
 
@@ -77,7 +77,7 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Of each stage, in their order: features, evidence, reliability, lift, neighbors, vote, store."""
+    """Of each stage, in their order: features, evidence, lift, neighbors, vote, store."""
 
 
 def lift_run(
@@ -128,7 +128,7 @@ def lift_run(
             parts.append(
                 block_evidence(run, scene, block, folder, weight_power=power, dtype=dtype, reuse=reuse, done=step)
             )
-    with stages("reliability") as step:
+    with stages("lift") as step:
         evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device, dtype)
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
         step()
@@ -136,15 +136,11 @@ def lift_run(
     statistics = {"views": len(indices), "left_out": left_out, "excluded": evidence.num_excluded, **_statistics(lifted)}
     copied = None
     if options.refine:
-        with stages("lift") as step:
-            half = dtype == torch.float32 and scene.means.is_cuda  # a tenth of the time, half the memory
-            directions = lifted.directions(dtype=torch.float16 if half else None)
-            step()
         with stages("neighbors") as step:
             neighbors = nearest_neighbors(scene.means, options.vote.k)
             step()
         with stages("vote") as step:
-            copied = refine(scene.means, directions, lifted.reliability, options.vote, neighbors=neighbors)
+            copied = refine(scene.means, lifted.directions, lifted.reliability, options.vote, neighbors=neighbors)
             step()
         changed = copied != torch.arange(len(copied), device=copied.device)
         statistics["refined_share"] = float(changed.float().mean())

@@ -61,8 +61,8 @@ def test_cancelled_sums_are_right():
     within = [exact[0] - exact[1], exact[2] - exact[3]]
     assert torch.allclose(total, torch.stack([sum(within), exact[4] - exact[5]]), rtol=1e-12)
     assert torch.allclose(by_view, torch.stack([sum(within), exact[4] + exact[5]]), rtol=1e-12)
-    known = torch.ones(2)
-    found = sums.unit_sums(*on_device(offsets, region, weight, table, known), torch.float32, CANCELLED).cpu()
+    arrays = on_device(torch.arange(2), offsets, region, weight, table, torch.ones(2))
+    found = sums.unit_sums(*arrays, torch.float32, CANCELLED).cpu()
     assert torch.equal(found, torch.eye(1, 8).expand(2, -1))
 
 
@@ -70,8 +70,10 @@ def test_cancelled_sums_are_right():
 def test_directions_equal_those_of_the_cpu(dtype):
     evidence = random_evidence(30, [3, 4], 5, dtype=torch.float32)
     lifted = lift(evidence, unit_rows(7, 20, 6, torch.float32))
-    arrays = on_device(evidence.offsets, evidence.region, evidence.weight, lifted.features, lifted.norm)
-    found = sums.unit_sums(*arrays, dtype, CANCELLED).cpu()
+    rows = torch.randperm(30, generator=generator(7))
+    arrays = on_device(rows, evidence.offsets, evidence.region, evidence.weight, lifted.features, lifted.norm)
+    found = torch.empty(30, 20, dtype=dtype)
+    found[rows] = sums.unit_sums(*arrays, dtype, CANCELLED).cpu()
     assert found.dtype == dtype
     assert torch.allclose(found.float(), lifted.directions(), atol=2e-7 if dtype == torch.float32 else 5e-4)
     assert torch.equal(found[lifted.norm == 0], torch.zeros_like(found[lifted.norm == 0]))

@@ -22,24 +22,33 @@ def test_equals_the_plain_vote(n, k, dimension):
     config = RefineConfig(k=k, delta=0.02)
     neighbors = nearest_neighbors(means, k)
     expected = refine(means, directions, reliability, config, neighbors=neighbors)
-    found = vote(
-        *(x.to(DEVICE) for x in (spatial_order(means), neighbors.index, neighbors.distance, directions, reliability)),
-        tau=config.tau,
-        gamma=config.gamma,
-        width=float(decay_width(neighbors, config)),
-        delta=config.delta,
-    )
+    # voters in two calls, directions in another order
+    perm = torch.randperm(n, generator=g)
+    source = torch.arange(n, dtype=torch.int32).to(DEVICE)
+    for voters in spatial_order(means).split(n // 2 + 1):
+        arrays = (voters, neighbors.index, neighbors.distance, directions[perm], perm.argsort().int(), reliability)
+        vote(
+            *(x.to(DEVICE) for x in arrays),
+            source,
+            tau=config.tau,
+            gamma=config.gamma,
+            width=float(decay_width(neighbors, config)),
+            delta=config.delta,
+        )
     assert (expected != torch.arange(n)).float().mean() > 0.2
-    assert torch.equal(found.cpu(), expected)
+    assert torch.equal(source.cpu(), expected)
 
 
 def test_nothing_changes_where_nobody_is_reliable():
     means = torch.randn(10, 3, generator=generator(0))
     neighbors = nearest_neighbors(means, 4)
     directions, reliability = unit_rows(10, 16, 0, torch.float32), torch.zeros(10)
-    arrays = (torch.arange(10), neighbors.index, neighbors.distance, directions, reliability)
-    found = vote(*(x.to(DEVICE) for x in arrays), tau=0.8, gamma=0.05, width=1.0, delta=0.0)
-    assert torch.equal(found.cpu(), torch.arange(10, dtype=torch.int32))
+    source = torch.full((10,), -7, dtype=torch.int32)
+    row_of = torch.arange(10, dtype=torch.int32)
+    arrays = (torch.arange(10), neighbors.index, neighbors.distance, directions, row_of, reliability, source)
+    there = [x.to(DEVICE) for x in arrays]
+    vote(*there, tau=0.8, gamma=0.05, width=1.0, delta=0.0)
+    assert torch.equal(there[-1].cpu(), source)  # nothing written
 
 
 def test_spatial_order_is_a_permutation_that_keeps_neighbours_together():

@@ -79,13 +79,17 @@ def test_all_backends_agree(regions, mode, kind):
         backend: rasterize_evidence(scene, cameras, labels, num_regions=counts, backend=backend, rasterize_mode=mode)
         for backend in ("triton", "gsplat", "torch")
     }
-    exact = dense(found["torch"].rows.to("cpu"), 4 * regions)
-    blank = dense(found["torch"].unlabeled.to("cpu"), 4)
-    for backend, tolerance in (("triton", 1e-5), ("gsplat", 3e-5)):
-        ours = dense(found[backend].rows.to("cpu"), 4 * regions)
-        assert (ours - exact).norm() <= tolerance * exact.norm(), backend
-        assert abs(ours.sum() / exact.sum() - 1) < 1e-6, backend
-        assert (dense(found[backend].unlabeled.to("cpu"), 4) - blank).norm() <= tolerance * blank.norm(), backend
+    # float32 loses most digits of a needle's determinant, on which antialiasing scales its opacity
+    tolerance = 5e-5 if (kind, mode) == ("hard", "antialiased") else 1e-5
+
+    def assert_close(a, b, tolerance):
+        for *pair, columns in ((a.rows, b.rows, 4 * regions), (a.unlabeled, b.unlabeled, 4)):
+            ours, theirs = (dense(x.to("cpu"), columns) for x in pair)
+            assert (ours - theirs).norm() <= tolerance * theirs.norm()
+            assert abs(ours.sum() / theirs.sum() - 1) < 1e-6
+
+    assert_close(found["triton"], found["torch"], tolerance)
+    assert_close(found["triton"], found["gsplat"], 1e-5)
     again = rasterize_evidence(scene, cameras, labels, num_regions=counts, rasterize_mode=mode)
     assert torch.equal(again.weight, found["triton"].weight)
     assert torch.equal(again.region, found["triton"].region)
@@ -104,9 +108,8 @@ def test_the_whole_lift_equals_that_of_the_cpu():
         there = scene.to(device)
         lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(device))
         neighbors = nearest_neighbors(there.means, 36)
-        directions = lifted.directions()
-        source = refine(there.means, directions, lifted.reliability, neighbors=neighbors)
-        results.append([x.cpu() for x in (lifted.reliability, neighbors.index, directions[source.long()])])
+        source = refine(there.means, lifted.directions, lifted.reliability, neighbors=neighbors)
+        results.append([x.cpu() for x in (lifted.reliability, neighbors.index, lifted.directions(source.long()))])
     (reliability, index, refined), (reliability_gpu, index_gpu, refined_gpu) = results
     assert (reliability - reliability_gpu).abs().max() < 1e-4
     assert torch.equal(index, index_gpu)
@@ -123,4 +126,4 @@ def test_neighbours_that_the_kernel_is_not_sure_of_come_from_the_cpu():
     uneven[17] = torch.inf
     found, expected = nearest_neighbors(uneven.cuda(), 36), nearest_neighbors(uneven, 36)
     assert torch.equal(found.index.cpu(), expected.index)
-    assert torch.equal(found.spacing.cpu(), expected.spacing)
+    assert torch.allclose(found.spacing.cpu(), expected.spacing, rtol=1e-15, atol=0)
