@@ -81,7 +81,7 @@ def features(rows: int, device: str = "cuda") -> torch.Tensor:
 
 def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
     """The RGB render of all views by stock gsplat, and its backward pass for 512 channels of the first few."""
-    from gsplat.cuda._backend import _C  # noqa: PLC0415
+    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
     from gsplat.cuda._wrapper import (  # noqa: PLC0415
         fully_fused_projection,
         isect_offset_encode,
@@ -145,7 +145,7 @@ def measure(report: Report, case: Case) -> None:
         evidence_gib = torch.cuda.max_memory_allocated() / 2**30
         table = features(evidence.num_regions)
         reliability_s, lifted = timed(lambda: lift(evidence, table))
-        directions_s, _ = timed(lambda: lifted.directions(dtype=torch.float16))
+        directions_s = timed(lambda: lifted.directions(dtype=torch.float16))[0]
         config = RefineConfig()
         neighbors_s, neighbors = timed(lambda: nearest_neighbors(case.scene.means, config.k))
         vote_s, source = timed(
@@ -285,9 +285,8 @@ def main(quick: bool, output: Path) -> None:
     report = Report("h100")
     captures = [capture_case(name) for name in ("fox", "tabletop")]
     agreement(report, captures)
-    for case in captures:
-        measure(report, case)
-    del captures, case
+    while captures:
+        measure(report, captures.pop(0))
     if not quick:
         for name, n, views in (("rooms_480k", 480_000, 131), ("rooms_1930k", 1_930_000, 177), ("rooms_10m", 10**7, 20)):
             measure(report, room_case(name, n, views))

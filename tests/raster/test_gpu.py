@@ -86,7 +86,7 @@ def test_all_backends_agree(regions, mode, kind):
         for *pair, columns in ((a.rows, b.rows, 4 * regions), (a.unlabeled, b.unlabeled, 4)):
             ours, theirs = (dense(x.to("cpu"), columns) for x in pair)
             assert (ours - theirs).norm() <= tolerance * theirs.norm()
-            assert abs(ours.sum() / theirs.sum() - 1) < 1e-6
+            assert abs(ours.sum() / theirs.sum() - 1) < 0.2 * tolerance
 
     assert_close(found["triton"], found["torch"], tolerance)
     assert_close(found["triton"], found["gsplat"], 1e-5)
