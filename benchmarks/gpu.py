@@ -255,14 +255,25 @@ def capture_case(name: str) -> Case:
 
 def agreement(report: Report, cases: Sequence[Case]) -> None:
     """How far the kernel is from gsplat's own backward pass, and whether two runs give the same bits."""
-    worst, repeatable = 0.0, True
+    from gsplat.cuda._wrapper import rasterize_to_pixels  # noqa: PLC0415
+
+    worst, alpha_worst, repeatable = 0.0, 0.0, True
     for case in cases:
         some = Case(case.name, case.scene, case.cameras[::9], case.labels[::9])
         for mode in ("classic", "antialiased"):
             ours, again, stock = (some.evidence(backend=b, rasterize_mode=mode) for b in ("triton", "triton", "gsplat"))
             worst = max(worst, relative_difference(ours.rows, stock.rows))
+            weight = ours.weight.double().sum() + ours.unlabeled.weight.double().sum()
+            alpha = 0.0
+            for camera in some.cameras:
+                seen = project_views(case.scene, [camera], mode == "antialiased", RasterSettings())
+                drawing = (seen.means2d, seen.conics, torch.zeros(1, len(case.scene), 1, device="cuda"), seen.opacities)
+                _, alphas = rasterize_to_pixels(*drawing, camera.width, camera.height, 16, seen.offsets, seen.members)
+                alpha += float(alphas.double().sum())
+            alpha_worst = max(alpha_worst, abs(float(weight) / alpha - 1))
             repeatable &= torch.equal(ours.weight, again.weight) and torch.equal(ours.region, again.region)
     report.add("triton_vs_gsplat_rel", worst, "relative Frobenius norm, worst of fox and tabletop in both modes")
+    report.add("weight_vs_alpha_rel", alpha_worst, "relative difference of the sums of E and of gsplat's alpha")
     report.add("bitwise_repeatable", float(repeatable), "1: yes")
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-Item = TypeVar("Item")
+Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
 Result = TypeVar("Result")
 
 
@@ -25,7 +25,7 @@ def kernels_apply(tensor: Tensor) -> bool:
     return tensor.is_cuda and has_triton()
 
 
-def in_parts(run: Callable[[Sequence[Item]], Result], items: Sequence[Item], advice: str) -> list[Result]:
+def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[Result]:
     """[run(items)]; where the GPU's memory does not hold that, the results of both halves, and so on.
 
     Raises:

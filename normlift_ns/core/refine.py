@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 
 _CHUNK_ELEMENTS = 2**24
@@ -97,7 +97,8 @@ def refine(
     # Where no neighbour is reliable, nobody can win.
     order = spatial_order(means)
     order = order[(_gather(reliability, neighbors.index) > 0).any(dim=1)[order]]
-    for voters in order.split(_BLOCK[means.device.type == "cuda"] if given is None else max(1, n)):
+
+    def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
             rows = directions
         else:
@@ -111,6 +112,9 @@ def refine(
             _vote_on_gpu(voters, neighbors, rows, row_of, reliability, source, config, float(width))
         else:
             _vote(voters, neighbors, rows, row_of, reliability, source, config, width)
+
+    for voters in order.split(_BLOCK[means.device.type == "cuda"] if given is None else max(1, n)):
+        in_parts(vote, voters, "refine on the CPU")
     return source
 
 
