@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -19,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
-PACKAGES = ("torch", "numpy", "scipy", "numba", "gsplat")
+PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Report:
     def write(self, folder: Path = RESULTS) -> Path:
         document = {
             "hardware": hardware(),
-            "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+            "versions": {"python": platform.python_version(), **{x: version(x) for x in PACKAGES if find_spec(x)}},
             "command": " ".join(["python -m", f"benchmarks.{self.name}", *(a for a in sys.argv[1:] if a == "--quick")]),
             "metrics": [asdict(metric) for metric in self.metrics],
         }

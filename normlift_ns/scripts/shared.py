@@ -30,7 +30,7 @@ def run_command(command: type[Command]) -> None:
         tyro.cli(tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[command]]).main()  # pyright: ignore[reportAttributeAccessIssue]
     except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read
         sys.exit(1 if stop.code == 2 else stop.code)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         CONSOLE.rule("Error", style="red")
         CONSOLE.print(str(error), justify="center", markup=False, highlight=False)
         sys.exit(1)
