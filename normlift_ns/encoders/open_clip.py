@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -27,10 +26,10 @@ from normlift_ns.encoders.clip_weights import (
     REMEDY,
     check_names,
     find_weights,
-    first_line,
     import_open_clip,
 )
 from normlift_ns.encoders.source import check_prompts
+from normlift_ns.encoders.weights import content_identity, first_line
 
 Fill = Literal["black", "white"]
 _BATCH = 64
@@ -109,13 +108,7 @@ class OpenClipEncoder:
     @cached_property
     def _weights_identity(self) -> str:
         path = Path(self.pretrained)
-        if not path.is_file():
-            return self.pretrained
-        digest = blake2b(digest_size=16)
-        with path.open("rb") as file:
-            while block := file.read(2**24):
-                digest.update(block)
-        return f"blake2b:{digest.hexdigest()}"
+        return content_identity(path) if path.is_file() else self.pretrained
 
     @cached_property
     def _network(self) -> _Network:
