@@ -177,12 +177,51 @@ class Evidence:
         """
         columns = self.columns_of(views)
         chosen = torch.tensor(self._checked_views(views), dtype=torch.int64, device=columns.device)
-        rows = _select_columns(self.rows, columns, self.num_regions)
-        unlabeled = _select_columns(self.unlabeled, chosen, self.num_views)
+        rows = self.rows.select_columns(columns, self.num_regions)
+        unlabeled = self.unlabeled.select_columns(chosen, self.num_views)
         new_view = torch.full((self.num_views,), -1, dtype=torch.int32, device=columns.device)
         new_view[chosen] = torch.arange(chosen.numel(), dtype=torch.int32, device=columns.device)
         region_view = new_view[self.region_view[columns].long()]
         return self._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
+
+    def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
+        """The evidence of coarser regions, without rasterizing: E'_jt = sum over levels and the columns s of t of E_js.
+
+        Rasterized on the cells of a partition, evidence becomes that of any regions made of whole cells, exactly but
+        for rounding: sums of A_ij ** weight_power add up whatever the power. What maps to -1 joins the unlabelled
+        weight of its view. With several levels every pixel is observed once per level, so that W_jv, unlabelled weight
+        included, counts it as often; N_eff and R do not change with the scale of W.
+
+        Args:
+            columns: the new column of every column, one row per level; -1: none.
+            region_view: view of every new column, non-decreasing.
+        Raises:
+            ValueError: a new column that does not exist, or of another view than its old one.
+        """
+        if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
+            raise ValueError(
+                f"columns must be [levels, {self.num_regions}] with values in -1..{len(region_view) - 1}, got "
+                f"{tuple(columns.shape)}"
+            )
+        columns, region_view = (x.to(self.region_view.device) for x in (columns.long(), region_view))
+        level, column = (columns >= 0).nonzero(as_tuple=True)
+        if not torch.equal(region_view[columns[level, column]], self.region_view[column]):
+            raise ValueError("a new column must be of the same view as the columns that it joins")
+        if torch.equal(columns, torch.arange(len(region_view), device=columns.device)[None]):
+            return self
+        old = self.region.long()
+        new = columns[:, old]
+        kept = new >= 0
+        row, view, weight = (x.expand_as(new) for x in (self.rows.row_index(), self.region_view[old], self.weight))
+        rows = SparseRows.from_coo(row[kept], new[kept], weight[kept], self.num_gaussians)
+        blank = self.unlabeled
+        unlabeled = SparseRows.from_coo(
+            torch.cat([blank.row_index(), row[~kept]]),
+            torch.cat([blank.column, view[~kept]]),
+            torch.cat([blank.weight * len(columns), weight[~kept]]),
+            self.num_gaussians,
+        )
+        return self._with(rows, region_view=region_view, unlabeled=unlabeled)
 
     def _with(self, rows: SparseRows, **changes: Any) -> Evidence:
         return replace(self, offsets=rows.offsets, region=rows.column, weight=rows.weight, **changes)
@@ -202,8 +241,8 @@ class Evidence:
                 raise ValueError(f"Evidence.merge: parts must agree in {name}, found {values}")
         views = torch.tensor([0, *(part.num_views for part in parts)]).cumsum(0).tolist()
         regions = torch.tensor([0, *(part.num_regions for part in parts)]).cumsum(0).tolist()
-        rows = _append_columns([part.rows for part in parts], regions)
-        unlabeled = _append_columns([part.unlabeled for part in parts], views)
+        rows = SparseRows.append_columns([part.rows for part in parts], regions)
+        unlabeled = SparseRows.append_columns([part.unlabeled for part in parts], views)
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
         return parts[0]._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
@@ -280,18 +319,3 @@ class Evidence:
         return Evidence(
             **tensors, unlabeled=unlabeled, num_views=num_views, weight_power=weight_power, num_excluded=num_excluded
         )
-
-
-def _select_columns(rows: SparseRows, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:
-    """Keeps the given columns and renumbers them in the given order."""
-    new = torch.full((num_columns,), -1, dtype=torch.int64, device=columns.device)
-    new[columns] = torch.arange(columns.numel(), device=columns.device)
-    column = new[rows.column.long()]
-    keep = column >= 0
-    return SparseRows.from_coo(rows.row_index()[keep], column[keep], rows.weight[keep], len(rows))
-
-
-def _append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
-    row = torch.cat([part.row_index() for part in parts])
-    column = torch.cat([part.column + first for part, first in zip(parts, first_column)])
-    return SparseRows.from_coo(row, column, torch.cat([part.weight for part in parts]), len(parts[0]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -77,6 +77,21 @@ class SparseRows:
             start - offsets[:-1], length
         )
         return SparseRows(offsets, self.column[entry], self.weight[entry])
+
+    def select_columns(self, columns: Int64[Tensor, " m"], num_columns: int) -> SparseRows:
+        """The given columns, distinct, of `num_columns`, renumbered in the given order."""
+        new = torch.full((num_columns,), -1, dtype=torch.int64, device=columns.device)
+        new[columns] = torch.arange(columns.numel(), device=columns.device)
+        column = new[self.column.long()]
+        keep = column >= 0
+        return SparseRows.from_coo(self.row_index()[keep], column[keep], self.weight[keep], len(self))
+
+    @staticmethod
+    def append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
+        """Matrices of the same rows side by side; the columns of each start at its `first_column`."""
+        row = torch.cat([part.row_index() for part in parts])
+        column = torch.cat([part.column + first for part, first in zip(parts, first_column)])
+        return SparseRows.from_coo(row, column, torch.cat([part.weight for part in parts]), len(parts[0]))
 
     def matmul(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
         """Dense product with a table, in the table's precision; all rows at once."""

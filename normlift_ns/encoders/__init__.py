@@ -1,18 +1,18 @@
 """2D semantics of images and texts in one space: `FeatureSource` is the protocol, `make_source` builds one."""
 
 from normlift_ns.encoders.build import SourceOptions, make_encoder, make_regions, make_source
-from normlift_ns.encoders.cache import CachedFeatures
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.images import read_image
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, ViewFeatures
 
 __all__ = [
-    "CachedFeatures",
     "Encoder",
     "FeatureSource",
     "RegionFeatures",
     "Regions",
     "SourceOptions",
     "ViewFeatures",
+    "cached",
     "make_encoder",
     "make_regions",
     "make_source",

@@ -10,10 +10,11 @@ from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.open_clip import Fill, OpenClipEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.source import Encoder, RegionFeatures, Regions
+from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions
 
 EncoderName = Literal["open_clip", "colour"]
 RegionsName = Literal["auto", "superpixel", "grid", "files"]
+FeaturesName = Literal["none", "langsplat"]
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,33 @@ class SourceOptions:
     """The value in label maps that means no region; negative values never mean one."""
     regions_resample: bool = False
     """Bring label maps of another size to the image's by nearest neighbour, instead of refusing them."""
-    level: int | None = None
-    """Which map of NPY label files that hold several, [levels, H, W]."""
+    level: str | None = None
+    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]."""
+    features: FeaturesName = "none"
+    """Take regions and features from features_dir instead of looking at images. langsplat: its preprocessing."""
+    features_dir: Path | None = None
+    """Folder of the features."""
 
 
-def make_source(options: SourceOptions, device: str = "cpu") -> RegionFeatures:
-    """Regions and encoder of the options, joined; arguments and errors as in `make_regions` and `make_encoder`."""
-    return RegionFeatures(make_regions(options), make_encoder(options, device))
+def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
+    """Regions and encoder of the options, joined, or the features of a folder.
+
+    Args:
+        device: as in `make_encoder`.
+    Raises:
+        ValueError: as `make_regions` and `make_encoder`; features without a folder, or a folder without features.
+        FileNotFoundError: as those; the folder does not exist.
+    """
+    if options.features not in get_args(FeaturesName):
+        known = ", ".join(get_args(FeaturesName))
+        raise ValueError(f"unknown features {options.features!r}; --features is one of {known}")
+    if options.features == "none":
+        if options.features_dir is not None:
+            raise ValueError(f"--features-dir {options.features_dir} is without use; add --features langsplat")
+        return RegionFeatures(make_regions(options), make_encoder(options, device))
+    if options.features_dir is None:
+        raise ValueError(f"features {options.features!r} need their folder: give it with --features-dir")
+    raise ValueError("features langsplat cannot be read yet")
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
@@ -80,8 +101,15 @@ def make_regions(options: SourceOptions) -> Regions:
             raise ValueError(
                 'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
             )
-        return LabelFiles(options.regions_dir, options.regions_background, options.level, options.regions_resample)
+        level = _number(options.level)
+        return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
     for flag, value in (("--regions-dir", options.regions_dir), ("--level", options.level)):
         if value is not None:
             raise ValueError(f'{flag} {value} is for --regions files, not for "{kind}"; leave one of the two out')
     return Superpixels(options.region_count) if kind == "superpixel" else Grid(options.region_count)
+
+
+def _number(level: str | None) -> int | None:
+    if level is not None and not (level.isascii() and level.isdigit()):
+        raise ValueError(f"--level of --regions files is the number of a map, 0, 1, ...; got {level!r}")
+    return None if level is None else int(level)

@@ -1,93 +1,143 @@
-"""2D features kept on disk per view, so that an interrupted run resumes and a second one encodes nothing."""
+"""Regions and features kept on disk per image, so that an interrupted run resumes and a second one computes neither.
+
+An entry is found again by the content of all that it was made from. Files appear complete or not at all; a damaged one
+is computed again. The folders may be deleted at any time.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float32, UInt8
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from jaxtyping import Float32, Int32, UInt8
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from normlift_ns.core.files import atomic_path
-from normlift_ns.encoders.source import FeatureSource, ViewFeatures
+from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions
 
-_FORMAT = "normlift_ns.view/1"
+_FORMAT = "normlift_ns.encoders/2"
 """Part of every key: to be raised when labels or features change for the same settings."""
 
 
-@dataclass(frozen=True)
-class CachedFeatures:
-    """A `FeatureSource` that keeps what another one has computed.
+def cached(source: FeatureSource, folder: Path) -> FeatureSource:
+    """The source with everything kept in a folder that is expensive to compute again.
 
-    A view is found again by the content of its image and of the files that the source reads for it, its name and the
-    settings of the source. Files appear complete or not at all; a damaged one is computed again.
+    Raises (later, where a view is asked for):
+        OSError: the folder cannot be written to, as when the disk is full.
+    """
+    if not isinstance(source, RegionFeatures):
+        return source
+    regions, encoder = (
+        CachedRegions(source.regions, folder / "regions"),
+        CachedEncoder(source.encoder, folder / "features"),
+    )
+    return replace(source, regions=regions, encoder=encoder)
+
+
+@dataclass(frozen=True)
+class CachedRegions:
+    """`Regions` that keep the label maps, of all levels, of images that they have seen.
+
+    The key: the image, its name, the files that are read for it, and the settings but the chosen level.
     """
 
-    source: FeatureSource
+    regions: Regions
     folder: Path
-    """Holds one safetensors file per view; made if it does not exist. It may be deleted at any time."""
+    """Holds one safetensors file per image; made if it does not exist."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        return self.source.identity
+        return self.regions.identity
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return self.regions.chosen
 
     def files(self, name: str) -> tuple[Path, ...]:
-        return self.source.files(name)
+        return self.regions.files(name)
 
-    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """As in `FeatureSource`.
-
-        Raises:
-            OSError: the folder cannot be written to, as when the disk is full.
-        """
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
         path = self.path(image, name)
-        found = _read(path)
+        found = _read(path, "labels")
         if found is None:
-            found = self.source.view(image, name)
-            _write(path, found)
+            found = self.regions.labels(image, name)
+            _write(path, "labels", found.to(torch.int16) if int(found.max()) < 2**15 else found)
+        return found.int()
+
+    def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
+        """Where the label maps of an image are kept, whether they exist or not."""
+        files = [file.read_bytes() for file in self.files(name)]
+        return _path(self.folder, self.identity, name.encode(), *_parts(image), *files)
+
+
+@dataclass(frozen=True)
+class CachedEncoder:
+    """An `Encoder` that keeps the features of regions that it has seen.
+
+    The key: the image, the labels, and the settings.
+    """
+
+    encoder: Encoder
+    folder: Path
+    """Holds one safetensors file per image and level; made if it does not exist."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return self.encoder.identity
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
+        path = self.path(image, labels)
+        found = _read(path, "features")
+        if found is None:
+            found = self.encoder.encode(image, labels)
+            _write(path, "features", found)
         return found
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        return self.source.text(prompts)
+        return self.encoder.text(prompts)
 
-    def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
-        """Where a view is kept, whether it exists or not."""
-        parts = [
-            _FORMAT.encode(),
-            json.dumps(self.identity, sort_keys=True).encode(),
-            name.encode(),
-            str((image.dtype, tuple(image.shape))).encode(),
-            image.cpu().numpy().tobytes(),
-            *(file.read_bytes() for file in self.files(name)),
-        ]
-        key = blake2b(b"".join(blake2b(part).digest() for part in parts), digest_size=16)
-        return self.folder / f"{key.hexdigest()}.safetensors"
+    def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Path:
+        """Where the features of an image's regions are kept, whether they exist or not."""
+        return _path(self.folder, self.identity, *_parts(image), *_parts(labels))
 
 
-def _read(path: Path) -> ViewFeatures | None:
+def _parts(tensor: Tensor) -> tuple[bytes, bytes]:
+    return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
+
+
+def _digest(*parts: bytes) -> str:
+    return blake2b(b"".join(blake2b(part).digest() for part in parts), digest_size=16).hexdigest()
+
+
+def _path(folder: Path, identity: dict[str, Any], *content: bytes) -> Path:
+    key = _digest(_FORMAT.encode(), json.dumps(identity, sort_keys=True).encode(), *content)
+    return folder / f"{key}.safetensors"
+
+
+def _read(path: Path, name: str) -> Tensor | None:
     try:
-        tensors = load(path.read_bytes())
-        return ViewFeatures(tensors["labels"].int(), tensors["features"])
-    except (FileNotFoundError, SafetensorError, KeyError, ValueError):
+        with safe_open(path, framework="pt") as file:
+            tensor, digest = file.get_tensor(name), (file.metadata() or {}).get("digest")
+    except (FileNotFoundError, SafetensorError):
         return None
+    return tensor if digest == _digest(*_parts(tensor)) else None
 
 
-def _write(path: Path, view: ViewFeatures) -> None:
-    labels = view.labels.to(torch.int16) if len(view.features) < 2**15 else view.labels
-    content = save({"labels": labels.contiguous(), "features": view.features.contiguous()})
+def _write(path: Path, name: str, tensor: Tensor) -> None:
+    content = save({name: tensor.contiguous()}, metadata={"digest": _digest(*_parts(tensor))})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
         raise OSError(
-            f"cannot keep 2D features in {path.parent} ({error}); free disk space or choose another folder, then run "
+            f"cannot keep 2D {name} in {path.parent} ({error}); free disk space or choose another folder, then run "
             "again: the views that are done are found there"
         ) from error

@@ -40,12 +40,16 @@ class Superpixels:
     def identity(self) -> dict[str, Any]:
         return {"kind": "superpixel", "count": self.count, "compactness": self.compactness}
 
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return ()
+
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 h w"]:
         found = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
-        return _compact(found, np.ones(found.shape, dtype=bool))
+        return _compact(found, np.ones(found.shape, dtype=bool))[None]
 
 
 @dataclass(frozen=True)
@@ -66,20 +70,24 @@ class Grid:
     def identity(self) -> dict[str, Any]:
         return {"kind": "grid", "count": self.count}
 
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return ()
+
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 h w"]:
         height, width = image.shape[:2]
         side = max(1, round(math.sqrt(height * width / self.count)))
         rows, columns = torch.arange(height) // side, torch.arange(width) // side
-        return (rows[:, None] * math.ceil(width / side) + columns).int()
+        return (rows[:, None] * math.ceil(width / side) + columns).int()[None]
 
 
 @dataclass(frozen=True)
 class LabelFiles:
     """Label maps from a folder, one per image: PNG (grey of 1, 8 or 16 bit, or palette, whose indices count) or NPY of
-    any integer type, of the size of the image.
+    any integer type, of the size of the image. An NPY file may hold several levels, [levels, H, W].
 
     The map of "images/left/0001.jpg" is the first that exists of images/left/0001.png, left/0001.png and 0001.png in
     the folder, or the same with .npy. Every value is one region, whether connected or not.
@@ -93,7 +101,7 @@ class LabelFiles:
     """The value of pixels that belong to no region. Negative values are never a region. With -1 for the background, 0
     is a region like any other."""
     level: int | None = None
-    """Which map of an NPY file [levels, H, W]; None for files [H, W]."""
+    """Which map of an NPY file [levels, H, W] counts; None for files [H, W]."""
     resample: bool = False
     """Bring maps of another size to the image's by nearest neighbour, instead of refusing them."""
 
@@ -106,7 +114,11 @@ class LabelFiles:
 
     @property
     def identity(self) -> dict[str, Any]:
-        return {"kind": "files", "background": self.background, "level": self.level, "resample": self.resample}
+        return {"kind": "files", "background": self.background, "resample": self.resample}
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return () if self.level is None else (self.level,)
 
     def files(self, name: str) -> tuple[Path, ...]:
         return (self.path(name),)
@@ -131,26 +143,26 @@ class LabelFiles:
             f"image {name} has no label map in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
         )
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
         """As in `Regions`.
 
         Raises:
             FileNotFoundError: no label map.
-            ValueError: a map that cannot be read, has colour channels or fractional values, lacks the level, or has
-                another size than the image while `resample` is off.
+            ValueError: a map that cannot be read, has colour channels or fractional values, or has another size than
+                the image while `resample` is off.
         """
         path = self.path(name)
         found = self._read(path)
         height, width = image.shape[:2]
-        if found.shape != (height, width):
+        if found.shape[1:] != (height, width):
             if not self.resample:
                 raise ValueError(
-                    f"label map {path} is {found.shape[1]}x{found.shape[0]} (width x height), its image {name} is "
+                    f"label map {path} is {found.shape[2]}x{found.shape[1]} (width x height), its image {name} is "
                     f"{width}x{height}; make label maps of the image's size (undistorting an image crops it), or "
                     "resample them by nearest neighbour: --regions-resample True"
                 )
-            found = found[_nearest(height, found.shape[0])][:, _nearest(width, found.shape[1])]
-        return _compact(found, (found != self.background) & (found >= 0))
+            found = resample_nearest(found, height, width)
+        return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in found])
 
     def _read(self, path: Path) -> np.ndarray:
         found = _read_npy(path) if path.suffix == ".npy" else read_pixels(path)
@@ -163,15 +175,9 @@ class LabelFiles:
             raise ValueError(
                 f"label map {path} holds {found.dtype}; expected an integer type: save it with .astype(numpy.int32)"
             )
-        if self.level is None and found.ndim == 2:
-            return found
-        if self.level is not None and found.ndim == 3 and 0 <= self.level < len(found):
-            return found[self.level]
-        expected = "[H, W]" if self.level is None else f"[levels, H, W] with levels > {self.level}"
-        raise ValueError(
-            f"label map {path} has shape {found.shape}, expected {expected}; choose one of its levels by number with "
-            "--level, and none for maps [H, W]"
-        )
+        if found.ndim not in (2, 3) or found.size == 0:
+            raise ValueError(f"label map {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
+        return found.reshape(-1, *found.shape[-2:])
 
 
 def _check_count(count: int) -> None:
@@ -187,6 +193,11 @@ def _read_npy(path: Path) -> np.ndarray:
         raise ValueError(
             f"label map {path} is damaged or no NPY file ({error}); write it again with numpy.save"
         ) from error
+
+
+def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Maps [levels, H, W] at another size, by nearest neighbour."""
+    return maps[:, _nearest(height, maps.shape[1])][:, :, _nearest(width, maps.shape[2])]
 
 
 def _nearest(size: int, source_size: int) -> np.ndarray:

@@ -3,6 +3,9 @@
 The two concerns are kept apart. `Regions` cuts an image into pieces, an `Encoder` puts pieces and texts into one space,
 `RegionFeatures` joins one of each to a `FeatureSource`, which is all that the rest of the package knows. Whatever
 brings labels and features together, as the importer of a preprocessed data set does, is a `FeatureSource` of its own.
+
+An image may be cut in several ways, its levels. Evidence is rasterized once, on the pieces that all of them have in
+common (`joint_partition`), and added up to the regions of the level that counts.
 """
 
 from __future__ import annotations
@@ -16,35 +19,47 @@ import torch
 from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
+from normlift_ns.encoders.levels import joint_partition
+
+UNIT_TOLERANCE = 1e-3
+"""Rows of this length, 1 give or take, are unit vectors: half precision leaves 5e-4."""
+
 
 @dataclass(frozen=True)
 class ViewFeatures:
-    """The 2D semantics of one image, on the CPU.
+    """The 2D semantics of one image, on the CPU: cells, the pieces that the rasterizer sums weights over, and regions,
+    the sets of cells that have a feature.
+
+    Cells depend on everything that is known of the image, not on what is chosen of it: another level of a source has
+    the same cells, so that its evidence is there already.
 
     Raises:
-        ValueError: wrong types or shapes, a label without a feature row, rows that are not unit vectors.
+        ValueError: wrong types or shapes, a label without a cell, a cell without a feature row, rows that are not unit
+            vectors.
     """
 
     labels: Int32[Tensor, "h w"]
-    """Region of every pixel, in -1..R-1; -1: none."""
+    """Cell of every pixel, in -1..C-1; -1: none."""
     features: Float32[Tensor, "r d"]
     """One unit row per region."""
+    regions: Int32[Tensor, "levels c"] | None = None
+    """Region of every cell in each level that counts, in -1..R-1; -1: none, as if the pixels were unlabelled. With
+    several levels every pixel is seen once in each. None: every cell is a region."""
 
     def __post_init__(self) -> None:
-        for name, dtype in (("labels", torch.int32), ("features", torch.float32)):
-            value: Tensor = getattr(self, name)
-            if value.ndim != 2 or value.dtype != dtype or value.device.type != "cpu":
+        for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
+            value: Tensor | None = getattr(self, name)
+            if value is not None and (value.ndim != 2 or value.dtype != dtype or value.device.type != "cpu"):
                 raise ValueError(
                     f"ViewFeatures.{name} must be a {dtype} matrix on the CPU, got {value.dtype} "
                     f"{tuple(value.shape)} on {value.device}"
                 )
-        if self.labels.numel() > 0 and not -1 <= int(self.labels.min()) <= int(self.labels.max()) < len(self.features):
-            raise ValueError(
-                f"ViewFeatures.labels must be in -1..{len(self.features) - 1} (one feature row per region), found "
-                f"{int(self.labels.min())}..{int(self.labels.max())}"
-            )
+        cells = len(self.features) if self.regions is None else self.regions.shape[1]
+        _check_range("labels", self.labels, cells, "cell")
+        if self.regions is not None:
+            _check_range("regions", self.regions, len(self.features), "feature row")
         length = torch.linalg.vector_norm(self.features.double(), dim=1)
-        bad = (~((length - 1).abs() < 1e-3)).nonzero().squeeze(1)
+        bad = (~((length - 1).abs() < UNIT_TOLERANCE)).nonzero().squeeze(1)
         if bad.numel() > 0:
             first = int(bad[0])
             raise ValueError(
@@ -52,20 +67,37 @@ class ViewFeatures:
                 f"{first} has length {length[first]:.3g}); normalise them, and label regions without a feature -1"
             )
 
+    @property
+    def region_of_cell(self) -> Int32[Tensor, "levels c"]:
+        """`regions`, also where they are the cells."""
+        return torch.arange(len(self.features), dtype=torch.int32)[None] if self.regions is None else self.regions
+
+
+def _check_range(name: str, values: Tensor, count: int, what: str) -> None:
+    if values.numel() > 0 and not -1 <= int(values.min()) <= int(values.max()) < count:
+        raise ValueError(
+            f"ViewFeatures.{name} must be in -1..{count - 1} (there are {count} {what}s), found "
+            f"{int(values.min())}..{int(values.max())}"
+        )
+
 
 class FeatureSource(Protocol):
     """2D semantics of images, and texts in the same space."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes the result, ready for JSON: part of cache keys and of the manifest.
+        """Every setting that changes the result, ready for JSON; it stands in the manifest.
 
         Device and precision are left out: they change rounding only.
         """
         ...
 
-    def files(self, name: str) -> tuple[Path, ...]:
-        """The files beside the image that `view` reads for it: their content belongs to cache keys."""
+    def available(self, names: Sequence[str]) -> list[str]:
+        """The images, of those given, that have semantics; the others are left out of a lift, as if never taken.
+
+        Raises:
+            ValueError, FileNotFoundError: what `view` would raise, as far as it shows without looking at any image.
+        """
         ...
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
@@ -93,15 +125,25 @@ class Regions(Protocol):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """As in `FeatureSource`."""
+        """Every setting that changes `labels`, ready for JSON; not `chosen`."""
+        ...
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """The levels of `labels` that count, by number; (): the only one."""
         ...
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """As in `FeatureSource`."""
+        """The files beside the image that `labels` reads for it.
+
+        Raises:
+            ValueError, FileNotFoundError: as `labels`.
+        """
         ...
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
-        """Region of every pixel; ids 0..R-1 without gaps, -1 for none."""
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
+        """Region of every pixel in every level that there is, chosen or not; in each, ids 0..R-1 without gaps, -1 for
+        none. A rule without levels returns one."""
         ...
 
 
@@ -114,7 +156,7 @@ class Encoder(Protocol):
         ...
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
-        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them."""
+        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level."""
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -131,10 +173,13 @@ class RegionFeatures:
 
     @property
     def identity(self) -> dict[str, Any]:
-        return {"regions": self.regions.identity, "encoder": self.encoder.identity}
+        chosen = {"levels": list(self.regions.chosen)}
+        return {"regions": self.regions.identity, **chosen, "encoder": self.encoder.identity}
 
-    def files(self, name: str) -> tuple[Path, ...]:
-        return self.regions.files(name)
+    def available(self, names: Sequence[str]) -> list[str]:
+        for name in names:
+            self.regions.files(name)
+        return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
@@ -142,8 +187,16 @@ class RegionFeatures:
                 f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
             )
         image = image.cpu()
-        labels = self.regions.labels(image, name)
-        return ViewFeatures(labels, self.encoder.encode(image, labels))
+        maps = self.regions.labels(image, name)
+        chosen = self.regions.chosen or (0,) * (len(maps) == 1)
+        if len(chosen) == 0 or max(chosen) >= len(maps):
+            found = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
+            raise ValueError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
+        features = [self.encoder.encode(image, maps[level]) for level in chosen]
+        cells, regions = joint_partition(maps)
+        first = torch.tensor([0, *(len(rows) for rows in features)]).cumsum(0)[:-1, None].int()
+        regions = regions[list(chosen)]
+        return ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + first, -1))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)

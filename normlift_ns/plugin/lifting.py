@@ -17,7 +17,7 @@ from normlift_ns.core.forms import Form
 from normlift_ns.core.lift import Lifted, Unlabeled, lift
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import RefineConfig, refine, unsupported
-from normlift_ns.encoders.cache import CachedFeatures
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.plugin.observe import BLOCK, block_evidence, see_block, spread
 
@@ -90,8 +90,10 @@ def lift_run(
     """
     stages = _Stages(report)
     scene = run.scene.to(device)
-    indices = spread(len(run.train), options.max_views)
-    seen = CachedFeatures(source, cache / "features") if options.reuse_evidence else source
+    names = set(source.available(run.train.names))
+    usable = [index for index, name in enumerate(run.train.names) if name in names]
+    indices = [usable[i] for i in spread(len(usable), options.max_views)]
+    seen = cached(source, cache) if options.reuse_evidence else source
     parts, tables = [], []
     for start in range(0, len(indices), BLOCK):
         chosen = indices[start : start + BLOCK]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
 
 BLOCK = 16
 """Views per file of evidence: what an interrupted run may lose."""
-_KEY = "normlift_ns.block/1"
+_KEY = "normlift_ns.block/2"
 """Part of every key: to be raised when evidence changes for the same input."""
 
 
@@ -34,7 +34,9 @@ class Block(NamedTuple):
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
-    """Region ids, -1 unlabelled, -2 masked."""
+    """Cells, -1 unlabelled, -2 masked."""
+    regions: list[Int32[Tensor, "levels c"]]
+    """Region of every cell, -1 none."""
     features: list[Float[Tensor, "r d"]]
 
 
@@ -65,7 +67,7 @@ def see_block(
         divisor: of the size of images and cameras.
         done: called after every view.
     """
-    block = Block([], [], [])
+    block = Block([], [], [], [])
     for index in indices:
         view = run.train[index]
         view = view._replace(image=run.render(view.camera)) if rendered else view
@@ -73,6 +75,7 @@ def see_block(
         found = source.view(view.image, view.name)
         block.cameras.append(view.camera)
         block.labels.append(found.labels if view.mask is None else found.labels.where(view.mask, MASKED))
+        block.regions.append(found.region_of_cell)
         block.features.append(found.features)
         done()
     return block
@@ -88,8 +91,12 @@ def block_evidence(
     reuse: bool,
     done: Callable[[], None],
 ) -> Evidence:
-    """Evidence of a block, from the folder if it was rasterized before with the same scene, cameras and labels."""
-    settings, counts = RasterSettings(), [len(rows) for rows in block.features]
+    """Evidence of the regions of a block.
+
+    That of its cells, from which it is made, is taken from the folder if it was rasterized before with the same scene,
+    cameras and labels, whatever the regions and features were.
+    """
+    settings, counts = RasterSettings(), [regions.shape[1] for regions in block.regions]
     facts = [_KEY, run.rasterize_mode, weight_power, asdict(settings), counts]
     tensors = [scene.means, scene.quats, scene.scales, scene.opacities, *block.labels]
     tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
@@ -99,7 +106,7 @@ def block_evidence(
             evidence = Evidence.load(path).to(scene.means.device)
             for _ in block.cameras:
                 done()
-            return evidence
+            return _of_regions(evidence, block)
         except ValueError:  # damaged: rasterize again
             path.unlink()
     evidence = rasterize_evidence(
@@ -114,7 +121,15 @@ def block_evidence(
     )
     folder.mkdir(parents=True, exist_ok=True)
     evidence.save(path)
-    return evidence
+    return _of_regions(evidence, block)
+
+
+def _of_regions(evidence: Evidence, block: Block) -> Evidence:
+    counts = torch.tensor([0, *(len(rows) for rows in block.features)])
+    first = counts.cumsum(0).tolist()
+    columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]
+    region_view = torch.repeat_interleave(torch.arange(len(block.features)), counts[1:])
+    return evidence.regroup(torch.cat(columns, dim=1), region_view.int())
 
 
 def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:

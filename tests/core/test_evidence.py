@@ -3,10 +3,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, lift
-from normlift_ns.core.evidence import ViewEvidence
+from normlift_ns import Evidence, lift, rasterize_evidence
+from normlift_ns.core.evidence import MASKED, ViewEvidence
 from normlift_ns.core.sparse import SparseRows
-from tests.scenes import dense, generator, random_evidence, unit_rows
+from normlift_ns.encoders.levels import joint_partition
+from tests.scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
 
 VIEWS = [3, 0, 1, 5, 2]
 SEEDS = st.integers(0, 2**31)
@@ -53,6 +54,84 @@ def test_merging_shards_gives_the_whole(seed, cut):
     shards = [whole.select_views(range(cut)), whole.select_views(range(cut, 5))]
     assert same(Evidence.merge(*shards), whole)
     assert same(Evidence.merge(whole), whole)
+
+
+@settings(deadline=None)
+@given(seed=SEEDS)
+def test_regrouping_adds_up_columns(seed):
+    evidence = random_evidence(30, VIEWS, seed)
+    g = generator(seed)
+    region_view = torch.tensor([0, 0, 2, 3, 3, 3, 4]).int()
+    first, count = torch.tensor([0, 2, 2, 3, 6]), torch.tensor([2, 0, 1, 3, 1])
+    view = evidence.region_view.long()
+    local = torch.randint(-1, 4, (2, sum(VIEWS)), generator=g)
+    columns = torch.where((local >= 0) & (local < count[view]), first[view] + local, -1)
+    regrouped = evidence.regroup(columns, region_view)
+    before, blank = dense(evidence.rows, sum(VIEWS)), 2 * dense(evidence.unlabeled, 5)
+    expected = torch.zeros(30, 7, dtype=torch.float64)
+    for level in columns:
+        for old, new in enumerate(level.tolist()):
+            if new >= 0:
+                expected[:, new] += before[:, old]
+            else:
+                blank[:, evidence.region_view[old]] += before[:, old]
+    assert torch.allclose(dense(regrouped.rows, 7), expected, rtol=1e-14, atol=0)
+    assert torch.allclose(dense(regrouped.unlabeled, 5), blank, rtol=1e-14, atol=0)
+    assert torch.equal(regrouped.region_view, region_view)
+    assert same(evidence.regroup(columns, region_view), regrouped)
+
+
+def test_regrouping_columns_into_themselves_changes_nothing():
+    evidence = random_evidence(20, VIEWS, 0)
+    assert evidence.regroup(torch.arange(sum(VIEWS))[None], evidence.region_view) is evidence
+    twice = evidence.regroup(torch.arange(sum(VIEWS)).expand(2, -1), evidence.region_view)
+    features = unit_rows(sum(VIEWS), 8, 0)
+    one, two = (lift(e, features, unlabeled="dilute") for e in (evidence, twice))
+    assert torch.allclose(two.weight, 2 * one.weight, rtol=1e-14)
+    for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability"):
+        assert torch.allclose(getattr(two, name), getattr(one, name), rtol=1e-12), name
+
+
+def test_regrouping_refuses_columns_that_do_not_fit():
+    evidence = random_evidence(5, [1, 2], 0)
+    views = evidence.region_view
+    for columns, message in (
+        ([[0, 1]], r"columns must be \[levels, 3\] with values in -1\.\.2, got \(1, 2\)"),
+        ([[0, 1, 3]], r"values in -1\.\.2"),
+        ([[0, -2, 1]], r"values in -1\.\.2"),
+        ([[0, 1, 0]], "must be of the same view"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            evidence.regroup(torch.tensor(columns), views)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=SEEDS, power=st.sampled_from([1, 2]), dtype=st.sampled_from([torch.float32, torch.float64]))
+def test_cells_give_the_evidence_of_every_level(seed, power, dtype):
+    """Rasterized once on the joint cells, evidence is that of each level rasterized by itself."""
+    scene, cameras = random_scene(40, seed), orbit(2, width=24, height=20)
+    maps = [
+        torch.stack([random_labels(c, 4, seed + i + 10 * v, 3 + i) for i in range(3)]) for v, c in enumerate(cameras)
+    ]
+    masked = [torch.rand(c.height, c.width, generator=generator(seed)) < 0.1 for c in cameras]
+    cut = [joint_partition(m) for m in maps]
+
+    def rasterized(labels, counts):
+        labels = [x.masked_fill(m, MASKED) for x, m in zip(labels, masked)]
+        return rasterize_evidence(scene, cameras, labels, num_regions=counts, weight_power=power, dtype=dtype)
+
+    cells = rasterized([labels for labels, _ in cut], [regions.shape[1] for _, regions in cut])
+    for level in range(3):
+        columns = torch.cat([torch.where(r >= 0, r + 4 * v, -1) for v, (_, r) in enumerate(cut)], dim=1)[
+            level : level + 1
+        ]
+        found = cells.regroup(columns, torch.tensor([0] * 4 + [1] * 4).int())
+        alone = rasterized([m[level] for m in maps], [4, 4])
+        tolerance = 1e-13 if dtype == torch.float64 else 1e-6
+        assert torch.allclose(dense(found.rows, 8), dense(alone.rows, 8), rtol=tolerance, atol=0)
+        assert torch.allclose(dense(found.unlabeled, 2), dense(alone.unlabeled, 2), rtol=tolerance, atol=0)
+        assert torch.equal(found.region, alone.region)
+        assert found.weight.dtype == alone.weight.dtype == dtype
 
 
 def test_merge_refuses_other_scenes():

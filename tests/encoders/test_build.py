@@ -1,6 +1,7 @@
 """Flat options to sources, and what is refused."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def test_options_reach_the_regions(tmp_path):
     assert make_regions(SourceOptions(regions="superpixel", region_count=9)) == Superpixels(9)
     assert make_regions(SourceOptions(regions="grid", region_count=9)) == Grid(9)
     options = SourceOptions(
-        regions="files", regions_dir=tmp_path, regions_background=-1, regions_resample=True, level=2
+        regions="files", regions_dir=tmp_path, regions_background=-1, regions_resample=True, level="2"
     )
     assert make_regions(options) == LabelFiles(tmp_path, background=-1, level=2, resample=True)
 
@@ -44,8 +45,13 @@ def test_a_moved_folder_of_labels_changes_no_identity(tmp_path):
         ({"encoder": "clip"}, "unknown encoder 'clip'; --encoder is one of open_clip, colour"),
         ({"regions": "sam"}, "unknown regions 'sam'; --regions is one of auto, superpixel, grid, files"),
         ({"regions": "files"}, 'regions "files" need a folder of label maps.*--regions-dir'),
-        ({"regions": "grid", "level": 1}, '--level 1 is for --regions files, not for "grid"'),
-        ({"level": 0}, '--level 0 is for --regions files, not for "superpixel"'),
+        ({"regions": "grid", "level": "1"}, '--level 1 is for --regions files, not for "grid"'),
+        ({"level": "0"}, '--level 0 is for --regions files, not for "superpixel"'),
+        ({"level": "l", "regions_dir": Path()}, "--level of --regions files is the number of a map, .*got 'l'"),
+        ({"level": "-1", "regions_dir": Path()}, "number of a map, .*got '-1'"),
+        ({"features": "lerf"}, "unknown features 'lerf'; --features is one of none, langsplat"),
+        ({"features": "langsplat"}, "features 'langsplat' need their folder: give it with --features-dir"),
+        ({"features_dir": Path("f")}, "--features-dir f is without use; add --features langsplat"),
     ],
 )
 def test_bad_options_say_what_to_do(options, message):

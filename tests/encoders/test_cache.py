@@ -1,4 +1,4 @@
-"""The cache of 2D features: what finds an entry again, and what does not."""
+"""The cache of regions and features: what finds an entry again, and what does not."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,117 +7,138 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns.encoders import CachedFeatures, RegionFeatures, SourceOptions, ViewFeatures, make_source
+from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
+from normlift_ns.encoders.cache import CachedEncoder, CachedRegions
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles
 
 IMAGE = torch.randint(0, 256, (20, 30, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Counted:
-    """A source that notes which views it was asked for."""
+    """Regions or an encoder that counts how often it is asked."""
 
-    source: RegionFeatures
+    inner: object
     asked: list[str] = field(default_factory=list)
 
-    @property
-    def identity(self):
-        return self.source.identity
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
 
-    def files(self, name):
-        return self.source.files(name)
-
-    def view(self, image, name):
+    def labels(self, image, name):
         self.asked.append(name)
-        return self.source.view(image, name)
+        return self.inner.labels(image, name)
 
-    def text(self, prompts):
-        return self.source.text(prompts)
+    def encode(self, image, labels):
+        self.asked.append("")
+        return self.inner.encode(image, labels)
 
 
 @pytest.fixture
-def counted() -> Counted:
-    return Counted(make_source(SourceOptions(encoder="colour", regions="grid", region_count=12)))
+def counted() -> RegionFeatures:
+    return RegionFeatures(Counted(Grid(12)), Counted(ColourEncoder()))
+
+
+def asked(source: RegionFeatures) -> tuple[int, int]:
+    return len(source.regions.asked), len(source.encoder.asked)
 
 
 def assert_same(a: ViewFeatures, b: ViewFeatures) -> None:
-    assert torch.equal(a.labels, b.labels) and torch.equal(a.features, b.features)
+    assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("labels", "features", "regions"))
 
 
 def test_a_second_run_computes_nothing(counted, tmp_path):
-    expected = counted.source.view(IMAGE, "a.jpg")
+    expected = RegionFeatures(Grid(12), ColourEncoder()).view(IMAGE, "a.jpg")
     for _ in range(2):  # as two runs would: nothing is held in memory
-        assert_same(CachedFeatures(counted, tmp_path / "new" / "folder").view(IMAGE, "a.jpg"), expected)
-    assert counted.asked == ["a.jpg"]
-    files = list((tmp_path / "new" / "folder").iterdir())
-    assert [file.suffix for file in files] == [".safetensors"]
+        assert_same(cached(counted, tmp_path / "new" / "folder").view(IMAGE, "a.jpg"), expected)
+    assert asked(counted) == (1, 1)
+    for kind in ("regions", "features"):
+        assert [file.suffix for file in (tmp_path / "new" / "folder" / kind).iterdir()] == [".safetensors"]
 
 
 def test_an_interrupted_run_resumes(counted, tmp_path):
     images = [IMAGE, 255 - IMAGE, IMAGE // 2]
-    cached = CachedFeatures(counted, tmp_path)
+    source = cached(counted, tmp_path)
     for i in range(2):
-        cached.view(images[i], f"{i}.jpg")
+        source.view(images[i], f"{i}.jpg")
     for i in range(3):
-        assert_same(cached.view(images[i], f"{i}.jpg"), counted.source.view(images[i], f"{i}.jpg"))
-    assert counted.asked == ["0.jpg", "1.jpg", "2.jpg"]
+        source.view(images[i], f"{i}.jpg")
+    assert counted.regions.asked == ["0.jpg", "1.jpg", "2.jpg"]
+    assert asked(counted) == (3, 3)
 
 
 def test_everything_that_matters_is_in_the_key(tmp_path):
-    def key(image=IMAGE, name="a.jpg", count=12):
-        return CachedFeatures(RegionFeatures(Grid(count), ColourEncoder()), tmp_path).path(image, name)
+    def regions(image=IMAGE, name="a.jpg", count=12):
+        return CachedRegions(Grid(count), tmp_path).path(image, name)
 
-    changed = IMAGE.clone()
+    changed, turned = IMAGE.clone(), IMAGE.reshape(30, 20, 3)
     changed[3, 4, 2] ^= 1
-    keys = [key(), key(changed), key(name="b.jpg"), key(count=13), key(IMAGE.reshape(30, 20, 3))]
+    labels, other = (Grid(count).labels(IMAGE, "")[0] for count in (12, 40))
+
+    def features(image=IMAGE, labels=labels):
+        return CachedEncoder(ColourEncoder(), tmp_path).path(image, labels)
+
+    keys = [regions(), regions(changed), regions(name="b.jpg"), regions(count=13), regions(turned)]
+    keys += [features(), features(changed), features(labels=other), features(turned)]
     assert len(set(keys)) == len(keys)
-    assert key(IMAGE.clone()) == key()
+    assert regions(IMAGE.clone()) == regions()
+    assert features(IMAGE.clone()) == features()
+
+
+def test_another_level_has_the_same_label_maps(tmp_path):
+    np.save(tmp_path / "a.npy", np.stack([np.ones((20, 30), int), np.arange(600).reshape(20, 30)]))
+    source = [RegionFeatures(Counted(LabelFiles(tmp_path, level=i)), Counted(ColourEncoder())) for i in range(2)]
+    first, second, again = (cached(s, tmp_path / "cache").view(IMAGE, "a.jpg") for s in (*source, source[0]))
+    assert [asked(s) for s in source] == [(1, 1), (0, 1)]
+    assert torch.equal(first.labels, second.labels)
+    assert (len(first.features), len(second.features)) == (1, 599)
+    assert_same(first, again)
 
 
 def test_another_label_file_is_another_entry(tmp_path):
     labels = tmp_path / "labels"
     labels.mkdir()
-    cached = CachedFeatures(RegionFeatures(LabelFiles(labels), ColourEncoder()), tmp_path / "cache")
+    source = cached(RegionFeatures(LabelFiles(labels), ColourEncoder()), tmp_path / "cache")
     for value, regions in ((0, 0), (3, 1)):
         np.save(labels / "a.npy", np.full((20, 30), value))
-        assert len(cached.view(IMAGE, "a.jpg").features) == regions
+        assert len(source.view(IMAGE, "a.jpg").features) == regions
     (labels / "a.npy").unlink()
     with pytest.raises(FileNotFoundError, match=r"a\.jpg has no label map"):
-        cached.view(IMAGE, "a.jpg")
+        source.view(IMAGE, "a.jpg")
 
 
+@pytest.mark.parametrize("kind", ["regions", "features"])
 @pytest.mark.parametrize("damage", ["truncate", "empty", "flip", "other"])
-def test_a_damaged_entry_is_computed_again(counted, tmp_path, damage):
-    cached = CachedFeatures(counted, tmp_path)
-    expected = cached.view(IMAGE, "a.jpg")
-    path = cached.path(IMAGE, "a.jpg")
+def test_a_damaged_entry_is_computed_again(counted, tmp_path, kind, damage):
+    source = cached(counted, tmp_path)
+    expected = source.view(IMAGE, "a.jpg")
+    (path,) = (tmp_path / kind).iterdir()
     whole = path.read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
     path.write_bytes(
         {
             "truncate": whole[: len(whole) // 2],
             "empty": b"",
-            "flip": whole[:header] + bytes(byte ^ 0x55 for byte in whole[header:]),
-            "other": whole.replace(b'"features"', b'"nonsense"'),
+            "flip": whole[:-1] + bytes([whole[-1] ^ 1]),
+            "other": whole[:header].replace(b'"labels"', b'"nonons"').replace(b'"features"', b'"nonsense"')
+            + whole[header:],
         }[damage]
     )
-    assert_same(cached.view(IMAGE, "a.jpg"), expected)
-    assert counted.asked == ["a.jpg"] * 2
+    assert_same(source.view(IMAGE, "a.jpg"), expected)
+    assert asked(counted) == ((2, 1) if kind == "regions" else (1, 2))
     assert path.read_bytes() == whole
 
 
 def test_many_regions_survive(tmp_path):
     """Beyond 16-bit labels."""
 
-    class Many(Counted):
-        def view(self, image, name):
-            count = 2**15 + 10
-            labels = torch.arange(-1, count - 1, dtype=torch.int32).reshape(-1, 2)
-            return ViewFeatures(labels, torch.ones(count, 1))
+    class Many(Grid):
+        def labels(self, image, name):
+            return torch.arange(-1, 2**15 + 9, dtype=torch.int32).reshape(1, -1, 2)
 
-    cached = CachedFeatures(Many(RegionFeatures(Grid(1), ColourEncoder())), tmp_path)
-    assert_same(cached.view(IMAGE, "a.jpg"), cached.view(IMAGE, "a.jpg"))
+    regions = CachedRegions(Many(1), tmp_path)
+    for _ in range(2):
+        assert torch.equal(regions.labels(IMAGE, "a.jpg"), Many(1).labels(IMAGE, "a.jpg"))
 
 
 def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
@@ -127,12 +148,14 @@ def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=r"cannot keep 2D features in .*No space left on device.*free disk space"):
-        CachedFeatures(counted, tmp_path).view(IMAGE, "a.jpg")
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match=r"cannot keep 2D labels in .*No space left on device.*free disk space"):
+        cached(counted, tmp_path).view(IMAGE, "a.jpg")
+    assert list((tmp_path / "regions").iterdir()) == []
 
 
-def test_identity_and_texts_are_those_of_the_source(counted, tmp_path):
-    cached = CachedFeatures(counted, tmp_path)
-    assert cached.identity == {"regions": {"kind": "grid", "count": 12}, "encoder": {"kind": "colour", "sigma": 30.0}}
-    assert torch.equal(cached.text(["red"]), counted.text(["red"]))
+def test_identity_and_texts_are_those_of_the_source(tmp_path):
+    source = RegionFeatures(Grid(12), ColourEncoder())
+    kept = cached(source, tmp_path)
+    expected = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
+    assert kept.identity == source.identity == expected
+    assert torch.equal(kept.text(["red"]), source.text(["red"]))

@@ -26,7 +26,7 @@ def test_view_features_accept_unlabelled_pixels_and_regions_without_pixels():
         (torch.zeros(2, 2), UNIT, "labels must be a torch.int32 matrix"),
         (torch.zeros(4, dtype=torch.int32), UNIT, "labels must be a torch.int32 matrix"),
         (torch.zeros(2, 2, dtype=torch.int32), UNIT.double(), "features must be a torch.float32 matrix"),
-        (torch.full((2, 2), 2, dtype=torch.int32), UNIT, r"in -1\.\.1 .* found 2\.\.2"),
+        (torch.full((2, 2), 2, dtype=torch.int32), UNIT, r"in -1\.\.1 \(there are 2 cells\), found 2\.\.2"),
         (torch.full((2, 2), -2, dtype=torch.int32), UNIT, r"found -2\.\.-2"),
         (torch.zeros(2, 2, dtype=torch.int32), 2 * UNIT, r"2 of 2 rows .*\(row 0 has length 2\)"),
         (torch.zeros(2, 2, dtype=torch.int32), UNIT * torch.tensor([[1.0], [torch.nan]]), "row 1 has length nan"),
@@ -35,6 +35,20 @@ def test_view_features_accept_unlabelled_pixels_and_regions_without_pixels():
 def test_view_features_refuse_what_does_not_fit(labels, features, message):
     with pytest.raises(ValueError, match=message):
         ViewFeatures(labels, features)
+
+
+def test_regions_of_cells_must_have_features():
+    labels = torch.tensor([[-1, 0], [1, 2]], dtype=torch.int32)
+    view = ViewFeatures(labels, UNIT, torch.tensor([[1, -1, 0], [-1, -1, 1]], dtype=torch.int32))
+    assert torch.equal(view.region_of_cell, view.regions)
+    assert ViewFeatures(labels.clamp(max=1), UNIT).region_of_cell.tolist() == [[0, 1]]
+    for regions, message in (
+        ([[0, 2, 1]], r"regions must be in -1\.\.1 \(there are 2 feature rows\), found 0\.\.2"),
+        ([[0, 1]], r"labels must be in -1\.\.1 \(there are 2 cells\), found -1\.\.2"),
+        ([0, 1, 0], "regions must be a torch.int32 matrix"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ViewFeatures(labels, UNIT, torch.tensor(regions, dtype=torch.int32))
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,25 @@ def test_label_maps_of_another_size_are_refused_or_resampled(trained, tmp_path, 
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--regions-resample", "True") == 0
 
 
+def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monkeypatch, capsys):
+    for path in (trained.parents[4] / "room" / "instance").iterdir():
+        classes = np.asarray(Image.open(path)).astype(int)
+        np.save(tmp_path / f"{path.stem}.npy", np.stack([classes, (classes > 0).astype(int)]))
+    flags = ("--load-config", trained, *SMALL, "--regions-dir", tmp_path, "--output-dir", tmp_path / "out")
+    for level in ("0", "1"):
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
+        monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)
+    fields = [load_field(load_run(tmp_path / "out" / "room" / "normlift" / t / "config.yml")) for t in ("0", "1")]
+    weights = [field.scalars.weight for field in fields]
+    assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
+    classes, whole = (field.scalars.c_intra for field in fields)
+    assert torch.allclose(whole[whole > 0], torch.ones(()), atol=1e-6)  # one region per view agrees with itself
+    assert float(classes[classes > 0].min()) < 0.9
+    capsys.readouterr()
+    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--timestamp", "none") == 1
+    assert "has 2 levels of regions, 0..1; choose one with --level" in " ".join(capsys.readouterr().out.split())
+
+
 def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
     flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *SMALL, *flags) == 0

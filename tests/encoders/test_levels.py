@@ -1,0 +1,83 @@
+"""Cells and regions of images that are cut in several ways."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from normlift_ns.encoders import RegionFeatures
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.levels import joint_partition
+from normlift_ns.encoders.regions import LabelFiles
+
+SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 6))
+
+
+@settings(deadline=None)
+@given(arrays(np.int32, SHAPES, elements=st.integers(-1, 3)))
+def test_cells_are_the_sets_of_pixels_with_the_same_labels(values):
+    maps = torch.from_numpy(values)
+    cells, regions = joint_partition(maps)
+    present = cells[cells >= 0].unique()
+    assert present.tolist() == list(range(regions.shape[1]))
+    assert torch.equal(cells == -1, (maps == -1).all(dim=0))
+    labelled = cells >= 0
+    assert torch.equal(regions[:, cells[labelled].long()], maps[:, labelled])
+    assert regions.unique(dim=1).shape == regions.shape  # no two cells have the same labels
+
+
+@settings(deadline=None)
+@given(arrays(np.int32, st.tuples(st.integers(1, 6), st.integers(1, 6)), elements=st.integers(-1, 3)))
+def test_the_cells_of_one_level_are_its_regions(values):
+    ids = np.unique(values[values >= 0])
+    labels = torch.from_numpy(np.where(values >= 0, np.searchsorted(ids, values), -1).astype(np.int32))
+    cells, regions = joint_partition(labels[None])
+    assert torch.equal(cells, labels)
+    assert regions.tolist() == [list(range(len(ids)))]
+
+
+def test_many_levels_of_many_regions_do_not_overflow():
+    """Ten levels of 40,000 regions: 10**46 possible tuples."""
+    maps = torch.stack([torch.randperm(40_000, generator=torch.Generator().manual_seed(i)) for i in range(10)]).int()
+    maps = maps.reshape(10, 200, 200)
+    cells, regions = joint_partition(maps)
+    assert torch.equal(regions[:, cells.long()], maps)
+
+
+MAPS = np.stack([np.repeat([[1, 1, 2, 2]], 4, 0), np.repeat([[1], [1], [0], [2]], 4, 1), np.zeros((4, 4), int)])
+IMAGE = torch.randint(0, 256, (4, 4, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    np.save(tmp_path / "a.npy", MAPS)
+    return tmp_path
+
+
+def test_every_level_has_the_same_cells_and_its_own_features(folder):
+    views = [RegionFeatures(LabelFiles(folder, level=i), ColourEncoder()).view(IMAGE, "a.jpg") for i in range(3)]
+    assert all(torch.equal(view.labels, views[0].labels) for view in views)
+    for level, view in enumerate(views):
+        alone = LabelFiles(folder).labels(IMAGE, "a.jpg")[level]
+        assert torch.equal(view.region_of_cell[0, view.labels.long()], alone)
+        assert torch.equal(view.features, ColourEncoder().encode(IMAGE, alone))
+    assert views[2].features.shape[0] == 0
+
+
+def test_several_levels_at_once(folder):
+    class Two(LabelFiles):
+        chosen = (1, 0)
+
+    view = RegionFeatures(Two(folder), ColourEncoder()).view(IMAGE, "a.jpg")
+    one, zero = (RegionFeatures(LabelFiles(folder, level=i), ColourEncoder()).view(IMAGE, "a.jpg") for i in (1, 0))
+    assert torch.equal(view.features, torch.cat([one.features, zero.features]))
+    offset = torch.where(zero.regions >= 0, zero.regions + len(one.features), -1)
+    assert torch.equal(view.regions, torch.cat([one.regions, offset]))
+
+
+@pytest.mark.parametrize("level", [None, 3])
+def test_a_level_must_be_one_of_those_in_the_file(folder, level):
+    with pytest.raises(ValueError, match=r"a\.npy has 3 levels of regions, 0\.\.2; choose one with --level"):
+        RegionFeatures(LabelFiles(folder, level=level), ColourEncoder()).view(IMAGE, "a.jpg")
