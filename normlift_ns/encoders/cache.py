@@ -63,7 +63,7 @@ class CachedRegions:
     def files(self, name: str) -> tuple[Path, ...]:
         return self.regions.files(name)
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
         found = _read(path, "labels")
         if found is None:
@@ -92,7 +92,7 @@ class CachedEncoder:
     def identity(self) -> dict[str, Any]:
         return self.encoder.identity
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         path = self.path(image, labels)
         found = _read(path, "features")
         if found is None:
@@ -103,7 +103,7 @@ class CachedEncoder:
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
 
-    def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Path:
+    def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Where the features of an image's regions are kept, whether they exist or not."""
         return _path(self.folder, self.identity, *_parts(image), *_parts(labels))
 

@@ -1,4 +1,4 @@
-"""Rules on binary masks: boxes, small regions, LangSplat's suppression, and the label map that overlaps end up in."""
+"""Rules on binary masks: boxes, small regions, LangSplat's suppression, and label maps of masks that overlap."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def mask_nms(
     All masks are compared with all, also with those that go. Intersections are counted exactly and their ratios
     compared in float64. Equal scores: the earlier mask is the better one.
 
-    LangSplat's inner score, 1 - (inter/area_i)(inter/area_j) > 0.5, holds for every pair that passes its two tests of
-    shares; so the tests alone decide.
+    LangSplat also asks for 1 - (inter/area_i)(inter/area_j) > 0.5 of a mask inside another, which every pair fulfils
+    that passes the two tests of shares.
 
     Args:
         scores: stability times predicted IoU.
@@ -64,12 +64,20 @@ def mask_nms(
     return keep
 
 
-def overlay(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "h w"]:
-    """The label map of masks: where they overlap the later one counts; -1 in none."""
-    labels = torch.full(masks.shape[1:], -1, dtype=torch.int32, device=masks.device)
-    for i, mask in enumerate(masks):
-        labels.masked_fill_(mask, i)
-    return labels
+def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
+    """Masks as label maps that lie on one another: where masks overlap the later one is on top; -1 beneath the last.
+
+    The depth is the largest number of masks that share a pixel, at least 1.
+    """
+    count = len(masks)
+    flat = masks.flatten(1)
+    sharing = flat.sum(dim=0)
+    depth = max(1, int(sharing.max()))
+    labels = torch.full((depth, flat.shape[1]), -1, dtype=torch.int32, device=masks.device)
+    pixel, upward = flat.flip(0).T.nonzero(as_tuple=True)  # pixel by pixel, in each the last mask first
+    above = torch.arange(len(pixel), device=masks.device) - (sharing.cumsum(0) - sharing)[pixel]
+    labels[above, pixel] = (count - 1 - upward).int()
+    return labels.reshape(depth, *masks.shape[1:])
 
 
 def boxes_of(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:

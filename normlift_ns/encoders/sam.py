@@ -26,13 +26,15 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 from torchvision.ops import nms
 
-from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, overlay
+from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
 from normlift_ns.encoders.sam_network import SamNetwork
 from normlift_ns.encoders.sam_weights import DEFAULT_SAM, check_sam, sam_identity
 
 Level = Literal["default", "s", "m", "l"]
+LEVELS: tuple[Level, ...] = get_args(Level)
 Box = tuple[int, int, int, int]
 """(x0, y0, x1, y1), the ends outside."""
 
@@ -80,7 +82,7 @@ class _Candidates(NamedTuple):
 
     def of(self, level: Level) -> Int64[Tensor, " k"]:
         """Indices of the candidates of a level."""
-        mine = torch.ones_like(self.channel) if level == "default" else self.channel == "sml".index(level)
+        mine = torch.ones_like(self.channel) if level == "default" else self.channel == LEVELS.index(level) - 1
         return mine.nonzero()[:, 0]
 
 
@@ -103,34 +105,40 @@ class SamMasks:
     rules: MaskRules = field(default_factory=MaskRules)
 
     def __post_init__(self) -> None:
-        if self.level not in get_args(Level):
-            raise ValueError(f"SAM has the levels {', '.join(get_args(Level))}; got {self.level!r}: choose with --level")
+        if self.level not in LEVELS:
+            raise ValueError(f"SAM has the levels {', '.join(LEVELS)}; got {self.level!r}: choose with --level")
         check_sam(self.checkpoint)
 
     @property
     def identity(self) -> dict[str, Any]:
         """Files count by their content, wherever they lie."""
-        return {"kind": "sam", "checkpoint": self._checkpoint, "level": self.level, "rules": asdict(self.rules)}
+        return {"kind": "sam", "checkpoint": self._checkpoint, "rules": asdict(self.rules)}
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return (LEVELS.index(self.level),)
 
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "h w"]:
-        """As in `Regions`; raises as `masks`."""
-        return overlay(self.masks(image)[self.level]).cpu()
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
+        """As in `Regions`: default, s, m, l; raises as `masks`."""
+        maps = [stack_masks(masks).cpu() for masks in self.masks(image).values()]
+        depth = max(len(each) for each in maps)
+        return torch.stack([pad(each, (0, 0, 0, 0, 0, depth - len(each)), value=-1) for each in maps])
 
     @torch.no_grad()
     def masks(
-        self, image: UInt8[Tensor, "h w 3"], levels: Sequence[Level] | None = None
+        self, image: UInt8[Tensor, "h w 3"], levels: Sequence[Level] = LEVELS
     ) -> dict[Level, Bool[Tensor, "m h w"]]:
-        """The masks of some levels, by default of its own, on the device and in their order.
+        """The masks of some levels, on the device and in their order.
 
         Raises:
             FileNotFoundError: the weights cannot be downloaded.
             ValueError: a checkpoint that is damaged or not of SAM.
             MemoryError: the memory of the device does not hold a single image or prompt.
         """
-        rules, levels = self.rules, [self.level] if levels is None else levels
+        rules = self.rules
         size = image.shape[0], image.shape[1]
         crops = crop_boxes(*size, rules.crop_overlap)
         embeddings = self._network.embed([image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops])
@@ -181,7 +189,7 @@ class SamMasks:
         boxes = boxes + torch.tensor([x0, y0, x0, y0], device=boxes.device)
         whole = torch.full_like(stable, number).long()
         found = _Candidates(every, torch.cat(channel), torch.cat(predicted), stable, boxes, whole)
-        good = (stable >= rules.stability) & ~cut_off(boxes, crop, size, rules.edge)
+        good = (stable >= rules.stability) & (stable > 0) & ~cut_off(boxes, crop, size, rules.edge)
         return found.at(good.nonzero()[:, 0])
 
     def _whole(self, found: _Candidates, crops: Sequence[Box], size: tuple[int, int]) -> Bool[Tensor, "c h w"]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 _PROBE_SECONDS = 10
 _BLOCK = 2**24
+_LONGEST = 300
 
 
 def content_identity(*files: Path) -> str:
@@ -23,8 +24,10 @@ def content_identity(*files: Path) -> str:
 
 def first_line(error: Exception) -> str:
     """The beginning of a foreign error, for a message of ours."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if len(lines) > 0 else type(error).__name__
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    kept = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
+    text = " ".join([f"{type(error).__name__}:", *kept]) if len(kept) > 0 else type(error).__name__
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + " ..."
 
 
 def probe(address: str) -> None:
