@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate, linear, normalize
 
@@ -68,13 +68,27 @@ class PatchFeatures:
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """As in `FeatureSource`; raises as `OpenClipEncoder.encode`."""
-        check_image(image, name)
+        """As in `FeatureSource`; raises as `features`."""
+        return ViewFeatures(self.labels(image), self.features(image, name))
+
+    def labels(self, image: UInt8[Tensor, "h w 3"]) -> Int32[Tensor, "h w"]:
+        """Patch of every pixel, the nearest one, counted row by row."""
         height, width = image.shape[:2]
         rows, columns = patch_grid(height, width, self.count)
-        (features,) = self._images(lambda batch: self._tokens(batch[0], rows, columns), image[None])
-        cells = np.arange(rows * columns, dtype=np.int32).reshape(1, rows, columns)
-        return ViewFeatures(torch.from_numpy(resample_nearest(cells, height, width)[0]), features)
+        patches = np.arange(rows * columns, dtype=np.int32).reshape(1, rows, columns)
+        return torch.from_numpy(resample_nearest(patches, height, width)[0])
+
+    def features(self, image: UInt8[Tensor, "h w 3"], name: str) -> Float32[Tensor, "r d"]:
+        """One unit row per patch.
+
+        Raises:
+            FileNotFoundError: the weights cannot be downloaded.
+            ValueError: no picture; a weight file that is damaged or of another architecture.
+            MemoryError: the memory of the device does not hold the image.
+        """
+        check_image(image, name)
+        rows, columns = patch_grid(*image.shape[:2], self.count)
+        return next(self._images(lambda batch: self._tokens(batch[0], rows, columns), image[None]))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)

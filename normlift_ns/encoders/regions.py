@@ -14,6 +14,7 @@ from skimage.segmentation import slic
 from torch import Tensor
 
 from normlift_ns.encoders.images import read_pixels
+from normlift_ns.encoders.npy import read_npy
 
 _SUFFIXES = (".png", ".npy")
 
@@ -165,7 +166,7 @@ class LabelFiles:
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in found])[:, None]
 
     def _read(self, path: Path) -> np.ndarray:
-        found = _read_npy(path) if path.suffix == ".npy" else read_pixels(path)
+        found = read_npy(path, "label map") if path.suffix == ".npy" else read_pixels(path)
         if found.ndim == 3 and path.suffix == ".png":
             raise ValueError(
                 f"label map {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "
@@ -183,16 +184,6 @@ class LabelFiles:
 def _check_count(count: int) -> None:
     if count < 1:
         raise ValueError(f"number of regions per image must be at least 1, got {count}")
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        with path.open("rb") as file:
-            return np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise ValueError(
-            f"label map {path} is damaged or no NPY file ({error}); write it again with numpy.save"
-        ) from error
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:

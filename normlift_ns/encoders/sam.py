@@ -27,7 +27,6 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import pad
-from torchvision.ops import nms
 
 from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
 from normlift_ns.encoders.sam_network import SamNetwork
@@ -251,6 +250,8 @@ def cut_off(boxes: Int64[Tensor, "n 4"], crop: Box, size: tuple[int, int], edge:
 
 def _distinct(index: Tensor, boxes: Tensor, scores: Tensor, rules: MaskRules) -> Tensor:
     """Non-maximum suppression of boxes; what stays, highest score first, earlier ones first among equals."""
+    from torchvision.ops import nms  # noqa: PLC0415 (takes a second, and not everybody asks SAM)
+
     return index[nms(boxes[index].float(), scores[index], rules.box_iou)]
 
 

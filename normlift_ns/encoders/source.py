@@ -151,21 +151,25 @@ class Regions(Protocol):
         ...
 
 
-class Encoder(Protocol):
-    """A joint space of image regions and texts."""
+class TextEncoder(Protocol):
+    """What queries need."""
 
     @property
     def identity(self) -> dict[str, Any]:
         """As in `FeatureSource`."""
         ...
 
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """As in `FeatureSource`."""
+        ...
+
+
+class Encoder(TextEncoder, Protocol):
+    """A joint space of image regions and texts."""
+
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level: a region is all
         pixels that have its id at any depth."""
-        ...
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """As in `FeatureSource`."""
         ...
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,11 +16,14 @@ from torch import Tensor
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.query import CANONICAL_NEGATIVES, RelevancyForm
-from normlift_ns.encoders.build import SourceOptions, make_encoder
-from normlift_ns.encoders.source import Encoder
+from normlift_ns.encoders.build import SourceOptions, make_texts
+from normlift_ns.encoders.cache import CachedTexts
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.source import TextEncoder
+from normlift_ns.encoders.text_vectors import TextVectors
 
-ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill")
-"""Options that say which encoder made a field; they stand in its manifest."""
+ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
+"""Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
 THRESHOLDS: dict[RelevancyForm, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
 """Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
 _CENTRAL = (0.05, 0.95)
@@ -39,27 +44,54 @@ class Answer:
     """Valid, above the threshold and reliable enough."""
 
 
-def encoder_of(field: SemanticField, device: str = "cpu") -> Encoder:
-    """The encoder that made the field, for texts.
+def encoder_settings(options: SourceOptions) -> dict[str, Any]:
+    """What `encoder_of` needs to know, ready for JSON; paths absolute."""
+    vectors = options.text_vectors
+    settings = {key: getattr(options, key) for key in ENCODER_KEYS}
+    return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
 
+
+def with_texts(field: SemanticField, *, vectors: Path | None = None, template: str | None = None) -> SemanticField:
+    """The field, with texts looked up in another file, or read in another template; None: as it was lifted."""
+    changes = {
+        "text_vectors": None if vectors is None else os.path.abspath(vectors),
+        "text_template": template,
+    }
+    given = {key: value for key, value in changes.items() if value is not None}
+    return replace(field, manifest={**field.manifest, "encoder": {**field.manifest.get("encoder", {}), **given}})
+
+
+def encoder_of(field: SemanticField, device: str = "cpu", cache: Path | None = None) -> TextEncoder:
+    """The encoder of texts that fits the field.
+
+    Args:
+        cache: folder in which to keep vectors of texts that a network has read.
     Raises:
         ValueError: the manifest names none that this version knows.
-        FileNotFoundError: its weights are not there any more.
+        FileNotFoundError: its weights, or its text vectors, are not there any more.
     """
+    texts = make_texts(_options(field), device)
+    return CachedTexts(texts, cache) if cache is not None and isinstance(texts, OpenClipEncoder) else texts
+
+
+def _options(field: SemanticField) -> SourceOptions:
     stored = field.manifest.get("encoder")
     if not isinstance(stored, Mapping) or set(stored) != set(ENCODER_KEYS):
         raise ValueError(f"the field's manifest names no encoder (found {stored!r}); lift again with: ns-normlift")
-    return make_encoder(SourceOptions(**stored), device)
+    vectors = stored["text_vectors"]
+    return SourceOptions(**{**stored, "text_vectors": None if vectors is None else Path(vectors)})
 
 
 def default_negatives(field: SemanticField) -> tuple[str, ...]:
-    """LERF's negatives for open_clip; none for the colour encoder, which knows no "object"."""
-    return CANONICAL_NEGATIVES if field.manifest["encoder"]["encoder"] == "open_clip" else ()
+    """LERF's negatives where the encoder knows them: the colour encoder does not, a file of text vectors may."""
+    options = _options(field)
+    known = CANONICAL_NEGATIVES if options.text_vectors is None else TextVectors(options.text_vectors).names
+    return CANONICAL_NEGATIVES if options.encoder == "open_clip" and set(CANONICAL_NEGATIVES) <= set(known) else ()
 
 
 def ask(
     field: SemanticField,
-    encoder: Encoder,
+    encoder: TextEncoder,
     texts: Sequence[str],
     *,
     negatives: Sequence[str] | None = None,

@@ -18,11 +18,13 @@ from normlift_ns.core.lift import Lifted, Unlabeled, lift
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import RefineConfig, refine, unsupported
 from normlift_ns.encoders.cache import cached
+from normlift_ns.encoders.langsplat import write_langsplat
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.plugin.observe import BLOCK, block_evidence, see_block, spread
 
 if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
     from normlift_ns.plugin.adapters import SourceRun
+    from normlift_ns.plugin.views import View
 
 Report = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
@@ -60,6 +62,14 @@ class LiftOptions:
                 raise ValueError(f"{name} must be at least 1, got {value}")
 
 
+class Export(NamedTuple):
+    """Where 2D features go besides the lift."""
+
+    folder: Path
+    overwrite: bool
+    """Replace files of other content."""
+
+
 class LiftResult(NamedTuple):
     """A field and how it came about."""
 
@@ -76,6 +86,7 @@ def lift_run(
     *,
     device: str = "cpu",
     encoder: Mapping[str, Any],
+    export: Export | None = None,
     report: Report = lambda stage, done, total: None,
 ) -> LiftResult:
     """Lifts 2D features onto the Gaussians of a trained run.
@@ -84,6 +95,7 @@ def lift_run(
         cache: folder for 2D features and evidence; made if missing, may be deleted at any time.
         device: where to rasterize, lift and vote.
         encoder: the options that queries need to encode texts likewise; kept in the manifest.
+        export: where to write the 2D features too, in LangSplat's format.
         report: told of the progress.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option that does not fit; the message names it.
@@ -98,8 +110,14 @@ def lift_run(
     for start in range(0, len(indices), BLOCK):
         chosen = indices[start : start + BLOCK]
         with stages("features", len(indices)) as step:
+
+            def done(view: View, step: Callable[[], None] = step) -> None:
+                if export is not None:
+                    write_langsplat(seen, view.image, view.name, *export)
+                step()
+
             rendered = options.image_source == "render"
-            block = see_block(run, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=step)
+            block = see_block(run, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
             tables.extend(block.features)
         with stages("evidence", len(indices)) as step:
             power, reuse = options.weight_power, options.reuse_evidence
@@ -109,7 +127,8 @@ def lift_run(
         evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
         step()
-    statistics = {"views": len(indices), "excluded": evidence.num_excluded, **_statistics(lifted)}
+    left_out = len(run.train) - len(usable)
+    statistics = {"views": len(indices), "left_out": left_out, "excluded": evidence.num_excluded, **_statistics(lifted)}
     copied = None
     if options.refine:
         with stages("lift") as step:

@@ -58,14 +58,14 @@ def see_block(
     *,
     rendered: bool,
     divisor: int,
-    done: Callable[[], None],
+    done: Callable[[View], None],
 ) -> Block:
     """Labels and features of some training views.
 
     Args:
         rendered: look at the trained scene rendered from the cameras instead of at the photographs.
         divisor: of the size of images and cameras.
-        done: called after every view.
+        done: called after every view, with the view as the source saw it.
     """
     block = Block([], [], [], [])
     for index in indices:
@@ -77,7 +77,7 @@ def see_block(
         block.labels.append(found.labels if view.mask is None else found.labels.where(view.mask, MASKED))
         block.regions.append(found.region_of_cell)
         block.features.append(found.features)
-        done()
+        done(view)
     return block
 
 

@@ -17,8 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from normlift_ns.encoders.build import SourceOptions, make_source
-from normlift_ns.plugin.asking import ENCODER_KEYS, default_negatives
-from normlift_ns.plugin.lifting import LiftOptions, LiftResult, Report, lift_run
+from normlift_ns.plugin.asking import default_negatives, encoder_settings
+from normlift_ns.plugin.lifting import Export, LiftOptions, LiftResult, Report, lift_run
 from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
 
 
@@ -37,11 +37,13 @@ class NormLift:
     timestamp: str | None = None
     """Name of the new run directory; the present time by default."""
     overwrite: bool = False
-    """Replace a run directory of that name."""
+    """Replace a run directory of that name, and exported files of other content."""
     device: str = "auto"
     """auto, cpu or cuda."""
     queries: tuple[str, ...] = ()
     """Texts to store in the run; ns-render and ns-viewer show their relevancy."""
+    export_langsplat: Path | None = None
+    """Write regions and features of all images into this folder too, in the format of LangSplat's preprocessing."""
     source: SourceOptions = field(default_factory=SourceOptions)
     options: LiftOptions = field(default_factory=LiftOptions)
 
@@ -61,10 +63,23 @@ class NormLift:
         if target.exists() and not self.overwrite:
             raise FileExistsError(f"{target} exists; give another --timestamp or --output-dir, or --overwrite True.")
         CONSOLE.print(f"{len(run.scene):,} Gaussians, {len(run.train)} training views, on {device}")
-        encoder = {key: getattr(self.source, key) for key in ENCODER_KEYS}
+        export = None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite)
         with progress_bars() as report:
             result = lift_run(
-                run, source, self.options, target.parent / ".cache", device=device, encoder=encoder, report=report
+                run,
+                source,
+                self.options,
+                target.parent / ".cache",
+                device=device,
+                encoder=encoder_settings(self.source),
+                export=export,
+                report=report,
+            )
+        if texts is not None and texts.shape[1] != result.field.dimension:
+            raise ValueError(
+                f"the vectors of --queries have {texts.shape[1]} numbers, the features {result.field.dimension}; name "
+                "the model that made the features with --encoder-model and --encoder-pretrained, or give "
+                "--text-vectors"
             )
         vectors = None
         if texts is not None:
@@ -109,6 +124,8 @@ def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str,
     table.add_row("Gaussians", f"{numbers['gaussians']:,}, without evidence {numbers['zero_evidence_share']:.1%}")
     if numbers["excluded"] > 0:
         table.add_row("not drawn", f"{numbers['excluded']:,} with non-finite parameters")
+    if numbers["left_out"] > 0:
+        table.add_row("left out", f"{numbers['left_out']} images without features")
     table.add_row("reliability R", quantiles)
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"

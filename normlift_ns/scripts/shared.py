@@ -23,14 +23,14 @@ class Command(Protocol):
 def run_command(command: type[Command]) -> None:
     """Reads the flags in the form of nerfstudio's commands (--flag True) and runs the command.
 
-    Errors of flags, input, files and disks become a message and exit code 1, Ctrl-C exit code 130.
+    Errors of flags, input, files, disks and memory become a message and exit code 1, Ctrl-C exit code 130.
     """
     tyro.extras.set_accent_color("bright_yellow")
     try:
         tyro.cli(tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[command]]).main()  # pyright: ignore[reportAttributeAccessIssue]
     except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read
         sys.exit(1 if stop.code == 2 else stop.code)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         CONSOLE.rule("Error", style="red")
         CONSOLE.print(str(error), justify="center", markup=False, highlight=False)
         sys.exit(1)
