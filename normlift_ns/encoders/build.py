@@ -9,8 +9,8 @@ from typing import Any, Literal, get_args
 
 from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED
 from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.langsplat import LangSplat, Missing
 from normlift_ns.encoders.crops import Fill
+from normlift_ns.encoders.langsplat import LangSplat, Missing
 from normlift_ns.encoders.open_clip import OpenClipEncoder
 from normlift_ns.encoders.patches import PatchFeatures, why_not_dense
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
@@ -47,8 +47,8 @@ class SourceOptions:
     region_count: int | None = None
     """Regions per image, about: of superpixel and grid 256 by default, of patches 1024."""
     sam_model: str | None = None
-    """Weights of sam: a folder as transformers writes it, a file as Meta publishes it, or a name to download; by default
-    facebook/sam-vit-huge, LangSplat's."""
+    """Weights of sam: a folder as transformers writes it, a file as Meta publishes it, or a name to download. By
+    default facebook/sam-vit-huge, LangSplat's."""
     regions_dir: Path | None = None
     """Folder with one label map per image, PNG or NPY of the same stem."""
     regions_background: int = 0

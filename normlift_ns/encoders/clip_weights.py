@@ -32,7 +32,8 @@ def check_names(model: str, pretrained: str) -> None:
     """Checks an architecture and its weights by name, without loading or downloading anything.
 
     Raises:
-        ValueError: a model or a tag of weights that open_clip does not know, or a model that the installed timm does not.
+        ValueError: a model or a tag of weights that open_clip does not know, or a model that the installed timm does
+            not know.
         FileNotFoundError: what looks like a weight file does not exist.
     """
     open_clip = import_open_clip()
@@ -47,8 +48,8 @@ def check_names(model: str, pretrained: str) -> None:
     if tower is not None and not timm.is_model(tower):
         raise ValueError(
             f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
-            f"{timm.__version__} does not have (nerfstudio pins an old one); take a model that open_clip builds itself, "
-            f"such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
+            f"{timm.__version__} does not have (nerfstudio pins an old one); take a model that open_clip builds "
+            f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
         )
     path = Path(pretrained)
     if path.is_file() or open_clip.is_pretrained_cfg(model, pretrained):

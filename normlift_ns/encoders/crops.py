@@ -58,7 +58,9 @@ def masked_crops(
     return crops.permute(0, 3, 1, 2)
 
 
-def _line(side: Tensor, margin: Tensor, length: Tensor, start: Tensor, size: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+def _line(
+    side: Tensor, margin: Tensor, length: Tensor, start: Tensor, size: int
+) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Where `size` samples of each square fall along one axis: the two pixels beside each, as position in the image,
     weight, and whether they lie in the box rather than in the margin.
     """

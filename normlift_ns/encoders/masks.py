@@ -93,7 +93,7 @@ def boxes_of(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
 def clean_masks(
     masks: Bool[Tensor, "m h w"], boxes: Int64[Tensor, "m 4"], least: int
 ) -> tuple[Bool[Tensor, "m h w"], Bool[Tensor, " m"]]:
-    """Fills holes and drops pieces of fewer than `least` pixels, 8-connected; if all pieces are small the largest stays.
+    """Fills holes and drops pieces of fewer than `least` pixels, 8-connected; the largest piece stays in any case.
 
     Args:
         boxes: as `boxes_of` returns them.

@@ -61,8 +61,6 @@ class MaskRules:
     suppression: Suppression = field(default_factory=Suppression)
 
 
-
-
 class _Candidates(NamedTuple):
     """Masks that may stay."""
 
@@ -162,8 +160,8 @@ class SamMasks:
         boxes, score = boxes_of(masks), found.stability * found.predicted_iou
         result: dict[Level, Tensor] = {}
         for level, index in kept.items():
-            index = _distinct(index, boxes, (~changed).float(), rules)
-            result[level] = masks[index[mask_nms(masks[index], score[index], rules.suppression)]]
+            last = _distinct(index, boxes, (~changed).float(), rules)
+            result[level] = masks[last[mask_nms(masks[last], score[last], rules.suppression)]]
         return result
 
     def _candidates(self, embedding: Tensor, crop: Box, number: int, size: tuple[int, int]) -> _Candidates:

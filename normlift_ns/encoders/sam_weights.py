@@ -1,4 +1,4 @@
-"""Weights of SAM: a folder as transformers writes it, a file as Meta published it, or a name on the Hugging Face hub."""
+"""Weights of SAM: a folder as transformers writes it, a file as Meta publishes it, or a name on the hub."""
 
 from __future__ import annotations
 

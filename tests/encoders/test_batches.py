@@ -28,7 +28,9 @@ def test_batches_halve_until_they_fit_and_stay_so():
 
 
 def test_one_item_that_does_not_fit_ends_it():
-    with pytest.raises(MemoryError, match=r"hold a single crop \(CUDA out of memory.*2 GiB\.\); .*--lift-downscale 2") as e:
+    with pytest.raises(
+        MemoryError, match=r"hold a single crop \(CUDA out of memory.*2 GiB\.\); .*--lift-downscale 2"
+    ) as e:
         list(Batches(16, "crop")(narrow(0)[0], torch.arange(10)))
     assert "\n" not in str(e.value) and e.value.__suppress_context__
 

@@ -11,7 +11,7 @@ from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
 
 
 def test_auto_takes_files_where_a_folder_is_given(tmp_path):
-    assert make_regions(SourceOptions()) == Superpixels(256)
+    assert make_regions(SourceOptions(encoder="colour")) == Superpixels(256)
     assert make_regions(SourceOptions(regions_dir=tmp_path)) == LabelFiles(tmp_path)
 
 
@@ -43,10 +43,13 @@ def test_a_moved_folder_of_labels_changes_no_identity(tmp_path):
     ("options", "message"),
     [
         ({"encoder": "clip"}, "unknown encoder 'clip'; --encoder is one of open_clip, colour"),
-        ({"regions": "sam"}, "unknown regions 'sam'; --regions is one of auto, superpixel, grid, files"),
+        (
+            {"regions": "slic"},
+            "unknown regions 'slic'; --regions is one of auto, sam, patches, superpixel, grid, files",
+        ),
         ({"regions": "files"}, 'regions "files" need a folder of label maps.*--regions-dir'),
-        ({"regions": "grid", "level": "1"}, '--level 1 is for --regions files, not for "grid"'),
-        ({"level": "0"}, '--level 0 is for --regions files, not for "superpixel"'),
+        ({"regions": "grid", "level": "1"}, '--level 1 is for --regions files or sam, not for "grid"'),
+        ({"level": "0"}, '--level 0 is for --regions files or sam, not for "superpixel"'),
         ({"level": "l", "regions_dir": Path()}, "--level of --regions files is the number of a map, .*got 'l'"),
         ({"level": "-1", "regions_dir": Path()}, "number of a map, .*got '-1'"),
         ({"features": "lerf"}, "unknown features 'lerf'; --features is one of none, langsplat"),

@@ -174,7 +174,11 @@ def test_a_checkpoint_counts_by_its_content(weights, tmp_path):
 @pytest.mark.parametrize(
     ("checkpoint", "error", "message"),
     [
-        ("/nowhere/sam_vit_h.pth", FileNotFoundError, r"SAM checkpoint /nowhere/sam_vit_h.pth does not exist.*--regions"),
+        (
+            "/nowhere/sam_vit_h.pth",
+            FileNotFoundError,
+            r"SAM checkpoint /nowhere/sam_vit_h.pth does not exist.*--regions",
+        ),
         ("sam_vit_h.pth", FileNotFoundError, "does not exist; check the path"),
         ("vit_h", ValueError, "'vit_h' is neither a path nor a name of the hub such as facebook/sam-vit-huge"),
     ],

@@ -1,12 +1,22 @@
 """Networks of the real kinds with few random weights, written to disk, for the real loading code."""
 
+import json
 from functools import partial
 from pathlib import Path
 
+import open_clip
 import torch
+from safetensors.torch import save_file
 from segment_anything.modeling import ImageEncoderViT, MaskDecoder, PromptEncoder, Sam, TwoWayTransformer
 from torch.nn import LayerNorm
 
+CLIP = "normlift-tiny"
+"""Name of the OpenCLIP architecture."""
+_CLIP_CONFIG = {
+    "embed_dim": 24,
+    "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
+    "text_cfg": {"context_length": 77, "vocab_size": 49408, "width": 32, "heads": 2, "layers": 2},
+}
 SIDE = 128
 """Of SAM's input."""
 _CHANNELS = 32
@@ -45,7 +55,7 @@ def tiny_sam(seed: int = 0, gain: float = 1.0) -> Sam:
                 if "rel_pos" in name or "pos_embed" in name:
                     value.normal_(std=0.3)
                 elif name.startswith("mask_decoder.transformer") and name.endswith("weight") and "norm" not in name:
-                    value *= 4 * gain if gain > 1 and ("q_proj" in name or "k_proj" in name) else gain
+                    value.mul_(4 * gain if gain > 1 and ("q_proj" in name or "k_proj" in name) else gain)
             sam.prompt_encoder.pe_layer.positional_encoding_gaussian_matrix *= 0.3
             for mlp in sam.mask_decoder.output_hypernetworks_mlps:
                 mlp.layers[2].weight *= 400
@@ -59,3 +69,14 @@ def tiny_sam(seed: int = 0, gain: float = 1.0) -> Sam:
 def write_sam(path: Path, seed: int = 0, gain: float = 1.0) -> None:
     """Writes a file as Meta publishes them."""
     torch.save(tiny_sam(seed, gain).state_dict(), path)
+
+
+def write_clip(folder: Path) -> None:
+    """Makes the architecture known to open_clip and writes tiny.pt and tiny.safetensors of the same 1.7 M weights."""
+    (folder / f"{CLIP}.json").write_text(json.dumps(_CLIP_CONFIG))
+    open_clip.add_model_config(folder / f"{CLIP}.json")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        state = open_clip.create_model(CLIP).state_dict()
+    torch.save(state, folder / "tiny.pt")
+    save_file({key: value.contiguous() for key, value in state.items()}, folder / "tiny.safetensors")
