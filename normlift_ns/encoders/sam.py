@@ -230,7 +230,8 @@ def crop_boxes(height: int, width: int, overlap: float) -> list[Box]:
 
 def stability(logits: Float[Tensor, "n h w"], offset: float) -> Float[Tensor, " n"]:
     """IoU of the masks at two thresholds of the logits, 0 plus and minus the offset; NaN where both are empty."""
-    return (logits > offset).sum(dim=(1, 2)) / (logits > -offset).sum(dim=(1, 2))
+    inner, outer = ((logits > bound).flatten(1).view(torch.uint8) for bound in (offset, -offset))
+    return inner.sum(dim=1, dtype=torch.int32) / outer.sum(dim=1, dtype=torch.int32)
 
 
 def cut_off(boxes: Int64[Tensor, "n 4"], crop: Box, size: tuple[int, int], edge: int) -> Bool[Tensor, " n"]:
