@@ -51,7 +51,9 @@ def masked_crops(
     for y, row_weight, row_inside in rows:
         for x, column_weight, column_inside in columns:
             at = y[:, :, None], x[:, None, :]
-            mine = (labels[:, at[0], at[1]] == regions[:, None, None]).any(dim=0)
+            mine = torch.zeros(len(regions), *size, dtype=torch.bool, device=image.device)
+            for layer in labels:
+                mine |= layer[at] == regions[:, None, None]
             pixels = torch.where(mine[:, :, :, None], image[at].float(), outside)
             weight = (row_weight * row_inside)[:, :, None] * (column_weight * column_inside)[:, None, :]
             crops += weight[:, :, :, None] * pixels

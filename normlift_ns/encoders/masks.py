@@ -69,14 +69,15 @@ def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
 
     The depth is the largest number of masks that share a pixel, at least 1.
     """
-    count = len(masks)
     flat = masks.flatten(1)
-    sharing = flat.sum(dim=0)
-    depth = max(1, int(sharing.max()))
+    depth = max(1, int(flat.sum(dim=0).max()))
     labels = torch.full((depth, flat.shape[1]), -1, dtype=torch.int32, device=masks.device)
-    pixel, upward = flat.flip(0).T.nonzero(as_tuple=True)  # pixel by pixel, in each the last mask first
-    above = torch.arange(len(pixel), device=masks.device) - (sharing.cumsum(0) - sharing)[pixel]
-    labels[above, pixel] = (count - 1 - upward).int()
+    for columns in _column_chunks(flat):
+        part = flat[:, columns].flip(0)
+        pixel, upward = part.T.nonzero(as_tuple=True)  # pixel by pixel, in each the last mask first
+        sharing = part.sum(dim=0)
+        above = torch.arange(len(pixel), device=masks.device) - (sharing.cumsum(0) - sharing)[pixel]
+        labels[above, columns.start + pixel] = (len(masks) - 1 - upward).int()
     return labels.reshape(depth, *masks.shape[1:])
 
 
@@ -116,15 +117,15 @@ def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     """Pixels that masks share, counted exactly: float32 sums of ones are exact below 2^24 pixels."""
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
-    for part in _column_chunks(flat):
+    for columns in _column_chunks(flat):
+        part = flat[:, columns].float()
         both += part @ part.T
     return both
 
 
-def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[Float[Tensor, "m c"]]:
-    step = max(1, _CHUNK // max(1, len(flat)))
-    for start in range(0, flat.shape[1], min(step, 2**24)):
-        yield flat[:, start : start + step].float()
+def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
+    step = min(2**24, max(1, _CHUNK // max(1, len(flat))))
+    return (slice(start, start + step) for start in range(0, flat.shape[1], step))
 
 
 def _around(box: list[int], size: torch.Size) -> tuple[slice, slice]:

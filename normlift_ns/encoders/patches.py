@@ -87,7 +87,7 @@ class PatchFeatures:
             MemoryError: the memory of the device does not hold the image.
         """
         check_image(image, name)
-        rows, columns = patch_grid(*image.shape[:2], self.count)
+        rows, columns = patch_grid(image.shape[0], image.shape[1], self.count)
         return next(self._images(lambda batch: self._tokens(batch[0], rows, columns), image[None]))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:

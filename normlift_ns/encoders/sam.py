@@ -138,7 +138,8 @@ class SamMasks:
         rules = self.rules
         size = image.shape[0], image.shape[1]
         crops = crop_boxes(*size, rules.crop_overlap)
-        embeddings = self._network.embed([image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops])
+        cuts = [image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
+        embeddings = self.network.embed(self.network.pixels(cuts))
         parts: list[_Candidates] = []
         lists: dict[Level, list[Tensor]] = {level: [] for level in levels}
         for i, embedding in enumerate(embeddings):
@@ -167,7 +168,7 @@ class SamMasks:
     def _candidates(self, embedding: Tensor, crop: Box, number: int, size: tuple[int, int]) -> _Candidates:
         """The masks of one crop that are good enough and do not end where it ends."""
         x0, y0, x1, y1 = crop
-        network, rules, within = self._network, self.rules, (y1 - y0, x1 - x0)
+        network, rules, within = self.network, self.rules, (y1 - y0, x1 - x0)
         points = point_grid(rules.points_per_side) * torch.tensor([x1 - x0, y1 - y0])
         logits, channel, predicted = [], [], []
         for masks, ious in network.prompt(embedding, points, within):
@@ -194,9 +195,9 @@ class SamMasks:
         for i, (x0, y0, x1, y1) in enumerate(crops):
 
             def paint(index: Tensor, x0: int = x0, y0: int = y0, x1: int = x1, y1: int = y1) -> None:
-                masks[index, y0:y1, x0:x1] = self._network.enlarge(found.logits[index], (y1 - y0, x1 - x0)) > 0
+                masks[index, y0:y1, x0:x1] = self.network.enlarge(found.logits[index], (y1 - y0, x1 - x0)) > 0
 
-            for _ in self._network.masks(paint, (found.crop == i).nonzero()[:, 0]):
+            for _ in self.network.masks(paint, (found.crop == i).nonzero()[:, 0]):
                 pass
         return masks
 
@@ -205,7 +206,8 @@ class SamMasks:
         return sam_identity(self.checkpoint)
 
     @cached_property
-    def _network(self) -> SamNetwork:
+    def network(self) -> SamNetwork:
+        """The network with its weights, loaded at the first use; raises as `masks`."""
         return SamNetwork.load(self.checkpoint, self.device)
 
 

@@ -38,9 +38,12 @@ class SamNetwork:
         """The network of a checkpoint; raises as `load_sam`."""
         return cls(load_sam(checkpoint), device)
 
-    def embed(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> list[Float[Tensor, "1 c y x"]]:
-        """Embeddings of images, scaled so that their longer side fills the input, the rest of which is 0."""
-        pixels = torch.stack([self._pixels(image) for image in images])
+    def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
+        """Images as the network takes them: scaled so that the longer side fills the input, the rest of which is 0."""
+        return torch.stack([self._pixels(image) for image in images])
+
+    def embed(self, pixels: Float[Tensor, "n 3 side side"]) -> list[Float[Tensor, "1 c y x"]]:
+        """Embeddings of images."""
         batches = self._images(lambda batch: self._embed(batch.to(self._device)), pixels)
         return list(torch.cat(list(batches)).split(1))
 
@@ -54,8 +57,8 @@ class SamNetwork:
             size: height and width of the image.
         """
         height, width = self._scaled(size)
-        scaled = points * torch.tensor([width / size[1], height / size[0]])
-        return self._prompts(lambda batch: self._decode(embedding, batch), scaled)
+        scaled = (points * torch.tensor([width / size[1], height / size[0]])).float()
+        return self._prompts(lambda batch: self.decode(embedding, batch), scaled)
 
     def enlarge(self, logits: Float[Tensor, "n y x"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
         """Logits at the size of the image, bilinear: first to the size of the input, then, without its empty rest, to
@@ -80,7 +83,10 @@ class SamNetwork:
             return self._model.get_image_embeddings(pixels).float()
 
     @torch.no_grad()
-    def _decode(self, embedding: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    def decode(
+        self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]
+    ) -> tuple[Float[Tensor, "b 3 y x"], Float[Tensor, "b 3"]]:
+        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input."""
         points = points.to(self._device)[None, :, None]
         found = self._model(image_embeddings=embedding, input_points=points, multimask_output=True)
         return found.pred_masks[0], found.iou_scores[0]

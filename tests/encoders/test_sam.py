@@ -47,7 +47,7 @@ def test_the_network_is_that_of_meta(weights, size):
     image, predictor = noise(*size), SamPredictor(tiny_sam(seed=1))
     predictor.set_image(image.numpy())
     network = SamNetwork.load(str(weights / "sam_tiny.pth"), "cpu")
-    (embedding,) = network.embed([image])
+    (embedding,) = network.embed(network.pixels([image]))
     torch.testing.assert_close(embedding, predictor.features, rtol=0, atol=1e-5)
     points = point_grid(5) * torch.tensor([size[1], size[0]])
     logits, ious = map(torch.cat, zip(*network.prompt(embedding, points, size)))
@@ -86,7 +86,7 @@ def blobs(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("size", [(160, 120), (100, 180)])
 def test_the_masks_are_those_of_metas_generator(weights, monkeypatch, size):
     """Same masks in the same order, level by level, for the same answers of the network; then LangSplat's rules."""
-    monkeypatch.setattr(SamNetwork, "_decode", lambda self, embedding, points: blobs(points))
+    monkeypatch.setattr(SamNetwork, "decode", lambda self, embedding, points: blobs(points))
     rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, edge=20, region_area=15)
     image = noise(*size)
     kept = SamMasks(str(weights / "tiny"), rules=replace(rules, suppression=EVERYTHING)).masks(image)
@@ -122,7 +122,7 @@ def test_the_masks_are_those_of_metas_generator(weights, monkeypatch, size):
 
 
 def test_label_maps_hold_all_levels_with_overlaps_beneath(weights, monkeypatch):
-    monkeypatch.setattr(SamNetwork, "_decode", lambda self, embedding, points: blobs(points))
+    monkeypatch.setattr(SamNetwork, "decode", lambda self, embedding, points: blobs(points))
     sam = SamMasks(str(weights / "tiny"), rules=MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6))
     image = noise(130, 170)
     labels, masks = sam.labels(image, "a.jpg"), sam.masks(image)
