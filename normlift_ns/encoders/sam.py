@@ -141,27 +141,20 @@ class SamMasks:
         cuts = [image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
         embeddings = self.network.embed(self.network.pixels(cuts))
         parts: list[_Candidates] = []
-        lists: dict[Level, list[Tensor]] = {level: [] for level in levels}
         for i, embedding in enumerate(embeddings):
             found = self._candidates(embedding, crops[i], i, size)
-            kept = {level: found.of(level) for level in levels}
-            kept = {level: _distinct(index, found.boxes, found.predicted_iou, rules) for level, index in kept.items()}
-            chosen, kept = _compact(kept)
-            for level in levels:
-                lists[level].append(kept[level] + sum(len(part.crop) for part in parts))
-            parts.append(found.at(chosen))
+            stay = [_distinct(found.of(level), found.boxes, found.predicted_iou, rules) for level in levels]
+            parts.append(found.at(torch.cat(stay).unique()))
         found = _Candidates(*map(torch.cat, zip(*parts)))
-        area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=self.device)
-        smaller_first = 1 / area[found.crop]
-        kept = {level: _distinct(torch.cat(lists[level]), found.boxes, smaller_first, rules) for level in levels}
-        chosen, kept = _compact(kept)
+        kept: dict[Level, Tensor] = {level: _distinct_in_crops(found, level, crops, rules) for level in levels}
+        chosen = torch.cat(list(kept.values())).unique()
         found = found.at(chosen)
         masks = self._whole(found, crops, size)
         masks, changed = clean_masks(masks, boxes_of(masks), rules.region_area)
         boxes, score = boxes_of(masks), found.stability * found.predicted_iou
         result: dict[Level, Tensor] = {}
         for level, index in kept.items():
-            last = _distinct(index, boxes, (~changed).float(), rules)
+            last = _distinct(torch.searchsorted(chosen, index), boxes, (~changed).float(), rules)
             result[level] = masks[last[mask_nms(masks[last], score[last], rules.suppression)]]
         return result
 
@@ -256,7 +249,11 @@ def _distinct(index: Tensor, boxes: Tensor, scores: Tensor, rules: MaskRules) ->
     return index[nms(boxes[index].float(), scores[index], rules.box_iou)]
 
 
-def _compact(lists: dict[Level, Tensor]) -> tuple[Tensor, dict[Level, Tensor]]:
-    """What any list holds, ascending, and the lists as positions in that."""
-    chosen = torch.cat(list(lists.values())).unique()
-    return chosen, {level: torch.searchsorted(chosen, index) for level, index in lists.items()}
+def _distinct_in_crops(found: _Candidates, level: Level, crops: Sequence[Box], rules: MaskRules) -> Tensor:
+    """Suppression within each crop, better predicted IoU first, then across crops, smaller ones first."""
+    index = found.of(level)
+    each = [
+        _distinct(index[found.crop[index] == i], found.boxes, found.predicted_iou, rules) for i in range(len(crops))
+    ]
+    area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=index.device)
+    return _distinct(torch.cat(each), found.boxes, 1 / area[found.crop], rules)

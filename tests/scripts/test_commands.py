@@ -14,6 +14,9 @@ import torch
 from PIL import Image
 
 from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.encoders import RegionFeatures, write_langsplat
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.regions import Grid
 from normlift_ns.encoders.sam import MaskRules, SamMasks
 from normlift_ns.plugin import lifting
 from normlift_ns.plugin.adapters import load_run
@@ -311,3 +314,62 @@ def test_selection_follows_threshold_and_reliability(lifted):
     lead = ask(field, encoder, ["red"], negatives=["orange", "brown"], form="margin")
     assert lead.threshold == 0.02
     assert (lead.relevancy[lead.selected] > 0.02).all()
+
+
+def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, tmp_path, monkeypatch, capsys):
+    """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
+    output = ("--load-config", trained, "--k", "12", "--output-dir", tmp_path / "out")
+    exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
+    assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
+    assert len(list((tmp_path / "features").iterdir())) == 2 * 12
+    texts = ("red", "sky blue")
+    np.savez(tmp_path / "texts.npz", **dict(zip(texts, ColourEncoder().text(texts).numpy())))
+
+    monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)
+    importing = ("--features", "langsplat", "--features-dir", tmp_path / "features")
+    vectors = ("--text-vectors", tmp_path / "texts.npz")
+    flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    ours, theirs = (tmp_path / "out" / "room" / "normlift" / t / "config.yml" for t in ("ours", "theirs"))
+    first, second = (load_field(load_run(config)) for config in (ours, theirs))
+    for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
+        assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
+    assert torch.equal(first.source, second.source)
+    assert torch.equal(first.directions(), second.directions())
+    assert second.manifest["features"]["level"] == "l"
+    assert second.manifest["encoder"]["text_vectors"] == str(tmp_path / "texts.npz")
+
+    asking = ("--load-config", theirs, "--text", "red", "--json", tmp_path / "a.json")
+    (tmp_path / "texts.npz").rename(tmp_path / "moved.npz")
+    capsys.readouterr()
+    assert run_entry(monkeypatch, query.entrypoint, *asking) == 1
+    assert "say where it is with --text-vectors" in " ".join(capsys.readouterr().out.split())
+    assert run_entry(monkeypatch, query.entrypoint, *asking, "--text-vectors", tmp_path / "moved.npz") == 0
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["negatives"] == []  # the file has no vectors of LERF's words
+    assert document["queries"][0]["peak"] > 0.9
+
+    np.savez(tmp_path / "short.npz", red=np.ones(5))
+    flags = (*output, *importing, "--text-vectors", tmp_path / "short.npz", "--queries", "red", "--timestamp", "t")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
+    assert "the vectors of --queries have 5 numbers, the features 343" in " ".join(capsys.readouterr().out.split())
+
+
+def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monkeypatch, capsys):
+    source = RegionFeatures(Grid(9), ColourEncoder())
+    for view in load_run(trained).train:
+        write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
+    (tmp_path / "features" / "0003_f.npy").unlink()
+    np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
+    flags = (
+        *("--load-config", trained, "--features", "langsplat", "--features-dir", tmp_path / "features"),
+        *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t"),
+    )
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
+    assert "1 of 12 images have no features" in " ".join(capsys.readouterr().out.split())
+    with pytest.warns(UserWarning, match=r"1 of 12 images have no features in .*: images/0003\.png; they are left out"):
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
+    assert "1 images without features" in capsys.readouterr().out
+    field = load_field(load_run(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml"))
+    assert field.manifest["statistics"]["views"] == 11
+    assert int(field.scalars.view_count.max()) <= 11
