@@ -71,12 +71,12 @@ def write_sam(path: Path, seed: int = 0, gain: float = 1.0) -> None:
     torch.save(tiny_sam(seed, gain).state_dict(), path)
 
 
-def write_clip(folder: Path) -> None:
+def write_clip(folder: Path, name: str = CLIP, dimension: int = 24) -> None:
     """Makes the architecture known to open_clip and writes tiny.pt and tiny.safetensors of the same 1.7 M weights."""
-    (folder / f"{CLIP}.json").write_text(json.dumps(_CLIP_CONFIG))
-    open_clip.add_model_config(folder / f"{CLIP}.json")
+    (folder / f"{name}.json").write_text(json.dumps({**_CLIP_CONFIG, "embed_dim": dimension}))
+    open_clip.add_model_config(folder / f"{name}.json")
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        state = open_clip.create_model(CLIP).state_dict()
+        state = open_clip.create_model(name).state_dict()
     torch.save(state, folder / "tiny.pt")
     save_file({key: value.contiguous() for key, value in state.items()}, folder / "tiny.safetensors")
