@@ -63,7 +63,7 @@ def main(quick: bool, output: Path) -> None:
     with stopwatch() as neighbor_watch:
         neighbors = nearest_neighbors(scene.means, config.k)
     with stopwatch() as refine_watch:
-        source = refine(scene.means, directions, lifted.reliability, config, neighbors=neighbors)
+        source = refine(scene.means, lifted.directions, lifted.reliability, config, neighbors=neighbors)
 
     pairs = rasterize_evidence(scene, cameras, labels, weight_power=0).weight.double().sum()
     exact_evidence = rasterize_evidence(scene, cameras, labels, dtype=torch.float64)

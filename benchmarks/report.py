@@ -9,9 +9,10 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -19,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
-PACKAGES = ("torch", "numpy", "scipy", "numba", "gsplat", "open_clip_torch", "transformers")
+PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat", "transformers")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Report:
     def write(self, folder: Path = RESULTS) -> Path:
         document = {
             "hardware": hardware(),
-            "versions": {"python": platform.python_version(), **installed()},
+            "versions": {"python": platform.python_version(), **{x: version(x) for x in PACKAGES if find_spec(x)}},
             "command": " ".join(["python -m", f"benchmarks.{self.name}", *(a for a in sys.argv[1:] if a == "--quick")]),
             "metrics": [asdict(metric) for metric in self.metrics],
         }
@@ -56,15 +57,6 @@ class Report:
             table.add_row(m.key, f"{m.value:.4g}", m.unit, "" if m.error is None else f"{m.error:.2e}")
         Console(width=120).print(table)
         return path
-
-
-def installed() -> dict[str, str]:
-    """Versions of those packages that are there."""
-    found = {}
-    for name in PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
 
 
 def hardware() -> str:

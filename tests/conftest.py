@@ -1,9 +1,14 @@
 """Fixtures for all tests."""
 
+import os
 from collections.abc import Iterator
 
 import jaxtyping
 import pytest
+import torch
+
+if not torch.cuda.is_available():  # Triton kernels run in its interpreter; read when a kernel is defined
+    os.environ["TRITON_INTERPRET"] = "1"
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Float64, Int, Int32, Int64
+from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -25,14 +25,15 @@ UNLABELED, MASKED = -1, -2
 """Labels of pixels without a region, and of pixels that are no observation at all."""
 
 
-class ViewEvidence(NamedTuple):
-    """Entries of one view, distinct and sorted by (gaussian, region)."""
+class Entries(NamedTuple):
+    """What a rasterizer finds in one or a few views: distinct places, sorted by (gaussian, column)."""
 
     gaussian: Int[Tensor, " nnz"]
-    region: Int[Tensor, " nnz"]
-    """View-local region id, -1 for unlabelled pixels."""
+    column: Int[Tensor, " nnz"]
+    """View by view, a column for the unlabelled pixels and then one per region."""
     weight: Float[Tensor, " nnz"]
-    num_regions: int
+    num_regions: tuple[int, ...]
+    """Of each view."""
 
 
 @dataclass(frozen=True)
@@ -107,33 +108,26 @@ class Evidence:
         return SparseRows(self.offsets, self.region, self.weight)
 
     @staticmethod
-    def from_views(
-        views: Sequence[ViewEvidence], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
+    def from_entries(
+        parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
         """Joins the entries of all views, in their order."""
-        counts = torch.tensor([0, *(view.num_regions for view in views)])
-        first_column = counts.cumsum(0).tolist()
-        device = views[0].weight.device if views else torch.device("cpu")
-        labeled = [view.region >= 0 for view in views]
-
-        def join(keep: Sequence[Tensor], columns: Sequence[Tensor]) -> SparseRows:
-            if not views:
-                empty = torch.zeros(0)
-                return SparseRows(torch.zeros(num_gaussians + 1, dtype=torch.int64), empty.int(), empty)
-            gaussian = torch.cat([view.gaussian[k].int() for view, k in zip(views, keep)])
-            weight = torch.cat([view.weight[k] for view, k in zip(views, keep)])
-            return SparseRows.from_coo(gaussian, torch.cat(list(columns)), weight, num_gaussians)
-
-        rows = join(labeled, [view.region[k].int() + first for view, k, first in zip(views, labeled, first_column)])
-        blank = [~k for k in labeled]
-        unlabeled = join(
-            blank,
-            [torch.full_like(view.gaussian[k], v, dtype=torch.int32) for v, (view, k) in enumerate(zip(views, blank))],
-        )
-        region_view = torch.repeat_interleave(torch.arange(len(views)), counts[1:]).int().to(device)
+        device = parts[0].weight.device if parts else torch.device("cpu")
+        counts = [count for part in parts for count in part.num_regions]
+        labeled, blank = [], []
+        first, view = 0, 0
+        for part in parts:
+            is_region, new = _column_table(part.num_regions, first, view)
+            is_region, new = is_region.to(device)[part.column], new.to(device)[part.column]
+            for found, keep in ((labeled, is_region), (blank, ~is_region)):
+                found.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
+            first, view = first + sum(part.num_regions), view + len(part.num_regions)
+        rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
+        region_view = torch.tensor([v for v, count in enumerate(counts) for _ in range(count)], dtype=torch.int32)
         return Evidence(
-            rows.offsets, rows.column, rows.weight, region_view, unlabeled, len(views), weight_power, num_excluded
-        )
+            rows.offsets, rows.column, rows.weight, region_view.to(device), unlabeled, view, weight_power,
+            num_excluded,
+        )  # fmt: skip
 
     @cached_property
     def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
@@ -319,3 +313,15 @@ class Evidence:
         return Evidence(
             **tensors, unlabeled=unlabeled, num_views=num_views, weight_power=weight_power, num_excluded=num_excluded
         )
+
+
+def _column_table(
+    num_regions: Sequence[int], first_region: int, first_view: int
+) -> tuple[Bool[Tensor, " columns"], Int32[Tensor, " columns"]]:
+    """Of every column of `Entries`: whether it is a region, and the number of that region, or else of the view."""
+    start = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
+    is_region = torch.ones(int(start[-1]), dtype=torch.bool)
+    is_region[start[:-1]] = False
+    new = first_region + is_region.cumsum(0) - 1
+    new[~is_region] = first_view + torch.arange(len(num_regions))
+    return is_region, new.int()

@@ -15,14 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.sparse import SparseRows, segment_sum
+from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, SparseRows, segment_sum
 
 Unlabeled = Literal["ignore", "dilute"]
 
@@ -51,16 +52,59 @@ class Lifted:
     features: Float[Tensor, "s d"]
     """The feature table, normalised, in the precision of the lift."""
 
-    def directions(self, gaussians: Int[Tensor, " m"] | None = None) -> Float[Tensor, "m d"]:
-        """u_j of all or some Gaussians, unit rows, 0 without evidence. Any subset gives the same rows as the whole."""
-        rows = self.evidence.rows if gaussians is None else self.evidence.rows.select_rows(gaussians)
-        norm = self.norm if gaussians is None else self.norm[gaussians]
-        blocks = (block for _, block in _directions(rows, norm, self.features))
-        return torch.cat([self.features.new_zeros(0, self.features.shape[1]), *blocks])
+    def directions(
+        self, gaussians: Int[Tensor, " m"] | None = None, *, dtype: torch.dtype | None = None
+    ) -> Float[Tensor, "m d"]:
+        """u_j of all or some Gaussians, unit rows, 0 without evidence. Any subset gives the same rows as the whole.
+
+        Args:
+            dtype: of the result; half precision needs half the memory, and no more than it on the way.
+        """
+        dtype = dtype or self.features.dtype
+        n, device = self.evidence.num_gaussians, self.features.device
+        gaussians = torch.arange(n, device=device) if gaussians is None else gaussians
+        found = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
+        first = 0
+        for rows in gaussians.split(self._step):
+            found[first : first + len(rows)] = self._directions(rows, dtype)
+            first += len(rows)
+        return found
 
     def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
         """u_j in blocks of consecutive Gaussians, (first Gaussian, block), with bounded memory."""
-        return _directions(self.evidence.rows, self.norm, self.features)
+        n, device = self.evidence.num_gaussians, self.features.device
+        for first in range(0, n, self._step):
+            rows = torch.arange(first, min(n, first + self._step), device=device)
+            yield first, self._directions(rows, self.features.dtype)
+
+    @property
+    def _step(self) -> int:
+        return max(1, CHUNK_ELEMENTS // max(1, self.features.shape[1]))
+
+    def _directions(self, gaussians: Tensor, dtype: torch.dtype) -> Tensor:
+        rows, table = self.evidence.rows, self.features
+        if _has_kernel(table):
+            from normlift_ns.kernels.sums import unit_sums  # noqa: PLC0415 (needs triton)
+
+            arrays = (rows.offsets, rows.column, rows.weight, table, self.norm)
+            return unit_sums(gaussians.long(), *arrays, dtype, CANCELLED)
+        sums = rows.select_rows(gaussians).sums_of_unit_rows(table)
+        length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
+        return torch.where((self.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
+
+
+class _Sums(NamedTuple):
+    """Per Gaussian, in float64 but for the last."""
+
+    total: Tensor
+    """||sum_v S_jv||"""
+    by_view: Tensor
+    """sum_v ||S_jv||"""
+    weight: Tensor
+    """W_j"""
+    weight_squared: Tensor
+    """sum_v W_jv ** 2"""
+    view_count: Tensor
 
 
 def lift(
@@ -84,14 +128,9 @@ def lift(
     if not beta >= 0:
         raise ValueError(f"beta must be >= 0, got {beta}")
     table = _unit_table(evidence, features)
-    view_weights = evidence.view_weights()
+    total, by_view, weight, weight_squared, view_count = _sums(evidence, table)
     if unlabeled == "dilute":
-        view_weights = SparseRows.add(view_weights, evidence.unlabeled)
-    weight = view_weights.row_sums()
-    weight_squared = segment_sum(view_weights.weight.double() ** 2, view_weights.offsets)
-
-    total = _row_norms(evidence.rows, table)  # ||sum_v S_jv||
-    by_view = _sum_of_view_norms(evidence, table)  # sum_v ||S_jv||
+        weight, weight_squared, view_count = _weights(SparseRows.add(evidence.view_weights(), evidence.unlabeled))
 
     found = (weight > 0) & (total > (1e-12 if table.dtype == torch.float64 else 1e-6) * weight)
     norm = _ratio(total, weight, found).clamp(max=1)
@@ -104,7 +143,6 @@ def lift(
         "reliability": _ratio(norm * n_eff, n_eff + beta, found),
         "weight": weight,
     }
-    view_count = segment_sum((view_weights.weight > 0).float(), view_weights.offsets)
     return Lifted(
         **{name: value.to(table.dtype) for name, value in values.items()},
         view_count=view_count.int(),
@@ -132,6 +170,22 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
 
+def _sums(evidence: Evidence, table: Tensor) -> _Sums:
+    if _has_kernel(table):
+        from normlift_ns.kernels.sums import row_norms  # noqa: PLC0415 (needs triton)
+
+        rows = evidence.rows
+        return _Sums(*row_norms(rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLED))
+    total, by_view = _row_norms(evidence.rows, table), _sum_of_view_norms(evidence, table)
+    return _Sums(total, by_view, *_weights(evidence.view_weights()))
+
+
+def _weights(view_weights: SparseRows) -> tuple[Tensor, Tensor, Tensor]:
+    """W_j, sum_v W_jv ** 2 and the number of views, of W_jv."""
+    squared = segment_sum(view_weights.weight.double() ** 2, view_weights.offsets)
+    return view_weights.row_sums(), squared, segment_sum((view_weights.weight > 0).float(), view_weights.offsets)
+
+
 def _row_norms(rows: SparseRows, table: Tensor) -> Tensor:
     norms = [
         torch.linalg.vector_norm(block.sums_of_unit_rows(table), dim=1).double()
@@ -151,11 +205,8 @@ def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
     return segment_sum(norms, torch.searchsorted(groups, evidence.offsets))
 
 
-def _directions(rows: SparseRows, norm: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
-    for first, block in rows.chunks(table.shape[1]):
-        sums = block.sums_of_unit_rows(table)
-        length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
-        yield first, torch.where((norm[first : first + len(block)] > 0)[:, None], sums / length, 0.0)
+def _has_kernel(table: Tensor) -> bool:
+    return kernels_apply(table) and table.dtype == torch.float32
 
 
 def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:

@@ -6,27 +6,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float64, Int32
 from scipy.spatial import KDTree
 from torch import Tensor
+
+from normlift_ns.core.gpu import kernels_apply
+
+_MOST_UNSURE = 1000
+"""Gaussians whose neighbours a GPU finds by looking at all others; with more of them the CPU's tree is faster."""
 
 
 class Neighbors(NamedTuple):
     """The K nearest other Gaussians of each Gaussian, nearest first, equal distances by index."""
 
-    index: Int64[Tensor, "n k"]  # pyright: ignore[reportIncompatibleMethodOverride]
+    index: Int32[Tensor, "n k"]  # pyright: ignore[reportIncompatibleMethodOverride]
     """-1 where there are fewer than K others with finite means."""
-    distance: Float64[Tensor, "n k"]
-    """Euclidean, in the units of the means; inf where index is -1."""
+    distance: Float[Tensor, "n k"]
+    """Euclidean, in the units of the means; inf where index is -1. Computed in float64, stored in float32 on a GPU."""
     spacing: Float64[Tensor, " n"]
     """Distance to the nearest Gaussian that is not at the same place; inf if there is none."""
 
 
 def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
-    """The K nearest neighbours in 3D, N_K(i) of the paper, self excluded, exact: a k-d tree over the distinct places.
+    """The K nearest neighbours in 3D, N_K(i) of the paper, self excluded, exact.
 
-    Any number of Gaussians may share a place; a tree over all of them would need all pairs to answer ties in a fixed
-    order.
+    On the CPU by a k-d tree over the distinct places: any number of Gaussians may share one, while a tree over all of
+    them would need all pairs to answer ties in a fixed order. On a GPU by `kernels.nearest`, which certifies its
+    answer; where it cannot (more ties than it keeps candidates) all distances are looked at, or the CPU answers.
     A Gaussian whose mean is not finite has no neighbours and is nobody's neighbour.
 
     Raises:
@@ -34,10 +40,40 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     """
     if k < 1:
         raise ValueError(f"k must be at least 1, got {k}")
+    found = _on_gpu(means.detach(), k) if kernels_apply(means) else None
+    return _on_cpu(means, k) if found is None else found
+
+
+def _on_gpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors | None:
+    """None where the kernel does not apply, or cannot be sure."""
+    from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
+
+    finite = means.isfinite().all(dim=1).nonzero().squeeze(1)
+    if means.dtype != torch.float32 or k > nearest.MOST_NEIGHBORS or finite.numel() == 0:
+        return None
+    points = means if finite.numel() == len(means) else means[finite]
+    found = nearest.nearest(points, k)
+    unsure = (~found.certain).nonzero().squeeze(1)
+    if unsure.numel() > _MOST_UNSURE:
+        return None
+    if unsure.numel() > 0:
+        for array, exact in zip(found, nearest.nearest_of_rows(points, unsure, k)):
+            array[unsure] = exact
+    if finite.numel() == len(means):
+        return Neighbors(found.index, found.distance, found.spacing)
+    n = len(means)
+    index, distance = found.index.new_full((n, k), -1), found.distance.new_full((n, k), torch.inf)
+    spacing = found.spacing.new_full((n,), torch.inf)
+    index[finite] = torch.where(found.index < 0, -1, finite.int()[found.index.clamp(min=0)])
+    distance[finite], spacing[finite] = found.distance, found.spacing
+    return Neighbors(index, distance, spacing)
+
+
+def _on_cpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     n = means.shape[0]
     points = means.detach().cpu().double().numpy()
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    index, distance, spacing = np.full((n, k), -1), np.full((n, k), np.inf), np.full(n, np.inf)
+    index, distance, spacing = np.full((n, k), -1, dtype=np.int32), np.full((n, k), np.inf), np.full(n, np.inf)
     if finite.size > 1:
         places, place_of = np.unique(points[finite], axis=0, return_inverse=True)
         place_of = place_of.reshape(-1)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int, Int32
+from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 
 _CHUNK_ELEMENTS = 2**24
+_BLOCK = (2**14, 2**17)
+"""Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
+_MOST_NEIGHBORS = 63
+"""Of `kernels.vote`."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class RefineConfig:
 
 def refine(
     means: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n d"],
+    directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
     reliability: Float[Tensor, " n"],
     config: RefineConfig | None = None,
     *,
@@ -68,7 +74,8 @@ def refine(
     changes; see `unsupported`.
 
     Args:
-        directions: u, unit rows or 0; any floating-point type, read in float32 (float64 if given).
+        directions: u, unit rows or 0, of any floating-point type, read in float32 (float64 if given); or a function
+            that gives those of some Gaussians, `Lifted.directions`: then only a block of them is held at a time.
         reliability: R in 0..1.
         neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes.
     Raises:
@@ -76,32 +83,108 @@ def refine(
     """
     config = config or RefineConfig()
     n = means.shape[0]
-    if directions.ndim != 2 or directions.shape[0] != n or tuple(reliability.shape) != (n,):
+    given = directions if isinstance(directions, Tensor) else None
+    shape = (n, 0) if given is None else tuple(given.shape)
+    if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
         raise ValueError(
-            f"means, directions and reliability must have the same rows, got {n}, {tuple(directions.shape)}, "
-            f"{tuple(reliability.shape)}"
+            f"means, directions and reliability must have the same rows, got {n}, {shape}, {tuple(reliability.shape)}"
         )
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
         raise ValueError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
+    width = decay_width(neighbors, config)
+    source, row_of = (torch.arange(n, dtype=torch.int32, device=means.device) for _ in range(2))
+    # Where no neighbour is reliable, nobody can win.
+    order = spatial_order(means)
+    order = order[(_gather(reliability, neighbors.index) > 0).any(dim=1)[order]]
+
+    def vote(voters: Tensor) -> None:
+        if isinstance(directions, Tensor):
+            rows = directions
+        else:
+            group = torch.cat([voters, neighbors.index[voters].flatten().long()])
+            read = torch.zeros(n, dtype=torch.bool, device=means.device)
+            read[group[group >= 0]] = True
+            gaussians = read.nonzero().squeeze(1)
+            rows = directions(gaussians)
+            row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=means.device)
+        if kernels_apply(means) and rows.dtype != torch.float64 and config.k <= _MOST_NEIGHBORS:
+            _vote_on_gpu(voters, neighbors, rows, row_of, reliability, source, config, float(width))
+        else:
+            _vote(voters, neighbors, rows, row_of, reliability, source, config, width)
+
+    for voters in order.split(_BLOCK[means.device.type == "cuda"] if given is None else max(1, n)):
+        in_parts(vote, voters, "refine on the CPU")
+    return source
+
+
+def _vote(
+    voters: Tensor,
+    neighbors: Neighbors,
+    directions: Tensor,
+    row_of: Tensor,
+    reliability: Tensor,
+    source: Tensor,
+    config: RefineConfig,
+    width: Tensor,
+) -> None:
+    """Writes source[voters]; row_of[j] is the row of u_j."""
     dtype = torch.promote_types(directions.dtype, torch.float32)
     reliability = reliability.to(dtype)
-    source = torch.arange(n, dtype=torch.int32, device=means.device)
-    # Where no neighbour is reliable, nobody can win.
-    active = (_gather(reliability, neighbors.index) > 0).any(dim=1).nonzero().squeeze(1)
     step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
-    width = decay_width(neighbors, config)
-    for i in active.split(step):
+    for i in voters.split(step):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
         r = _gather(reliability, group)
         d = spatial_decay(neighbors, width, i).to(dtype)
-        u = directions[group.clamp(min=0)].to(dtype)
+        u = directions[row_of[group.clamp(min=0)]].to(dtype)
         g = torch.sigmoid((u @ u.transpose(1, 2) - config.tau) / config.gamma)
         score = r * (g @ (r * d)[:, :, None]).squeeze(2)
         best, choice = score[:, 1:].max(dim=1)
         wins = best > score[:, 0] + config.delta
         source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
-    return source
+
+
+def _vote_on_gpu(
+    voters: Tensor,
+    neighbors: Neighbors,
+    directions: Tensor,
+    row_of: Tensor,
+    reliability: Tensor,
+    source: Tensor,
+    config: RefineConfig,
+    width: float,
+) -> None:
+    from normlift_ns.kernels.vote import vote  # noqa: PLC0415 (needs triton)
+
+    vote(
+        voters,
+        neighbors.index,
+        neighbors.distance,
+        directions.contiguous(),
+        row_of,
+        reliability.float(),
+        source,
+        tau=config.tau,
+        gamma=config.gamma,
+        width=width,
+        delta=config.delta,
+    )
+
+
+def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+    """All Gaussians along a Morton curve of 1,024 steps a side: neighbours in space come near each other.
+
+    A scene's far outliers would leave the rest in one cell, so that sides end at the 1st and 99th percentile.
+    """
+    sample = means[:: max(1, len(means) // 100_000)]
+    sample = sample[sample.isfinite().all(dim=1)].double()
+    if len(sample) == 0:
+        return torch.arange(len(means), device=means.device)
+    low, high = (sample.quantile(q, dim=0) for q in (0.01, 0.99))
+    cell = ((means - low) / (high - low).clamp(min=1e-12) * 1023).nan_to_num(0).clamp(0, 1023).long()
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        cell = (cell | (cell << shift)) & mask
+    return (cell[:, 0] | cell[:, 1] << 1 | cell[:, 2] << 2).argsort(stable=True)
 
 
 def decay_width(neighbors: Neighbors, config: RefineConfig) -> Float64[Tensor, ""]:

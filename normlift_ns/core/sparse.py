@@ -10,9 +10,13 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from normlift_ns.core.gpu import kernels_apply
+
 CANCELLED = 1e-3
 """Below this share of its weight a vector sum is recomputed in float64: its float32 digits have cancelled."""
-_CHUNK_ELEMENTS = 2**24
+CHUNK_ELEMENTS = 2**24
+"""Of a dense array that is made block by block."""
+_FEW_COLUMNS = 32
 
 
 def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
@@ -25,6 +29,10 @@ def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float
     """
     if values.numel() == 0:
         return torch.zeros(offsets.numel() - 1, dtype=torch.float64, device=values.device)
+    if kernels_apply(values):
+        from normlift_ns.kernels import sums  # noqa: PLC0415 (needs triton)
+
+        return sums.segment_sum(values, offsets)
     return torch.segment_reduce(values.double(), "sum", offsets=offsets, initial=0.0)
 
 
@@ -45,6 +53,29 @@ class SparseRows:
         """Sorts entries given in any order; entries of the same place become one. See `sum_duplicates`."""
         row, column, weight = sum_duplicates(row, column, weight)
         return SparseRows(row_offsets(row, num_rows), column.int(), weight)
+
+    @staticmethod
+    def stack(parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device) -> SparseRows:
+        """Joins (row, column, weight) lists, each sorted by row, whose columns follow each other from list to list.
+
+        Nothing is sorted: every entry goes straight to its place, behind those of its row in earlier lists.
+        """
+        dtype = parts[0][2].dtype if parts else torch.float32
+        parts = [part for part in parts if part[0].numel() > 0]
+        offsets = torch.zeros(num_rows + 1, dtype=torch.int64, device=device)
+        for row, _, _ in parts:
+            offsets[1:] += torch.bincount(row, minlength=num_rows)
+        offsets = offsets.cumsum(0)
+        place, size = offsets[:-1].clone(), int(offsets[-1])
+        columns = torch.empty(size, dtype=torch.int32, device=device)
+        weights = torch.empty(size, dtype=dtype, device=device)
+        for row, column, weight in parts:
+            count = torch.bincount(row, minlength=num_rows)
+            behind = place - (count.cumsum(0) - count)  # what to add to the number of an entry in its list
+            target = torch.arange(row.numel(), device=device) + behind[row]
+            columns[target], weights[target] = column, weight
+            place += count
+        return SparseRows(offsets, columns, weights)
 
     @staticmethod
     def add(a: SparseRows, b: SparseRows) -> SparseRows:
@@ -89,14 +120,18 @@ class SparseRows:
     @staticmethod
     def append_columns(parts: Sequence[SparseRows], first_column: Sequence[int]) -> SparseRows:
         """Matrices of the same rows side by side; the columns of each start at its `first_column`."""
-        row = torch.cat([part.row_index() for part in parts])
-        column = torch.cat([part.column + first for part, first in zip(parts, first_column)])
-        return SparseRows.from_coo(row, column, torch.cat([part.weight for part in parts]), len(parts[0]))
+        entries = [(part.row_index(), part.column + first, part.weight) for part, first in zip(parts, first_column)]
+        return SparseRows.stack(entries, len(parts[0]), parts[0].weight.device)
 
     def matmul(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
         """Dense product with a table, in the table's precision; all rows at once."""
         if self.weight.numel() == 0:
             return table.new_zeros(len(self), table.shape[1])
+        if kernels_apply(table) and table.shape[1] <= _FEW_COLUMNS:
+            from normlift_ns.kernels.sums import product  # noqa: PLC0415 (needs triton)
+
+            columns = [product(self.offsets, self.column, self.weight, x.contiguous()) for x in table.T]
+            return torch.stack(columns, dim=1)
         # An embedding bag is exactly this product: gather rows, scale, add. It is threaded on CPU, deterministic on
         # GPU, and needs no MKL.
         return embedding_bag(
@@ -112,7 +147,7 @@ class SparseRows:
         """Consecutive blocks of rows, (first row, block), small enough that block rows x row_size stays near 2**24
         elements.
         """
-        step = max(1, _CHUNK_ELEMENTS // max(1, row_size))
+        step = max(1, CHUNK_ELEMENTS // max(1, row_size))
         for first in range(0, len(self), step):
             offsets = self.offsets[first : first + step + 1]
             low, high = int(offsets[0]), int(offsets[-1])
@@ -144,16 +179,29 @@ def sum_duplicates(
     """
     if row.numel() == 0:
         return row, column, weight
-    key = row.long() * (int(column.max()) + 1) + column
+    columns = int(column.max()) + 1
+    key, summed = sum_equal_keys(row.long() * columns + column, weight)
+    row_of = torch.div(key, columns, rounding_mode="floor")
+    return row_of.to(row.dtype), (key - row_of * columns).to(column.dtype), summed
+
+
+def sum_equal_keys(
+    key: Int[Tensor, " m"], weight: Float[Tensor, " m"]
+) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
+    """Distinct keys in ascending order, each with the sum of its weights, added up in float64 in the order given.
+
+    >>> sum_equal_keys(torch.tensor([7, 5, 7]), torch.tensor([1.0, 2.0, 4.0]))
+    (tensor([5, 7]), tensor([2., 5.]))
+    """
     key, order = key.sort(stable=True)
+    weight = weight[order]
     starts = torch.ones_like(key, dtype=torch.bool)
     starts[1:] = key[1:] != key[:-1]
-    if bool(starts.all()):
-        return row[order], column[order], weight[order]
     first = starts.nonzero().squeeze(1)
-    place = order[first]
-    summed = segment_sum(weight[order], torch.cat([first, first.new_tensor([key.numel()])]))
-    return row[place], column[place], summed.to(weight.dtype)
+    if first.numel() == key.numel():
+        return key, weight
+    summed = segment_sum(weight, torch.cat([first, first.new_tensor([key.numel()])]))
+    return key[first], summed.to(weight.dtype)
 
 
 def row_offsets(row: Int[Tensor, " nnz"], num_rows: int) -> Int64[Tensor, " rows_plus_1"]:

@@ -53,6 +53,8 @@ class LiftOptions:
     """Largest error that storing may add to any cosine."""
     form: Form | Literal["auto"] = "auto"
     """How directions are stored; auto: the smallest form within the tolerance."""
+    precision: Literal["standard", "double"] = "standard"
+    """standard: float32, added up in float64 where digits cancel. double: float64 throughout, slow on a GPU."""
     reuse_evidence: bool = True
     """Take 2D features and evidence of earlier lifts from the cache where they fit."""
 
@@ -75,7 +77,7 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Of each stage, in their order: features, evidence, reliability, lift, neighbors, vote, store."""
+    """Of each stage, in their order: features, evidence, lift, neighbors, vote, store."""
 
 
 def lift_run(
@@ -99,9 +101,11 @@ def lift_run(
         report: told of the progress.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option that does not fit; the message names it.
+        MemoryError: the GPU's memory does not hold the lift.
     """
     stages = _Stages(report)
     scene = run.scene.to(device)
+    dtype = torch.float64 if options.precision == "double" else torch.float32
     names = set(source.available(run.train.names))
     usable = [index for index, name in enumerate(run.train.names) if name in names]
     indices = [usable[i] for i in spread(len(usable), options.max_views)]
@@ -120,25 +124,23 @@ def lift_run(
             block = see_block(run, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
             tables.extend(block.features)
         with stages("evidence", len(indices)) as step:
-            power, reuse = options.weight_power, options.reuse_evidence
-            folder = cache / "evidence"
-            parts.append(block_evidence(run, scene, block, folder, weight_power=power, reuse=reuse, done=step))
-    with stages("reliability") as step:
-        evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+            power, reuse, folder = options.weight_power, options.reuse_evidence, cache / "evidence"
+            parts.append(
+                block_evidence(run, scene, block, folder, weight_power=power, dtype=dtype, reuse=reuse, done=step)
+            )
+    with stages("lift") as step:
+        evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device, dtype)
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
         step()
     left_out = len(run.train) - len(usable)
     statistics = {"views": len(indices), "left_out": left_out, "excluded": evidence.num_excluded, **_statistics(lifted)}
     copied = None
     if options.refine:
-        with stages("lift") as step:
-            directions = lifted.directions()
-            step()
         with stages("neighbors") as step:
             neighbors = nearest_neighbors(scene.means, options.vote.k)
             step()
         with stages("vote") as step:
-            copied = refine(scene.means, directions, lifted.reliability, options.vote, neighbors=neighbors)
+            copied = refine(scene.means, lifted.directions, lifted.reliability, options.vote, neighbors=neighbors)
             step()
         changed = copied != torch.arange(len(copied), device=copied.device)
         statistics["refined_share"] = float(changed.float().mean())
@@ -175,7 +177,12 @@ class _Stages:
 
         start = time.perf_counter()
         self._report(stage, self._done.get(stage, 0), total)
-        yield step
+        try:
+            yield step
+        except torch.OutOfMemoryError as error:
+            raise MemoryError(
+                f"the GPU's memory is full in stage {stage} ({error}); lift on the CPU: --device cpu"
+            ) from error
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start

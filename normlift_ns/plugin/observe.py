@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
 
 BLOCK = 16
 """Views per file of evidence: what an interrupted run may lose."""
-_KEY = "normlift_ns.block/2"
+_KEY = "normlift_ns.block/3"
 """Part of every key: to be raised when evidence changes for the same input."""
 
 
@@ -88,6 +88,7 @@ def block_evidence(
     folder: Path,
     *,
     weight_power: int,
+    dtype: torch.dtype,
     reuse: bool,
     done: Callable[[], None],
 ) -> Evidence:
@@ -97,7 +98,7 @@ def block_evidence(
     cameras and labels, whatever the regions and features were.
     """
     settings, counts = RasterSettings(), [regions.shape[1] for regions in block.regions]
-    facts = [_KEY, run.rasterize_mode, weight_power, asdict(settings), counts]
+    facts = [_KEY, run.rasterize_mode, weight_power, str(dtype), asdict(settings), counts]
     tensors = [scene.means, scene.quats, scene.scales, scene.opacities, *block.labels]
     tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
     path = folder / f"{_digest(facts, tensors)}.safetensors"
@@ -117,6 +118,7 @@ def block_evidence(
         rasterize_mode=run.rasterize_mode,
         weight_power=weight_power,
         settings=settings,
+        dtype=dtype,
         progress=lambda *_: done(),
     )
     folder.mkdir(parents=True, exist_ok=True)

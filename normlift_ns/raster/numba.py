@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from normlift_ns.core.evidence import UNLABELED, ViewEvidence
+from normlift_ns.core.evidence import UNLABELED, Entries
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.raster.projection import Projected, Tiles
 from normlift_ns.raster.settings import RasterSettings
@@ -30,7 +30,7 @@ def view_evidence(
     num_regions: int,
     weight_power: int,
     settings: RasterSettings,
-) -> ViewEvidence:
+) -> Entries:
     """The same as `reference.view_evidence`, for tensors on the CPU."""
     label_map = labels.int().numpy()
     offsets = tiles.offsets.numpy()
@@ -43,8 +43,8 @@ def view_evidence(
     )
     used = np.flatnonzero((slots[0] > 0) & (slots[2] >= UNLABELED))
     weight, member, region = (torch.from_numpy(x[used]) for x in slots)
-    gaussian, region, weight = sum_duplicates(projected.gaussian[member.long()], region + 1, weight)
-    return ViewEvidence(gaussian, region - 1, weight.to(projected.opacities.dtype), num_regions)
+    gaussian, column, weight = sum_duplicates(projected.gaussian[member.long()], region + 1, weight)
+    return Entries(gaussian, column, weight.to(projected.opacities.dtype), (num_regions,))
 
 
 def composite(

@@ -1,25 +1,33 @@
-"""`rasterize_evidence`: a loop over views. Backends differ only in how one view is summed."""
+"""`rasterize_evidence`: a loop over views. Backends differ only in how a few views of one size are summed."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from itertools import zip_longest
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from importlib import import_module
+from itertools import groupby, islice, zip_longest
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.evidence import MASKED, UNLABELED, Evidence, ViewEvidence
+from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gpu import has_triton, in_parts
 from normlift_ns.raster import reference
 from normlift_ns.raster.projection import assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
-Backend = Literal["auto", "torch", "numba"]
+Backend = Literal["auto", "torch", "numba", "gsplat", "triton"]
 RasterizeMode = Literal["classic", "antialiased"]
 Progress = Callable[[int, int | None], None]
+_IN_FLIGHT = 8
+"""Most views at once on a GPU."""
+_FLIGHT_ELEMENTS = 2**24
+"""Views in flight times Gaussians, about: each takes 60 bytes."""
+_ADVICE = "rasterize at a fraction of the resolution (ns-normlift --lift-downscale 2), or on the CPU (--device cpu)"
 
 
 def rasterize_evidence(
@@ -49,7 +57,9 @@ def rasterize_evidence(
             -2 = masked: the pixel is no observation at all, whatever `lift` does with unlabelled ones.
         num_regions: regions (columns, feature rows) per view; by default the largest id + 1. Needed where a table has
             rows that no pixel shows.
-        backend: "torch" (the reference, any device), "numba" (compiled, CPU), "auto" (by the scene's device).
+        backend: "torch" (the reference, any device and precision), "numba" (compiled, CPU), "triton" (fast, GPU,
+            float32), "gsplat" (stock gsplat, GPU, float32, weight_power 1), "auto" (the fastest for the scene's device
+            and the precision).
         rasterize_mode: as the scene was trained, splatfacto's `rasterize_mode`.
         weight_power: sums A_ij ** power. 1: the paper. 2: as SFS's code. 0: counts the pixels that a Gaussian
             contributes to.
@@ -66,25 +76,33 @@ def rasterize_evidence(
     if weight_power not in (0, 1, 2):
         raise ValueError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     settings = settings or RasterSettings()
-    view_evidence = _choose(backend, scene.means.device).view_evidence
+    views_evidence, in_flight = _choose_evidence(backend, scene, dtype or scene.means.dtype)
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
             f"{num_excluded} of {len(scene)} Gaussians have non-finite parameters and are not drawn", stacklevel=2
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
-    world = to_world(scene, dtype or scene.means.dtype)
-    views: list[ViewEvidence] = []
+    parts: list[Entries] = []
+    done = 0
     with torch.no_grad():
-        for index, (camera, label_map, count) in enumerate(_zip_views(cameras, labels, num_regions)):
-            regions = _check_labels(index, camera, label_map, count)
-            projected = project(world, camera, settings, rasterize_mode == "antialiased")
-            tiles = assign_tiles(projected, camera.width, camera.height, settings.tile_size)
-            there = label_map.to(scene.means.device)
-            views.append(view_evidence(projected, tiles, there, regions, weight_power, settings))
-            if progress is not None:
-                progress(index + 1, total)
-    return Evidence.from_views(views, len(scene), weight_power=weight_power, num_excluded=num_excluded)
+        for flight in _flights(_zip_views(cameras, labels, num_regions), in_flight):
+            checked = [
+                (camera, there, _check_labels(done + i, camera, there, count))
+                for i, (camera, there, count) in enumerate(flight)
+            ]
+
+            def sums(views: Sequence[tuple[Camera, Tensor, int]]) -> Entries:
+                seen, maps, counts = zip(*views)
+                there = [labels.to(scene.means.device, torch.int32) for labels in maps]
+                return views_evidence(seen, there, counts, rasterize_mode == "antialiased", weight_power, settings)
+
+            parts += in_parts(sums, checked, _ADVICE)
+            for _ in flight:
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+    return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
 def render(
@@ -125,8 +143,36 @@ def _check_mode(rasterize_mode: str) -> None:
         raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
 
 
+def _choose_evidence(backend: str, scene: GaussianScene, dtype: torch.dtype) -> tuple[Callable[..., Entries], int]:
+    """How some views of one size are summed, and how many at once."""
+    on_gpu = scene.means.device.type == "cuda"
+    if backend == "auto" and on_gpu and dtype == scene.means.dtype == torch.float32:
+        backend = "triton" if has_triton() else "gsplat"
+    if backend in ("gsplat", "triton"):
+        if dtype != torch.float32:
+            raise ValueError(f'backend "{backend}" computes in float32, not in {dtype}; use backend="torch"')
+        gpu = import_module(f"normlift_ns.raster.{backend}")  # kernels load where they are used
+        in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS // max(1, len(scene))))
+        return partial(gpu.views_evidence, scene), in_flight
+    module, world = _choose(backend, scene.means.device), to_world(scene, dtype)
+
+    def one_view(
+        cameras: Sequence[Camera],
+        labels: Sequence[Tensor],
+        num_regions: Sequence[int],
+        antialiased: bool,
+        weight_power: int,
+        settings: RasterSettings,
+    ) -> Entries:
+        projected = project(world, cameras[0], settings, antialiased)
+        tiles = assign_tiles(projected, cameras[0].width, cameras[0].height, settings.tile_size)
+        return module.view_evidence(projected, tiles, labels[0], num_regions[0], weight_power, settings)
+
+    return one_view, 1
+
+
 def _choose(backend: str, device: torch.device) -> Any:
-    """The module that sums one view: `view_evidence` and `composite`."""
+    """The module that draws one view in any precision: `view_evidence` and `composite`."""
     if backend == "auto":
         backend = "numba" if device.type == "cpu" else "torch"
     if backend == "torch":
@@ -136,10 +182,17 @@ def _choose(backend: str, device: torch.device) -> Any:
             raise ValueError(
                 f'backend "numba" needs a scene on the CPU, this one is on {device}; move it, or use backend="torch"'
             )
-        from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
+        return import_module("normlift_ns.raster.numba")  # importing numba takes a second
+    raise ValueError(f"unknown backend {backend!r}; it is one of {', '.join(get_args(Backend))}")
 
-        return numba
-    raise ValueError(f'backend must be "auto", "torch" or "numba", got {backend!r}')
+
+def _flights(
+    views: Iterator[tuple[Camera, Tensor, int | None]], most: int
+) -> Iterator[list[tuple[Camera, Tensor, int | None]]]:
+    """Consecutive views of one size, at most so many at once."""
+    for _, same_size in groupby(views, key=lambda view: (view[0].width, view[0].height)):
+        while flight := list(islice(same_size, most)):
+            yield flight
 
 
 def _zip_views(
@@ -170,7 +223,7 @@ def _check_labels(index: int, camera: Camera, labels: Tensor, count: int | None)
             f"labels of view {index} have shape {tuple(labels.shape)}, but its camera is {camera.height} x "
             f"{camera.width} (height x width)"
         )
-    low, high = int(labels.min()), int(labels.max())
+    low, high = torch.stack(labels.aminmax()).tolist()
     if low < MASKED:
         raise ValueError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
     if count is not None and high >= count:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from normlift_ns.core.evidence import UNLABELED, ViewEvidence
+from normlift_ns.core.evidence import UNLABELED, Entries
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.raster.projection import Projected, Tiles
 from normlift_ns.raster.settings import RasterSettings
@@ -39,7 +39,7 @@ def view_evidence(
     num_regions: int,
     weight_power: int,
     settings: RasterSettings,
-) -> ViewEvidence:
+) -> Entries:
     """Sums of A_ij ** weight_power by (Gaussian, region) of one view; region -1 collects the unlabelled pixels."""
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for member, (rows, columns), a in _tiles(projected, tiles, labels.shape[1], labels.shape[0], settings):
@@ -50,8 +50,8 @@ def view_evidence(
         found.append((projected.gaussian[member[k]], region[r], sums[r, k]))
     none = torch.zeros(0, dtype=torch.int64, device=labels.device)
     gaussian, region, weight = (torch.cat(parts) for parts in zip((none, none, none.double()), *found))
-    gaussian, region, weight = sum_duplicates(gaussian, region + 1, weight)
-    return ViewEvidence(gaussian, region - 1, weight.to(projected.opacities.dtype), num_regions)
+    gaussian, column, weight = sum_duplicates(gaussian, region + 1, weight)
+    return Entries(gaussian, column, weight.to(projected.opacities.dtype), (num_regions,))
 
 
 def composite(

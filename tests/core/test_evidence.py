@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift, rasterize_evidence
-from normlift_ns.core.evidence import MASKED, ViewEvidence
+from normlift_ns.core.evidence import MASKED, Entries
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.encoders.levels import joint_partition
 from tests.scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
@@ -207,11 +207,11 @@ def test_a_failed_save_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_from_views_keeps_unlabelled_weight_apart():
+def test_from_entries_keeps_unlabelled_weight_apart():
     g = torch.tensor([0, 0, 2])
-    one = ViewEvidence(g, torch.tensor([-1, 1, 0]), torch.tensor([0.5, 1.0, 2.0]), 2)
-    two = ViewEvidence(torch.tensor([1, 2]), torch.tensor([0, -1]), torch.tensor([3.0, 4.0]), 1)
-    evidence = Evidence.from_views([one, two], 3)
+    one = Entries(g, torch.tensor([0, 2, 1]), torch.tensor([0.5, 1.0, 2.0]), (2,))
+    two = Entries(torch.tensor([1, 2]), torch.tensor([1, 0]), torch.tensor([3.0, 4.0]), (1,))
+    evidence = Evidence.from_entries([one, two], 3)
     assert dense(evidence.rows, 3).tolist() == [[0, 1, 0], [0, 0, 3], [2, 0, 0]]
     assert dense(evidence.unlabeled, 2).tolist() == [[0.5, 0], [0, 0], [0, 4]]
 

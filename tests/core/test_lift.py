@@ -124,7 +124,8 @@ def test_invariances(seed, scale, cut):
 def test_chunks_do_not_change_directions(monkeypatch):
     evidence, features = random_evidence(40, VIEWS, 0, dtype=torch.float32), unit_rows(S, D, 0, torch.float32)
     whole = lift(evidence, features)
-    monkeypatch.setattr("normlift_ns.core.sparse._CHUNK_ELEMENTS", 3 * D)
+    for module in ("sparse", "lift"):
+        monkeypatch.setattr(f"normlift_ns.core.{module}.CHUNK_ELEMENTS", 3 * D)
     parts = lift(evidence, features)
     for name in STATISTICS:
         assert torch.equal(getattr(parts, name), getattr(whole, name))

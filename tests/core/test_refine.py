@@ -191,3 +191,19 @@ def test_unknown_variant():
     lifted = lift(random_evidence(5, [2], 0), unit_rows(2, 8, 0))
     with pytest.raises(ValueError, match="variant must be one of none, knn, linear, norm, support, full"):
         refine_variant("mean", torch.rand(5, 3), lifted)
+
+
+def test_directions_given_block_by_block_change_nothing(monkeypatch):
+    means, directions, reliability = scene(7, n=300)
+    config = RefineConfig(k=9, delta=0.0)
+    whole = refine(means, directions, reliability, config)
+    monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (40, 40))
+    asked = []
+
+    def some(gaussians):
+        asked.append(len(gaussians))
+        return directions[gaussians]
+
+    assert torch.equal(refine(means, some, reliability, config), whole)
+    assert len(asked) == 8
+    assert max(asked) < 300

@@ -231,7 +231,7 @@ GOOD = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.int32)
         ({"labels": [GOOD, GOOD]}, "cameras ended after 1 views"),
         ({"num_regions": [0]}, "contain region 0, but num_regions says 0"),
         ({"num_regions": []}, "num_regions ended after 0 views"),
-        ({"backend": "cuda"}, 'backend must be "auto", "torch" or "numba"'),
+        ({"backend": "cuda"}, "unknown backend"),
         ({"rasterize_mode": "smooth"}, 'rasterize_mode must be "classic" or "antialiased"'),
         ({"weight_power": 3}, "weight_power must be 0, 1 or 2, got 3"),
     ],

@@ -1,0 +1,314 @@
+"""The whole lift on one GPU: seconds of every stage beside its error, memory, and what stock gsplat needs.
+
+    python -m benchmarks.gpu            fox, tabletop, rooms of 0.48, 1.93 and 10 million Gaussians, growth
+    python -m benchmarks.gpu --quick    fox and tabletop only
+
+Every time is the median of three runs after a first one, the GPU waited for on both sides.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks import rooms
+from benchmarks.captures import trained_scene, training_cameras
+from benchmarks.cpu import grid_labels, relative_difference
+from benchmarks.report import RESULTS, Report
+from normlift_ns import (
+    Camera,
+    Evidence,
+    GaussianScene,
+    Lifted,
+    RefineConfig,
+    SemanticField,
+    lift,
+    nearest_neighbors,
+    rasterize_evidence,
+    refine,
+)
+from normlift_ns.core.forms import EvidenceForm
+from normlift_ns.raster.gsplat import project_views
+from normlift_ns.raster.settings import RasterSettings
+
+DIMENSION, CHANNELS, GSPLAT_VIEWS, SAMPLE = 512, 32, 6, 20_000
+
+
+@dataclass(frozen=True)
+class Case:
+    name: str
+    scene: GaussianScene
+    cameras: list[Camera]
+    labels: list[torch.Tensor]
+
+    @cached_property
+    def counts(self) -> list[int]:
+        """Regions of each view."""
+        return [int(labels.max()) + 1 for labels in self.labels]
+
+    def evidence(self, **options: Any) -> Evidence:
+        return rasterize_evidence(self.scene, self.cameras, self.labels, num_regions=self.counts, **options)
+
+
+def timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Median seconds of three runs after a first one, and the result of the last."""
+    result, seconds = run(), []
+    for _ in range(3):
+        del result
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        result = run()
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return sorted(seconds)[1], result
+
+
+def features(rows: int, device: str = "cuda") -> torch.Tensor:
+    """Unit rows around 40 directions, so that neighbours agree in part."""
+    g = torch.Generator(device).manual_seed(0)
+    classes = torch.randn(40, DIMENSION, generator=g, device=device)
+    which = torch.randint(0, 40, (rows,), generator=g, device=device)
+    noise = torch.randn(rows, DIMENSION, generator=g, device=device)
+    return torch.nn.functional.normalize(classes[which] + 0.5 * noise, dim=1)
+
+
+def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
+    """The RGB render of all views by stock gsplat, and its backward pass for 512 channels of the first few."""
+    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
+    from gsplat.cuda._wrapper import (  # noqa: PLC0415
+        fully_fused_projection,
+        isect_offset_encode,
+        isect_tiles,
+        rasterize_to_pixels,
+    )
+
+    scene, n = case.scene, len(case.scene)
+    poses = torch.stack([camera.world_to_camera.float() for camera in case.cameras]).cuda()
+    intrinsics = torch.stack([camera.K.float() for camera in case.cameras]).cuda()
+    colors = torch.rand(1, n, 3, device="cuda")
+
+    def prepared(v: int) -> tuple[Any, ...]:
+        width, height = case.cameras[v].width, case.cameras[v].height
+        radii, means2d, depths, conics, _ = fully_fused_projection(
+            scene.means, None, scene.quats, scene.scales, poses[v : v + 1], intrinsics[v : v + 1], width, height
+        )
+        across, down = -(-width // 16), -(-height // 16)
+        _, keys, members = isect_tiles(means2d, radii, depths, 16, across, down)
+        return means2d, conics, width, height, isect_offset_encode(keys, 1, across, down), members
+
+    def rgb() -> None:
+        for v in range(len(case.cameras)):
+            means2d, conics, width, height, offsets, members = prepared(v)
+            opacities = scene.opacities[None]
+            rasterize_to_pixels(means2d, conics, colors, opacities, width, height, 16, offsets, members)
+
+    def backward() -> None:
+        total = torch.zeros(n, DIMENSION, device="cuda")
+        blank = torch.zeros(1, n, CHANNELS, device="cuda")
+        for v in range(min(GSPLAT_VIEWS, len(case.cameras))):
+            means2d, conics, width, height, offsets, members = prepared(v)
+            drawing = (means2d, conics, blank, scene.opacities[None].contiguous(), None, None, width, height, 16)
+            _, alphas, last = _C.rasterize_to_pixels_fwd(*drawing, offsets, members)
+            gradient = torch.rand(1, height, width, CHANNELS, device="cuda")
+            for first in range(0, DIMENSION, CHANNELS):
+                found = _C.rasterize_to_pixels_bwd(
+                    *drawing, offsets, members, alphas, last, gradient, torch.zeros_like(alphas), False
+                )
+                total[:, first : first + CHANNELS] += found[3][0]
+
+    return rgb, backward
+
+
+def measure(report: Report, case: Case) -> None:
+    """Adds the metrics NAME.* of a case."""
+
+    def add(key: str, value: Any, unit: str, error: Any = None) -> None:
+        report.add(f"{case.name}.{key}", value, unit, error)
+
+    views, n = len(case.cameras), len(case.scene)
+    rgb, backward = stock_renders(case)
+    with torch.no_grad():
+        rgb_s, _ = timed(rgb)
+        gsplat512_s = timed(backward)[0] * views / min(GSPLAT_VIEWS, views)
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+        settings = RasterSettings()
+        intersections = len(project_views(case.scene, case.cameras[:1], False, settings).members)
+        evidence_s, evidence = timed(case.evidence)
+        evidence_gib = torch.cuda.max_memory_allocated() / 2**30
+        table = features(evidence.num_regions)
+        reliability_s, lifted = timed(lambda: lift(evidence, table))
+        directions_s = timed(lambda: lifted.directions(dtype=torch.float16))[0]
+        config = RefineConfig()
+        neighbors_s, neighbors = timed(lambda: nearest_neighbors(case.scene.means, config.k))
+        vote_s, source = timed(
+            lambda: refine(case.scene.means, lifted.directions, lifted.reliability, config, neighbors=neighbors)
+        )
+        peak_gib = torch.cuda.max_memory_allocated() / 2**30
+        field = query_field(lifted, source)
+        query_s, _ = timed(lambda: field.query(table[:1]))
+
+        lift_s = reliability_s + directions_s
+        norm_error, direction_error = lift_errors(case, evidence, table, lifted)
+        vote_error = vote_errors(case, evidence, lifted, config, neighbors, source)
+        add("gaussians", n, "")
+        add("views", views, "")
+        add("rgb_s", rgb_s, "s, stock gsplat")
+        add("rgb_ms_per_view", rgb_s / views * 1e3, "ms")
+        add("evidence_s", evidence_s, "s", evidence_error(case, evidence))
+        add("reliability_s", reliability_s, "s", norm_error)
+        add("lift_s", lift_s, "s, reliability and directions", direction_error)
+        add("evidence_lift_s", evidence_s + lift_s, "s")
+        add("evidence_lift_over_rgb", (evidence_s + lift_s) / rgb_s, "times the RGB render")
+        add("neighbors_s", neighbors_s, "s", 0)
+        add("vote_s", vote_s, "s", vote_error)
+        add("total_s", evidence_s + lift_s + neighbors_s + vote_s, "s")
+        add("query_ms", query_s * 1e3, "ms")
+        add("gsplat512_s", gsplat512_s, f"s, stock gsplat's backward, {min(GSPLAT_VIEWS, views)} views scaled up")
+        add("gsplat512_over_evidence_lift", gsplat512_s / (evidence_s + lift_s), "times evidence and lift")
+        add("evidence_peak_gib", evidence_gib, "GiB on the GPU")
+        add("peak_gib", peak_gib, "GiB on the GPU")
+        add("intersections_per_view", intersections, "of the first view")
+        add("nonzeros", evidence.nnz, "entries")
+        pixels = sum(camera.width * camera.height for camera in case.cameras[:4])
+        pairs = rasterize_evidence(case.scene, case.cameras[:4], case.labels[:4], weight_power=0)
+        add("contributors_per_pixel", pairs.weight.double().sum() / pixels, "Gaussians")
+
+
+def query_field(lifted: Lifted, source: torch.Tensor) -> SemanticField:
+    """A field of the exact form without its costly facts (bytes and bounds of the other forms)."""
+    from normlift_ns.core.forms import Scalars  # noqa: PLC0415
+
+    scalars = Scalars(*(getattr(lifted, name) for name in Scalars.__dataclass_fields__))
+    return SemanticField(scalars, source, EvidenceForm(lifted.evidence, lifted.features), {"dimension": DIMENSION})
+
+
+def evidence_error(case: Case, evidence: Evidence) -> float:
+    """Relative Frobenius difference to the float64 reference, in the first view."""
+    exact = rasterize_evidence(
+        case.scene, case.cameras[:1], case.labels[:1], num_regions=case.counts[:1], dtype=torch.float64
+    )
+    return relative_difference(evidence.select_views([0]).rows, exact.rows)
+
+
+def lift_errors(case: Case, evidence: Evidence, table: torch.Tensor, lifted: Lifted) -> tuple[float, float]:
+    """Largest error of R, and of a direction, in a sample of Gaussians."""
+    rows = sample_rows(len(case.scene))
+    chosen = evidence.rows.select_rows(rows)
+    part = Evidence(
+        chosen.offsets, chosen.column, chosen.weight.double(), evidence.region_view,
+        evidence.unlabeled.select_rows(rows), evidence.num_views,
+    )  # fmt: skip
+    exact = lift(part, table.double())
+    reliability = (lifted.reliability[rows].double() - exact.reliability).abs().max()
+    turned = (lifted.directions(rows).double() - exact.directions()).norm(dim=1).max()
+    return float(reliability), float(turned)
+
+
+def vote_errors(
+    case: Case, evidence: Evidence, lifted: Lifted, config: RefineConfig, neighbors: Any, source: torch.Tensor
+) -> float:
+    """Share of a sample of Gaussians whose refined direction is off by more than 1e-3 from that of a float64 vote.
+
+    Copying another Gaussian is no error where both have the same direction, as those seen in one region only.
+    """
+    rows = sample_rows(len(case.scene))[:: SAMPLE // 2000]
+    group = torch.cat([rows[:, None], neighbors.index[rows].long()], dim=1)
+    used, local = group.unique(return_inverse=True)
+    exact = lifted.directions(used).double()
+    k = config.k
+    near = type(neighbors)(
+        torch.full((len(used), k), -1, device=used.device, dtype=torch.int32),
+        torch.full((len(used), k), torch.inf, device=used.device, dtype=torch.float64),
+        neighbors.spacing,
+    )
+    near.index[local[:, 0]] = local[:, 1:].int()
+    near.distance[local[:, 0]] = neighbors.distance[rows].double()
+    found = refine(case.scene.means[used].double(), exact, lifted.reliability[used].double(), config, neighbors=near)[
+        local[:, 0]
+    ]
+    ours = torch.searchsorted(used, source[rows].long())
+    return float(((exact[found.long()] - exact[ours]).norm(dim=1) > 1e-3).float().mean())
+
+
+def sample_rows(n: int) -> torch.Tensor:
+    return torch.randint(0, n, (SAMPLE,), generator=torch.Generator().manual_seed(0)).unique().cuda()
+
+
+def room_case(name: str, n: int, views: int, regions: int = 128, scale: float = 1.0) -> Case:
+    width, height = round(rooms.WIDTH * scale), round(rooms.HEIGHT * scale)
+    labels = [rooms.voronoi_labels(regions, width, height, seed=v) for v in range(views)]
+    return Case(name, rooms.room(n), rooms.cameras(views, width, height), labels)
+
+
+def capture_case(name: str) -> Case:
+    cameras = training_cameras(name)
+    return Case(name, trained_scene(name).to("cuda"), cameras, [grid_labels(camera).cuda() for camera in cameras])
+
+
+def agreement(report: Report, cases: Sequence[Case]) -> None:
+    """How far the kernel is from gsplat's own backward pass, and whether two runs give the same bits."""
+    from gsplat.cuda._wrapper import rasterize_to_pixels  # noqa: PLC0415
+
+    worst, alpha_worst, repeatable = 0.0, 0.0, True
+    for case in cases:
+        some = Case(case.name, case.scene, case.cameras[::9], case.labels[::9])
+        for mode in ("classic", "antialiased"):
+            ours, again, stock = (some.evidence(backend=b, rasterize_mode=mode) for b in ("triton", "triton", "gsplat"))
+            worst = max(worst, relative_difference(ours.rows, stock.rows))
+            weight = ours.weight.double().sum() + ours.unlabeled.weight.double().sum()
+            alpha = 0.0
+            for camera in some.cameras:
+                seen = project_views(case.scene, [camera], mode == "antialiased", RasterSettings())
+                drawing = (seen.means2d, seen.conics, torch.zeros(1, len(case.scene), 1, device="cuda"), seen.opacities)
+                _, alphas = rasterize_to_pixels(*drawing, camera.width, camera.height, 16, seen.offsets, seen.members)
+                alpha += float(alphas.double().sum())
+            alpha_worst = max(alpha_worst, abs(float(weight) / alpha - 1))
+            repeatable &= torch.equal(ours.weight, again.weight) and torch.equal(ours.region, again.region)
+    report.add("triton_vs_gsplat_rel", worst, "relative Frobenius norm, worst of fox and tabletop in both modes")
+    report.add("weight_vs_alpha_rel", alpha_worst, "relative difference of the sums of E and of gsplat's alpha")
+    report.add("bitwise_repeatable", float(repeatable), "1: yes")
+
+
+def growth(report: Report) -> None:
+    """Seconds of evidence as one quantity grows, the others fixed: 0.48 M Gaussians, 32 views, 128 regions."""
+    base = {"n": 480_000, "views": 32, "regions": 128, "scale": 1.0}
+    for key, values in (
+        ("views", (16, 32, 64, 128)),
+        ("scale", (0.5, 1.0, 2.0)),
+        ("n", (240_000, 480_000, 960_000, 1_920_000)),
+        ("regions", (1, 16, 128, 1024, 5000)),
+    ):
+        for value in values:
+            case = room_case("growth", **{**base, key: value})  # type: ignore[arg-type]
+            seconds, evidence = timed(case.evidence)
+            report.add(f"growth.{key}_{value}.evidence_s", seconds, f"s, {evidence.nnz} entries")
+
+
+def main(quick: bool, output: Path) -> None:
+    report = Report("h100")
+    captures = [capture_case(name) for name in ("fox", "tabletop")]
+    agreement(report, captures)
+    while captures:
+        measure(report, captures.pop(0))
+    if not quick:
+        for name, n, views in (("rooms_480k", 480_000, 131), ("rooms_1930k", 1_930_000, 177), ("rooms_10m", 10**7, 20)):
+            measure(report, room_case(name, n, views))
+            torch.cuda.empty_cache()
+        growth(report)
+    report.write(output)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="captures only")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    arguments = parser.parse_args()
+    main(arguments.quick, arguments.output)

@@ -1,0 +1,41 @@
+"""Where the Triton kernels of `normlift_ns.kernels` apply, and what to do when a GPU's memory is full."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from importlib.util import find_spec
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
+Result = TypeVar("Result")
+
+
+@cache
+def has_triton() -> bool:
+    """Whether torch came with Triton, as it does on Linux."""
+    return find_spec("triton") is not None
+
+
+def kernels_apply(tensor: Tensor) -> bool:
+    """Whether a tensor is where kernels run."""
+    return tensor.is_cuda and has_triton()
+
+
+def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[Result]:
+    """[run(items)]; where the GPU's memory does not hold that, the results of both halves, and so on.
+
+    Raises:
+        MemoryError: one item alone is too large; says so, and what to do: `advice`.
+    """
+    try:
+        return [run(items)]
+    except torch.OutOfMemoryError as error:
+        if len(items) <= 1:
+            raise MemoryError(f"the GPU's memory is full ({error}); {advice}") from error
+    torch.cuda.empty_cache()
+    half = len(items) // 2
+    return in_parts(run, items[:half], advice) + in_parts(run, items[half:], advice)

@@ -1,0 +1,202 @@
+"""Sums over the rows of a sparse matrix: of the weights themselves, and of weighted rows of a table."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Float32, Float64, Int32, Int64
+from torch import Tensor
+
+_ROWS = 128
+
+
+class RowNorms(NamedTuple):
+    """Of every row j of a matrix E whose columns s belong to views v, with a table of unit rows F."""
+
+    total: Float64[Tensor, " n"]
+    """||sum_s E_js F_s||"""
+    by_view: Float64[Tensor, " n"]
+    """sum_v ||sum_{s in v} E_js F_s||"""
+    weight: Float64[Tensor, " n"]
+    """sum_s E_js"""
+    weight_squared: Float64[Tensor, " n"]
+    """sum_v (sum_{s in v} E_js) ** 2"""
+    views: Int32[Tensor, " n"]
+    """Views with an entry."""
+
+
+@triton.jit
+def _segment_sum(values, offsets, out, segments, ROWS: tl.constexpr):
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    start = tl.load(offsets + row, mask=row < segments, other=0)
+    length = tl.load(offsets + row + 1, mask=row < segments, other=0) - start
+    total = tl.zeros([ROWS], tl.float64)
+    for i in range(tl.max(length, axis=0)):
+        total += tl.load(values + start + i, mask=i < length, other=0.0).to(tl.float64)
+    tl.store(out + row, total, mask=row < segments)
+
+
+def segment_sum(values: Float[Tensor, " m"], offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
+    """Sums of values[offsets[i]:offsets[i + 1]], each from left to right in float64. For many short segments."""
+    out = torch.empty(len(offsets) - 1, dtype=torch.float64, device=values.device)
+    _segment_sum[(triton.cdiv(len(out), _ROWS),)](values, offsets, out, len(out), ROWS=_ROWS, num_warps=4)
+    return out
+
+
+@triton.jit
+def _product(offsets, column, weight, vector, out, rows, ROWS: tl.constexpr):
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    start = tl.load(offsets + row, mask=row < rows, other=0)
+    length = tl.load(offsets + row + 1, mask=row < rows, other=0) - start
+    total = tl.zeros([ROWS], tl.float64)
+    for i in range(tl.max(length, axis=0)):
+        inside = i < length
+        value = tl.load(vector + tl.load(column + start + i, mask=inside, other=0), mask=inside, other=0.0)
+        total += tl.load(weight + start + i, mask=inside, other=0.0).to(tl.float64) * value.to(tl.float64)
+    tl.store(out + row, total.to(out.dtype.element_ty), mask=row < rows)
+
+
+def product(
+    offsets: Int64[Tensor, " n_plus_1"],
+    column: Int32[Tensor, " nnz"],
+    weight: Float[Tensor, " nnz"],
+    vector: Float[Tensor, " s"],
+) -> Float[Tensor, " n"]:
+    """E x, added up in float64, in the precision of x. For many short rows."""
+    out = torch.empty(len(offsets) - 1, dtype=vector.dtype, device=vector.device)
+    grid = (triton.cdiv(len(out), _ROWS),)
+    _product[grid](offsets, column, weight, vector, out, len(out), ROWS=_ROWS, num_warps=4)
+    return out
+
+
+@triton.jit
+def _exact_sum(column, weight, table, start, stop, dimension, BLOCK: tl.constexpr):
+    """sum of weighted rows in float64."""
+    d = tl.arange(0, BLOCK)
+    total = tl.zeros([BLOCK], tl.float64)
+    for e in range(start, stop):
+        row = tl.load(column + e).to(tl.int64) * dimension + d
+        total += tl.load(weight + e).to(tl.float64) * tl.load(table + row, mask=d < dimension, other=0.0).to(tl.float64)
+    return total
+
+
+@triton.jit
+def _row_norms(
+    offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
+    dimension, cancelled, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One row per program. Where float32 digits have cancelled, the sum is taken again in float64."""
+    j = tl.program_id(0)
+    start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
+    d = tl.arange(0, BLOCK)
+    zero = tl.zeros([BLOCK], tl.float32)
+    total, of_view = zero, zero
+    all_weight = tl.zeros([], tl.float64)
+    view_weight, squared, by_view = all_weight, all_weight, all_weight
+    views, first = 0, start
+    view = -1
+    for e in range(start, stop + 1):
+        inside = e < stop
+        s = tl.load(column + e, mask=inside, other=0)
+        next_view = tl.load(column_view + s, mask=inside, other=-2)
+        if (next_view != view) & (view != -1):  # the entries of a view end here
+            norm = view_weight  # of a single unit row
+            if e - first > 1:
+                norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
+                if norm < cancelled * view_weight:
+                    exact = _exact_sum(column, weight, table, first, e, dimension, BLOCK)
+                    norm = tl.sqrt(tl.sum(exact * exact, axis=0))
+            by_view += norm
+            all_weight += view_weight
+            squared += view_weight * view_weight
+            views += tl.where(view_weight > 0, 1, 0)
+            total += of_view
+            of_view = zero
+            view_weight = tl.zeros([], tl.float64)
+            first = e
+        if inside:
+            w = tl.load(weight + e)
+            of_view += w * tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
+            view_weight += w.to(tl.float64)
+        view = next_view
+    norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
+    if norm < cancelled * all_weight:
+        exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
+        norm = tl.sqrt(tl.sum(exact * exact, axis=0))
+    tl.store(out_total + j, norm)
+    tl.store(out_by_view + j, by_view)
+    tl.store(out_weight + j, all_weight)
+    tl.store(out_squared + j, squared)
+    tl.store(out_views + j, views)
+
+
+def row_norms(
+    offsets: Int64[Tensor, " n_plus_1"],
+    column: Int32[Tensor, " nnz"],
+    weight: Float32[Tensor, " nnz"],
+    column_view: Int32[Tensor, " s"],
+    table: Float32[Tensor, "s d"],
+    cancelled: float,
+) -> RowNorms:
+    """All that the lift needs of E, in one pass and without any [N, D] array.
+
+    Args:
+        column: ascending in each row, so that entries of a view follow each other.
+        cancelled: sums shorter than this share of their weight are taken again in float64.
+    """
+    n, dimension, device = len(offsets) - 1, table.shape[1], table.device
+    out = RowNorms(
+        *(torch.empty(n, dtype=torch.float64, device=device) for _ in range(4)),
+        torch.empty(n, dtype=torch.int32, device=device),
+    )
+    _row_norms[(n,)](
+        offsets, column, weight, column_view, table, *out, dimension, cancelled,
+        BLOCK=triton.next_power_of_2(dimension), num_warps=1,
+    )  # fmt: skip
+    return out
+
+
+@triton.jit
+def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, cancelled, BLOCK: tl.constexpr):
+    j = tl.load(rows + tl.program_id(0))
+    start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
+    d = tl.arange(0, BLOCK)
+    total = tl.zeros([BLOCK], tl.float32)
+    all_weight = tl.zeros([], tl.float32)
+    if tl.load(known + j) > 0:
+        for e in range(start, stop):
+            w = tl.load(weight + e)
+            row = tl.load(column + e).to(tl.int64) * dimension + d
+            total += w * tl.load(table + row, mask=d < dimension, other=0.0)
+            all_weight += w
+        norm = tl.sqrt(tl.sum(total * total, axis=0))
+        if norm < cancelled * all_weight:
+            exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
+            total = (exact / tl.sqrt(tl.sum(exact * exact, axis=0))).to(tl.float32)
+        else:
+            total = total / norm
+    tl.store(out + tl.program_id(0).to(tl.int64) * dimension + d, total.to(out.dtype.element_ty), mask=d < dimension)
+
+
+def unit_sums(
+    rows: Int64[Tensor, " m"],
+    offsets: Int64[Tensor, " n_plus_1"],
+    column: Int32[Tensor, " nnz"],
+    weight: Float32[Tensor, " nnz"],
+    table: Float32[Tensor, "s d"],
+    known: Float32[Tensor, " n"],
+    dtype: torch.dtype,
+    cancelled: float,
+) -> Float[Tensor, "m d"]:
+    """sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 where `known` is 0."""
+    dimension = table.shape[1]
+    out = torch.empty(len(rows), dimension, dtype=dtype, device=table.device)
+    if len(rows) > 0:
+        _unit_sums[(len(rows),)](
+            rows, offsets, column, weight, table, known, out, dimension, cancelled,
+            BLOCK=triton.next_power_of_2(dimension), num_warps=1,
+        )  # fmt: skip
+    return out

@@ -1,0 +1,140 @@
+"""Stock gsplat on the GPU: its projection and its tile lists, and evidence as the gradient of its renders.
+
+With colours c_j and the image I_i = sum_j A_ij c_j, the gradient of sum_{i in s} I_i with respect to c_j is E_js: one
+backward pass with one-hot pixel gradients gives 32 regions at once. Slower than `raster.triton` and not bitwise
+repeatable (gsplat adds with atomics), but gsplat's own code throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cache
+from importlib.metadata import version
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float32, Int32
+from torch import Tensor
+
+from normlift_ns.core.evidence import Entries
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.sparse import sum_duplicates
+from normlift_ns.raster.settings import RasterSettings
+
+_CHANNELS = 32
+_COMPILED = ("frustum_margin", "min_discriminant", "radius_sigmas", "max_alpha", "min_alpha", "min_transmittance")
+"""Constants that stand in gsplat's compiled code."""
+
+
+class Projections(NamedTuple):
+    """What C cameras of one size see of N Gaussians, and where: the input of gsplat's rasterizer."""
+
+    means2d: Float32[Tensor, "c n 2"]
+    conics: Float32[Tensor, "c n 3"]
+    opacities: Float32[Tensor, "c n"]
+    members: Int32[Tensor, " intersections"]
+    """Indices into c * n, by camera, tile and depth."""
+    offsets: Int32[Tensor, "c tiles_y tiles_x"]
+    """Where each tile starts in `members`."""
+
+
+def project_views(
+    scene: GaussianScene, cameras: Sequence[Camera], antialiased: bool, settings: RasterSettings
+) -> Projections:
+    """gsplat's projection and tile lists for cameras of one size.
+
+    Raises:
+        ValueError: a scene that is not float32 on a GPU, another gsplat than 1.4, constants that gsplat has compiled.
+    """
+    check_usable(scene, settings)
+    from gsplat.cuda._wrapper import (  # noqa: PLC0415 (needs a GPU)
+        fully_fused_projection,
+        isect_offset_encode,
+        isect_tiles,
+    )
+
+    device, (width, height) = scene.means.device, (cameras[0].width, cameras[0].height)
+    poses = torch.stack([camera.world_to_camera.float() for camera in cameras]).to(device)
+    intrinsics = torch.stack([camera.K.float() for camera in cameras]).to(device)
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        scene.means, None, scene.quats, scene.scales, poses, intrinsics, width, height,
+        eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
+        calc_compensations=antialiased,
+    )  # fmt: skip
+    opacities = scene.opacities.expand(len(cameras), -1)
+    opacities = opacities * compensations if antialiased else opacities.contiguous()
+    across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
+    _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down, n_cameras=len(cameras))
+    return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
+
+
+def check_usable(scene: GaussianScene, settings: RasterSettings) -> None:
+    """Raises ValueError where gsplat cannot draw the scene as it was trained."""
+    if scene.means.dtype != torch.float32 or scene.means.device.type != "cuda":
+        raise ValueError(
+            f"gsplat draws float32 on a GPU, this scene is {scene.means.dtype} on {scene.means.device}; move it "
+            '(scene.to("cuda")), or use backend="torch", which knows every device and precision'
+        )
+    if not _gsplat_version().startswith("1.4."):
+        raise ValueError(
+            f"gsplat {_gsplat_version()} is installed, but nerfstudio 1.1.5 trains with 1.4.0, and other versions draw "
+            'differently; install it (pip install "gsplat==1.4.0"), or use backend="torch"'
+        )
+    ours = RasterSettings()
+    other = [name for name in _COMPILED if getattr(settings, name) != getattr(ours, name)]
+    if len(other) > 0:
+        raise ValueError(f'gsplat has compiled its {", ".join(other)}; to change them use backend="torch"')
+
+
+@cache
+def _gsplat_version() -> str:
+    return version("gsplat")
+
+
+def views_evidence(
+    scene: GaussianScene,
+    cameras: Sequence[Camera],
+    labels: Sequence[Int32[Tensor, "h w"]],
+    num_regions: Sequence[int],
+    antialiased: bool,
+    weight_power: int,
+    settings: RasterSettings,
+) -> Entries:
+    """Entries of some views, from gsplat's forward and backward pass alone.
+
+    Raises:
+        ValueError: weight_power other than 1, which a gradient cannot give; and as `project_views`.
+    """
+    if weight_power != 1:
+        raise ValueError(
+            f'backend "gsplat" sums A_ij alone, weight_power {weight_power} is not a gradient; use backend="triton"'
+        )
+    parts, before = [], 0
+    for camera, label_map, count in zip(cameras, labels, num_regions):
+        for first, gradient in _gradients(scene, camera, label_map, count, antialiased, settings):
+            gaussian, column = gradient.nonzero(as_tuple=True)
+            parts.append((gaussian, before + first + column, gradient[gaussian, column]))
+        before += count + 1
+    return Entries(*sum_duplicates(*(torch.cat(part) for part in zip(*parts))), tuple(num_regions))
+
+
+def _gradients(
+    scene: GaussianScene, camera: Camera, labels: Tensor, count: int, antialiased: bool, settings: RasterSettings
+) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:
+    """(first column, sums of A_ij by column) of 32 columns at once; column 0 holds the unlabelled pixels.
+
+    The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py).
+    """
+    seen = project_views(scene, [camera], antialiased, settings)
+    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
+
+    colors = torch.zeros(1, len(scene), _CHANNELS, device=scene.means.device)
+    drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
+    lists = (settings.tile_size, seen.offsets, seen.members)
+    _, alphas, last = _C.rasterize_to_pixels_fwd(*drawing, *lists)
+    column = labels.long() + 1
+    for first in range(0, count + 1, _CHANNELS):
+        channels = torch.arange(first, first + _CHANNELS, device=column.device)
+        one_hot = (column[None, :, :, None] == channels).float()
+        gradients = _C.rasterize_to_pixels_bwd(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
+        yield first, gradients[3][0]

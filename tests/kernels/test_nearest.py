@@ -1,0 +1,83 @@
+"""The GPU's neighbour search against the k-d tree of the CPU."""
+
+import pytest
+import torch
+
+from normlift_ns.core.neighbors import _on_cpu
+from normlift_ns.kernels import nearest
+from tests.scenes import generator
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:invalid value encountered:RuntimeWarning"
+)  # infinity - infinity, unused
+
+
+def uneven(n: int, seed: int = 0) -> torch.Tensor:
+    """Two thirds of the points in a cluster a thousandth of the scene's size, one far away, three at one place."""
+    g = generator(seed)
+    points = torch.randn(n, 3, generator=g)
+    points[: 2 * n // 3] = points[: 2 * n // 3] * 1e-3 + 2
+    points[-1] = 1e4
+    points[-4:-1] = 0.5
+    return points
+
+
+@pytest.mark.parametrize(("n", "k"), [(150, 12), (70, 36), (5, 12), (1, 3)])
+def test_equals_the_cpu(n, k):
+    points = uneven(n)
+    points = points.to(DEVICE)
+    found = nearest.nearest(points, k)
+    expected = _on_cpu(points.cpu(), k)
+    unsure = (~found.certain).nonzero().squeeze(1)  # the far one: to float32 the cluster is one point
+    assert (n - 1 in unsure.tolist()) == (n > k)
+    if unsure.numel() > 0:
+        for array, exact in zip(found, nearest.nearest_of_rows(points, unsure, k)):
+            array[unsure] = exact
+    assert torch.equal(found.index.cpu(), expected.index)
+    assert torch.allclose(found.distance.cpu().double(), expected.distance, rtol=1e-7, atol=0)
+    assert torch.equal(found.spacing.cpu(), expected.spacing)
+
+
+def test_ties_that_it_cannot_order_are_reported():
+    """Six points of a lattice stand at each distance: more than the spare candidates."""
+    points = torch.cartesian_prod(*[torch.arange(5.0)] * 3)
+    found = nearest.nearest(points.to(DEVICE), 12)
+    expected = _on_cpu(points, 12)
+    certain = found.certain.cpu()
+    assert torch.equal(found.index.cpu()[certain], expected.index[certain])
+    assert not certain.all()
+
+
+def test_more_coincident_points_than_candidates_are_reported():
+    points = torch.zeros(80, 3)
+    points[60:] = torch.randn(20, 3, generator=generator(1))
+    found, expected = nearest.nearest(points.to(DEVICE), 12), _on_cpu(points, 12)
+    certain = found.certain.cpu()
+    assert not certain[:60].any()
+    assert torch.equal(found.index.cpu()[certain], expected.index[certain])
+
+
+def test_the_tree_holds_every_point_once():
+    points = uneven(333)
+    tree = nearest.build_tree(points)
+    held = tree.index[tree.index >= 0]
+    assert torch.equal(held.sort().values, torch.arange(333))
+    assert torch.equal(tree.points[tree.index >= 0], points[held])
+    leaves = len(tree.index) // nearest.LEAF
+    assert leaves == 16
+    low, high = tree.boxes[1, :3], tree.boxes[1, 3:]
+    assert torch.equal(low, points.amin(0))
+    assert torch.equal(high, points.amax(0))
+
+
+def test_looking_at_all_points_equals_the_cpu_where_everything_ties(monkeypatch):
+    monkeypatch.setattr(nearest, "_PAIRS", 300)  # two rows at once
+    points = torch.cartesian_prod(*[torch.arange(5.0)] * 3)
+    points[3] = points[90]
+    rows = torch.tensor([0, 3, 62, 90, 124])
+    for k in (1, 12, 130):
+        found, expected = nearest.nearest_of_rows(points, rows, k), _on_cpu(points, k)
+        assert torch.equal(found.index, expected.index[rows])
+        assert torch.allclose(found.distance.double(), expected.distance[rows], rtol=1e-7)
+        assert torch.equal(found.spacing, expected.spacing[rows])

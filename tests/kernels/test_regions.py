@@ -1,0 +1,128 @@
+"""Region sums against the reference rasterizer, in Triton's interpreter where there is no GPU."""
+
+import pytest
+import torch
+
+from normlift_ns import Evidence, GaussianScene, RasterSettings, rasterize_evidence
+from normlift_ns.core.evidence import MASKED, UNLABELED, Entries
+from normlift_ns.core.sparse import sum_equal_keys
+from normlift_ns.kernels import regions
+from normlift_ns.raster.projection import assign_tiles, project, to_world
+from tests.scenes import dense, generator, orbit, random_labels, random_scene
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+SETTINGS = RasterSettings()
+
+
+def kernel_evidence(scene, cameras, labels, counts, weight_power=1):
+    """Evidence by the kernel, all views in flight at once, projected by our own code."""
+    n, columns = len(scene), sum(counts) + len(counts)
+    arrays = [torch.zeros(len(cameras) * n, size) for size in (2, 3)] + [torch.zeros(len(cameras) * n)]
+    members, offsets = [], [torch.zeros(1, dtype=torch.int64)]
+    for view, camera in enumerate(cameras):
+        projected = project(to_world(scene, torch.float32), camera, SETTINGS, False)
+        tiles = assign_tiles(projected, camera.width, camera.height, SETTINGS.tile_size)
+        place = view * n + projected.gaussian
+        for array, values in zip(arrays, (projected.means2d, projected.conics, projected.opacities)):
+            array[place] = values
+        members.append(place[tiles.members.long()].int())
+        offsets.append(tiles.offsets[1:] + offsets[-1][-1])
+    first = torch.tensor([0, *(count + 1 for count in counts)]).cumsum(0)[:-1].int()
+    found = regions.region_sums(
+        *(x.to(DEVICE) for x in (*arrays, torch.cat(members), torch.cat(offsets), torch.stack(labels), first)),
+        columns=columns,
+        tile_size=SETTINGS.tile_size,
+        max_alpha=SETTINGS.max_alpha,
+        min_alpha=SETTINGS.min_alpha,
+        min_transmittance=SETTINGS.min_transmittance,
+        weight_power=weight_power,
+    )
+    key, weight = (x.cpu() for x in sum_equal_keys(*found))
+    gaussian = key // columns
+    entries = Entries(gaussian.int(), (key - gaussian * columns).int(), weight, tuple(counts))
+    return Evidence.from_entries([entries], n, weight_power=weight_power)
+
+
+def assert_same(found, expected, regions_in_all, tolerance=2e-6):
+    for ours, theirs, columns in (
+        (found.rows, expected.rows, regions_in_all),
+        (found.unlabeled, expected.unlabeled, expected.num_views),
+    ):
+        difference = (dense(ours, columns) - dense(theirs, columns)).abs()
+        assert difference.max() <= tolerance * max(1.0, float(dense(theirs, columns).max()))
+    assert torch.equal(found.region_view, expected.region_view)
+
+
+@pytest.mark.parametrize("weight_power", [0, 1, 2])
+def test_two_views_in_flight_equal_the_reference(weight_power):
+    scene, cameras = random_scene(70, dtype=torch.float32), orbit(2, width=37, height=21)
+    labels = [random_labels(camera, 5, seed=v) for v, camera in enumerate(cameras)]
+    labels[1][:4] = MASKED
+    found = kernel_evidence(scene, cameras, labels, [5, 7], weight_power)
+    expected = rasterize_evidence(
+        scene, cameras, labels, num_regions=[5, 7], backend="torch", weight_power=weight_power
+    )
+    assert expected.nnz > 100
+    assert expected.unlabeled.weight.numel() > 10
+    assert_same(found, expected, 12)
+    assert torch.equal(found.region, expected.region)
+
+
+def hard_scene():
+    """Needles, pancakes, giants, a stack at one place, Gaussians about the near plane, opacities at both ends."""
+    g = generator(3)
+    scene = random_scene(60, seed=3, dtype=torch.float32)
+    means, scales, opacities = scene.means.clone(), scene.scales.clone(), scene.opacities.clone()
+    scales[:8] = torch.tensor([1.0, 1e-4, 1e-4])  # needles
+    scales[8:14] = torch.tensor([0.5, 0.5, 1e-5])  # pancakes
+    scales[14:16] = 30.0  # larger than the image
+    means[16:26] = torch.tensor([0.1, 0.2, 0.3])  # one place, one depth
+    opacities[16:20] = 0.999
+    opacities[20:23] = 0.0
+    means[26:30] = torch.tensor([0.0, 0.0, -3.99]) + 1e-2 * torch.rand(4, 3, generator=g)  # before the lens
+    return GaussianScene(means, scene.quats, scales, opacities)
+
+
+def test_hard_gaussians_equal_the_reference():
+    scene, cameras = hard_scene(), orbit(1, width=33, height=18)
+    labels = [random_labels(cameras[0], 3, seed=1)]
+    expected = rasterize_evidence(scene, cameras, labels, num_regions=[3], backend="torch")
+    assert_same(kernel_evidence(scene, cameras, labels, [3]), expected, 3)
+
+
+@pytest.mark.parametrize("kind", ["every pixel a region", "nothing labelled", "nothing observed"])
+def test_any_number_of_regions(kind):
+    scene, cameras = random_scene(20, seed=5, dtype=torch.float32), orbit(1, width=17, height=16)
+    pixels = cameras[0].width * cameras[0].height
+    value = torch.arange(pixels, dtype=torch.int32).view(16, 17)
+    labels = {
+        "every pixel a region": value,
+        "nothing labelled": torch.full_like(value, UNLABELED),
+        "nothing observed": torch.full_like(value, MASKED),
+    }[kind]
+    found = kernel_evidence(scene, cameras, [labels], [pixels])
+    expected = rasterize_evidence(scene, cameras, [labels], num_regions=[pixels], backend="torch")
+    assert (expected.nnz > 0) == (kind == "every pixel a region")
+    assert_same(found, expected, pixels)
+
+
+def test_chunks_of_tiles_change_nothing(monkeypatch):
+    scene, cameras = random_scene(40, seed=2, dtype=torch.float32), orbit(1)
+    labels = [random_labels(cameras[0], 4, seed=2)]
+    whole = kernel_evidence(scene, cameras, labels, [4])
+    monkeypatch.setattr(regions, "_MOST_SLOTS", 50)
+    parts = kernel_evidence(scene, cameras, labels, [4])
+    assert torch.equal(whole.weight, parts.weight)
+    assert torch.equal(whole.region, parts.region)
+
+
+def test_chunks_cover_all_tiles_once():
+    slots = torch.tensor([0, 0, 3, 90, 91, 91, 99, 150, 150])
+    chunks = regions._chunks(slots)
+    assert chunks == [(0, 8, 0, 150)]
+    assert regions._chunks(torch.zeros(5, dtype=torch.int64)) == []
+
+
+def test_keys_are_as_wide_as_they_must_be():
+    assert regions._key_type(2**31 - 1) == torch.int32
+    assert regions._key_type(2**31) == torch.int64

@@ -1,0 +1,80 @@
+"""Row sums on the GPU against those of the CPU, where digits cancel too."""
+
+import pytest
+import torch
+
+from normlift_ns import Evidence, lift
+from normlift_ns.core.lift import _sums
+from normlift_ns.core.sparse import CANCELLED, SparseRows, segment_sum
+from normlift_ns.kernels import sums
+from tests.scenes import generator, random_evidence, unit_rows
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def on_device(*tensors):
+    return [x.to(DEVICE) for x in tensors]
+
+
+def kernel_norms(evidence, table):
+    arrays = on_device(evidence.offsets, evidence.region, evidence.weight, evidence.region_view, table)
+    return [x.cpu() for x in sums.row_norms(*arrays, CANCELLED)]
+
+
+def test_segments_are_added_in_float64():
+    values = 10 ** (18 * torch.rand(500, generator=generator(0)) - 12)
+    offsets = torch.tensor([0, 0, 1, 4, 4, 200, 500, 500])
+    found = sums.segment_sum(*on_device(values, offsets)).cpu()
+    assert torch.allclose(found, segment_sum(values, offsets), rtol=1e-15, atol=0)
+    assert found[0] == found[3] == found[6] == 0
+
+
+def test_products_with_a_vector():
+    evidence = random_evidence(300, [3, 4], 1, dtype=torch.float32)
+    vector = torch.randn(7, generator=generator(1), dtype=torch.float64)
+    found = sums.product(*on_device(evidence.offsets, evidence.region, evidence.weight, vector)).cpu()
+    expected = evidence.rows.matmul(vector[:, None]).squeeze(1)
+    assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dimension", [16, 21])
+def test_norms_equal_those_of_the_cpu(dimension):
+    evidence = random_evidence(30, [3, 0, 4, 2], 1, dtype=torch.float32)
+    table = unit_rows(9, dimension, 2, torch.float32)
+    found, expected = kernel_norms(evidence, table), _sums(evidence, table)
+    for ours, theirs in zip(found, expected):
+        assert torch.allclose(ours.double(), theirs.double(), rtol=2e-6, atol=0)
+    assert torch.equal(found[4].long(), expected.view_count.long())
+
+
+def test_cancelled_sums_are_right():
+    """Opposite vectors within a view, and between views, leave 1e-6 of the weight: float32 has no digit of it."""
+    table = torch.eye(1, 8)
+    table = torch.cat([table, -table, table, -table])
+    offsets, region = torch.tensor([0, 4, 6]), torch.tensor([0, 1, 2, 3, 0, 3], dtype=torch.int32)
+    weight = torch.tensor([1.0, 1 - 2**-20, 3.0, 3 - 2**-20, 5.0, 5 - 2**-19])
+    view = torch.tensor([0, 0, 1, 1], dtype=torch.int32)
+    empty = SparseRows(torch.zeros(3, dtype=torch.int64), torch.zeros(0, dtype=torch.int32), torch.zeros(0))
+    evidence = Evidence(offsets, region, weight, view, empty, 2)
+    total, by_view, *_ = kernel_norms(evidence, table)
+    exact = weight.double()
+    within = [exact[0] - exact[1], exact[2] - exact[3]]
+    assert torch.allclose(total, torch.stack([sum(within), exact[4] - exact[5]]), rtol=1e-12)
+    assert torch.allclose(by_view, torch.stack([sum(within), exact[4] + exact[5]]), rtol=1e-12)
+    arrays = on_device(torch.arange(2), offsets, region, weight, table, torch.ones(2))
+    found = sums.unit_sums(*arrays, torch.float32, CANCELLED).cpu()
+    assert torch.equal(found, torch.eye(1, 8).expand(2, -1))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_directions_equal_those_of_the_cpu(dtype):
+    evidence = random_evidence(30, [3, 4], 5, dtype=torch.float32)
+    lifted = lift(evidence, unit_rows(7, 20, 6, torch.float32))
+    rows = torch.randperm(30, generator=generator(7))
+    arrays = on_device(rows, evidence.offsets, evidence.region, evidence.weight, lifted.features, lifted.norm)
+    found = torch.empty(30, 20, dtype=dtype)
+    found[rows] = sums.unit_sums(*arrays, dtype, CANCELLED).cpu()
+    assert found.dtype == dtype
+    assert torch.allclose(found.float(), lifted.directions(), atol=2e-7 if dtype == torch.float32 else 5e-4)
+    assert torch.equal(found[lifted.norm == 0], torch.zeros_like(found[lifted.norm == 0]))
+    assert torch.equal(lifted.directions(dtype=dtype), lifted.directions().to(dtype))
