@@ -142,7 +142,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     found = _weights(folder)
     if len(found) == 0:
         raise ValueError(f"the folder has no {_FILES[0]}")
-    return import_transformers().SamConfig(**config), _read_tensors(found[0])
+    return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
 
 
 def _weights(folder: Path) -> list[Path]:

@@ -11,14 +11,15 @@ import huggingface_hub
 import numpy as np
 import pytest
 import torch
-from segment_anything import SamAutomaticMaskGenerator, SamPredictor
+import transformers
+from segment_anything import SamAutomaticMaskGenerator, SamPredictor, sam_model_registry
 
 from benchmarks.captures import SHARED
 from normlift_ns.encoders.images import read_image
 from normlift_ns.encoders.masks import Suppression
 from normlift_ns.encoders.sam import LEVELS, MaskRules, SamMasks, point_grid
 from normlift_ns.encoders.sam_network import SamNetwork
-from normlift_ns.encoders.sam_weights import load_sam
+from normlift_ns.encoders.sam_weights import load_sam, published_config, published_name
 from tests.captures import needs_shared
 from tests.encoders.test_masks import nms_by_hand, pixels
 from tests.encoders.tiny import SIDE, tiny_sam, write_sam
@@ -69,6 +70,16 @@ def test_a_folder_and_a_file_of_the_same_weights_agree(weights):
     assert all(torch.equal(file[name], inside[name]) for name in file)
 
 
+@pytest.mark.parametrize("kind", ["vit_b", "vit_l", "vit_h"])
+def test_metas_files_fit(kind):
+    """Names and shapes of all parameters, without any weights."""
+    with torch.device("meta"):
+        state = sam_model_registry[kind]().state_dict()
+        expected = transformers.SamModel(published_config(state)).state_dict()
+    found = {published_name(name): value.shape for name, value in state.items()}
+    assert {name: value.shape for name, value in expected.items() if not name.startswith("shared_image")} == found
+
+
 def blobs(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """In place of the mask decoder: three sizes of blobs around points of the input, with ragged edges, holes and
     specks, and scores that differ."""
@@ -78,8 +89,7 @@ def blobs(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     radius = torch.tensor([0.08, 0.13, 0.2])[:, None, None] * (1 + 0.5 * torch.sin(9 * p[..., 0] + 5 * p[..., 1]))
     waves = torch.sin(40 * x + 17 * p[..., 0]) * torch.sin(31 * y + 23 * p[..., 1])
     distance = ((x - p[..., 0]) ** 2 + (y - p[..., 1]) ** 2).sqrt()
-    k = torch.arange(3)
-    score = 0.75 + 0.25 * torch.sin(13 * p[:, 0, 0, :, 0] + 29 * p[:, 0, 0, :, 1] + k)
+    score = 0.75 + 0.25 * torch.sin(13 * p[:, 0, 0, :, 0] + 29 * p[:, 0, 0, :, 1] + torch.arange(3))
     return (200 * (radius - distance) + 9 * waves).float(), score.float()
 
 
@@ -119,6 +129,20 @@ def test_the_masks_are_those_of_metas_generator(weights, monkeypatch, size):
         stay = nms_by_hand([pixels(one["segmentation"]) for one in expected], scores, Suppression())
         assert torch.equal(chosen[level], kept[level][torch.tensor(stay)])
         assert 0 < sum(stay) < len(stay)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_a_gpu_finds_what_the_cpu_finds(weights, monkeypatch):
+    image, path = noise(160, 120), str(weights / "tiny")
+    networks = [SamNetwork.load(path, device) for device in ("cpu", "cuda")]
+    exact, half = (network.embed(network.pixels([image]))[0].cpu() for network in networks)
+    assert float((half - exact).norm() / exact.norm()) < 0.01
+    monkeypatch.setattr(SamNetwork, "decode", lambda self, _, points: tuple(x.to(self._device) for x in blobs(points)))
+    rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, region_area=15)
+    cpu, gpu = (SamMasks(path, device=device, rules=rules).masks(image) for device in ("cpu", "cuda"))
+    for level in LEVELS:
+        assert gpu[level].shape == cpu[level].shape
+        assert float((gpu[level].cpu() != cpu[level]).float().mean()) < 1e-4  # bilinear weights are rounded otherwise
 
 
 def test_label_maps_hold_all_levels_with_overlaps_beneath(weights, monkeypatch):
