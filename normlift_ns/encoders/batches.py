@@ -6,21 +6,24 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
-import torch
 from torch import Tensor
 
+from normlift_ns.core.gpu import in_parts
+
 T = TypeVar("T")
+_ADVICE = (
+    "close other programs that use the GPU, take a smaller model, or images of a fraction of the size "
+    "(--lift-downscale 2), or lift on the CPU: --device cpu"
+)
 
 
 @dataclass
 class Batches:
-    """Cuts work into batches. Where the memory of the device does not suffice, it goes on with half of the batch, for
-    all that follows."""
+    """Cuts work into batches. Where a GPU's memory does not hold one, it goes on with smaller ones, for all that
+    follows."""
 
     size: int
     """Items per batch."""
-    what: str
-    """What an item is called in a message, such as "crop"."""
 
     def __call__(self, function: Callable[[Tensor], T], items: Tensor) -> Iterator[T]:
         """The function's results on consecutive items.
@@ -31,18 +34,8 @@ class Batches:
         start = 0
         while start < len(items):
             batch = items[start : start + self.size]
-            try:
-                result = function(batch)
-            except torch.OutOfMemoryError as error:
-                if len(batch) == 1:
-                    raise MemoryError(
-                        f"the memory of the device does not hold a single {self.what} ({str(error).splitlines()[0]}); "
-                        "close other programs that use it, take a smaller model, images of a fraction of the size "
-                        "(--lift-downscale 2), or --device cpu"
-                    ) from None
-                self.size = len(batch) // 2
-            else:
-                start += len(batch)
-                yield result
-                continue
-            torch.cuda.empty_cache()  # outside of the except block, whose traceback holds tensors
+            results = in_parts(function, batch, _ADVICE)
+            if len(results) > 1:
+                self.size = -(-len(batch) // len(results))
+            start += len(batch)
+            yield from results

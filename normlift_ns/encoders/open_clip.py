@@ -112,11 +112,11 @@ class OpenClipEncoder:
 
     @cached_property
     def _crops(self) -> Batches:
-        return Batches(_BATCH[torch.device(self.device).type], "crop")
+        return Batches(_BATCH[torch.device(self.device).type])
 
     @cached_property
     def _texts(self) -> Batches:
-        return Batches(_BATCH[torch.device(self.device).type], "text")
+        return Batches(_BATCH[torch.device(self.device).type])
 
 
 def _templates(template: str) -> Sequence[Callable[[str], str]]:

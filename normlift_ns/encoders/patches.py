@@ -103,7 +103,7 @@ class PatchFeatures:
 
     @cached_property
     def _images(self) -> Batches:
-        return Batches(1, "image cut into patches")
+        return Batches(1)
 
 
 def patch_grid(height: int, width: int, count: int) -> tuple[int, int]:

@@ -29,8 +29,8 @@ class SamNetwork:
         self._device = torch.device(device)
         self._side: int = model.config.vision_config.image_size
         images, prompts, masks = _BATCHES["cuda" if self._device.type == "cuda" else "cpu"]
-        self._images, self._prompts = Batches(images, "image for SAM"), Batches(prompts, "prompt for SAM")
-        self.masks = Batches(masks, "mask at the size of the image")
+        self._images, self._prompts = Batches(images), Batches(prompts)
+        self.masks = Batches(masks)
         """For what is done with masks at the size of the image."""
 
     @classmethod
