@@ -22,6 +22,8 @@ ALLOWED = {
         "skimage",
         "PIL",
         "huggingface_hub",
+        "torchvision",
+        "cv2",
         *(f"normlift_ns.{x}" for x in ("core", "encoders")),
     },
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},

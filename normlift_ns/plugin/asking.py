@@ -17,10 +17,12 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.query import CANONICAL_NEGATIVES, RelevancyForm
 from normlift_ns.encoders.build import SourceOptions, make_texts
+from normlift_ns.encoders.cache import CachedTexts
+from normlift_ns.encoders.open_clip import OpenClipEncoder
 from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.encoders.text_vectors import TextVectors
 
-ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_vectors")
+ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
 THRESHOLDS: dict[RelevancyForm, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
 """Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
@@ -49,22 +51,27 @@ def encoder_settings(options: SourceOptions) -> dict[str, Any]:
     return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
 
 
-def with_text_vectors(field: SemanticField, file: Path | None) -> SemanticField:
-    """The field, with texts looked up in another file; None: as it was lifted."""
-    if file is None:
-        return field
-    encoder = {**field.manifest.get("encoder", {}), "text_vectors": os.path.abspath(file)}
-    return replace(field, manifest={**field.manifest, "encoder": encoder})
+def with_texts(field: SemanticField, *, vectors: Path | None = None, template: str | None = None) -> SemanticField:
+    """The field, with texts looked up in another file, or read in another template; None: as it was lifted."""
+    changes = {
+        "text_vectors": None if vectors is None else os.path.abspath(vectors),
+        "text_template": template,
+    }
+    given = {key: value for key, value in changes.items() if value is not None}
+    return replace(field, manifest={**field.manifest, "encoder": {**field.manifest.get("encoder", {}), **given}})
 
 
-def encoder_of(field: SemanticField, device: str = "cpu") -> TextEncoder:
+def encoder_of(field: SemanticField, device: str = "cpu", cache: Path | None = None) -> TextEncoder:
     """The encoder of texts that fits the field.
 
+    Args:
+        cache: folder in which to keep vectors of texts that a network has read.
     Raises:
         ValueError: the manifest names none that this version knows.
         FileNotFoundError: its weights, or its text vectors, are not there any more.
     """
-    return make_texts(_options(field), device)
+    texts = make_texts(_options(field), device)
+    return CachedTexts(texts, cache) if cache is not None and isinstance(texts, OpenClipEncoder) else texts
 
 
 def _options(field: SemanticField) -> SourceOptions:

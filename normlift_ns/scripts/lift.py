@@ -126,6 +126,8 @@ def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str,
         table.add_row("not drawn", f"{numbers['excluded']:,} with non-finite parameters")
     if numbers["left_out"] > 0:
         table.add_row("left out", f"{numbers['left_out']} images without features")
+    features = facts["features"]
+    table.add_row("2D features", features["kind"] if "kind" in features else features["regions"]["kind"])
     table.add_row("reliability R", quantiles)
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"

@@ -43,6 +43,9 @@ class NormLiftQuery:
     """Training images from whose cameras to render, such as 0001 0042; by default three of them, evenly spread."""
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
+    text_template: str | None = None
+    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}"; ensemble: the mean of
+    seven. By default as the run was lifted."""
     data: Path | None = None
     """Where the dataset is now, if it was moved."""
     device: str = "auto"
@@ -53,16 +56,17 @@ class NormLiftQuery:
         device = choose_device(self.device)
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
-        from normlift_ns.plugin.asking import ask, encoder_of, summarize, with_text_vectors  # noqa: PLC0415
+        from normlift_ns.plugin.asking import ask, encoder_of, summarize, with_texts  # noqa: PLC0415
         from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data)
         cameras = training_cameras(run, self.render_views)
-        field = with_text_vectors(load_field(run), self.text_vectors)
+        field = with_texts(load_field(run), vectors=self.text_vectors, template=self.text_template)
+        texts = run.location.run_dir.parent / ".cache" / "texts"
         answer = ask(
             field,
-            encoder_of(field, device),
+            encoder_of(field, device, texts),
             self.text,
             negatives=self.negatives,
             form=self.relevancy,

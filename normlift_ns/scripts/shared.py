@@ -23,7 +23,7 @@ class Command(Protocol):
 def run_command(command: type[Command]) -> None:
     """Reads the flags in the form of nerfstudio's commands (--flag True) and runs the command.
 
-    Errors of flags, input, files and disks become a message and exit code 1, Ctrl-C exit code 130.
+    Errors of flags, input, files, disks and memory become a message and exit code 1, Ctrl-C exit code 130.
     """
     tyro.extras.set_accent_color("bright_yellow")
     try:
