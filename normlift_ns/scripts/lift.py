@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from normlift_ns.encoders.build import SourceOptions, make_source
-from normlift_ns.plugin.asking import ENCODER_KEYS, default_negatives
+from normlift_ns.plugin.asking import ENCODER_KEYS, pose
 from normlift_ns.plugin.lifting import LiftOptions, LiftResult, Report, lift_run
 from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
 
@@ -50,10 +50,10 @@ class NormLift:
         start = time.perf_counter()
         device = choose_device(self.device)
         source = make_source(self.source, device)
-        texts = None if len(self.queries) == 0 else source.text(self.queries)
+        if len(self.queries) > 0:
+            source.text(self.queries)
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s; mistakes show before)
-        from normlift_ns.plugin.queries import QueryVectors  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import run_directory, write_run  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data, load_step=self.load_step)
@@ -66,15 +66,11 @@ class NormLift:
             result = lift_run(
                 run, source, self.options, target.parent / ".cache", device=device, encoder=encoder, report=report
             )
-        vectors = None
-        if texts is not None:
-            negatives = default_negatives(result.field)
-            vectors = QueryVectors(texts, source.text(negatives) if len(negatives) > 0 else None)
+        question = None if len(self.queries) == 0 else pose(result.field, source, self.queries)
         written = write_run(
             run,
             result.field,
-            queries=self.queries,
-            query_vectors=vectors,
+            question=question,
             output_dir=self.output_dir,
             timestamp=target.name,
             overwrite=self.overwrite,

@@ -33,6 +33,8 @@ class NormLiftQuery:
     """Least reliability of a selected Gaussian, in 0..1."""
     refined: bool = True
     """Ask the refined directions."""
+    save: bool = False
+    """Store the question in the run, in place of an earlier one: ns-render and ns-viewer then draw its answer."""
     json: Path | None = None
     """Write the table to this file."""
     output_path: Path | None = None
@@ -52,7 +54,9 @@ class NormLiftQuery:
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
         from normlift_ns.plugin.asking import ask, encoder_of, summarize  # noqa: PLC0415
+        from normlift_ns.plugin.config import FIELD_FOLDER  # noqa: PLC0415
         from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
+        from normlift_ns.plugin.queries import save_question  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data)
@@ -68,10 +72,10 @@ class NormLiftQuery:
             min_reliability=self.min_reliability,
             refined=self.refined,
         )
-        rows = summarize(answer, field, run.scene)
-        CONSOLE.print(_table(rows, f"{answer.form} > {answer.threshold:g}"))
+        rows, rule = summarize(answer, field, run.scene), answer.question
+        CONSOLE.print(_table(rows, f"{rule.form} > {rule.threshold:g}"))
         if self.json is not None:
-            facts = {"relevancy": answer.form, "threshold": answer.threshold, "negatives": list(answer.negatives)}
+            facts = {"relevancy": rule.form, "threshold": rule.threshold, "negatives": list(rule.negatives)}
             with atomic_path(self.json) as temporary:
                 temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
         if self.output_path is not None:
@@ -81,7 +85,8 @@ class NormLiftQuery:
                 np.savez(file, names=np.array(self.text), **arrays)
         if self.render_dir is not None:
             save_overlays(run, answer, cameras, self.render_dir)
-        written = [path for path in (self.json, self.output_path, self.render_dir) if path is not None]
+        stored = save_question(run.location.run_dir / FIELD_FOLDER, rule) if self.save else None
+        written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
         if len(written) > 0:
             CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)
         return rows

@@ -16,6 +16,7 @@ from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfact
 from normlift_ns.plugin import lifting
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ask, encoder_of
+from normlift_ns.plugin.queries import load_question
 from normlift_ns.plugin.run_dir import load_field
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
@@ -67,7 +68,9 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
     assert after > 0.7
     assert field.manifest["encoder"]["encoder"] == "colour"
     assert field.manifest["statistics"]["views"] == 12
-    assert run.model_config.queries == ("red", "yellow")  # pyright: ignore[reportAttributeAccessIssue]
+    question = load_question(lifted.parent / "normlift")
+    assert question is not None
+    assert question.texts == ("red", "yellow")
     assert sorted(p.name for p in lifted.parent.iterdir()) == [
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
     ]  # fmt: skip
