@@ -91,6 +91,7 @@ class Panel(torch.nn.Module):
         self._model = [model]  # in lists: a module that holds its parent, or an encoder that is saved with the model
         self._encoder: list[Encoder] = []
         self._answer: Answer | None = None
+        self._rendered: tuple[int | None, str, str] | None = None
         self.control = ViewerControl()
         off = {"disabled": True}
         self.ask_1_prompts = _Text("Prompts", "", **off, hint="What to look for; several are separated by ;")
@@ -138,7 +139,8 @@ class Panel(torch.nn.Module):
             question = answer.question
             self.ask_1_prompts.value = "; ".join(question.texts)
             self.ask_2_negatives.value = "; ".join(question.negatives)
-            self.ask_3_relevancy.value = question.form
+            usual = "cosine" if len(question.negatives) == 0 else "lerf"
+            self.ask_3_relevancy.value = "auto" if question.form == usual else question.form
             self.ask_4_refined.value = question.refined
             self.show_3_reliability.value = question.min_reliability
         self._replace(answer)
@@ -194,7 +196,8 @@ class Panel(torch.nn.Module):
 
     @_reported
     def _show(self) -> None:
-        self._render()
+        if self._choices() != self._rendered:
+            self._render()
 
     @_reported
     def _arm(self) -> None:
@@ -236,7 +239,8 @@ class Panel(torch.nn.Module):
             raise ValueError("Nothing is selected; there is nothing to export.")
         assert self._answer is not None and model.field is not None and model.config.semantics is not None
         texts, shown = self._answer.texts, self._shown()
-        path = model.config.semantics.parent / "exports" / f"{file_name(texts[shown or 0])}.ply"
+        name = file_name("_".join(texts) if shown is None else texts[shown])
+        path = model.config.semantics.parent / "exports" / f"{name}.ply"
         path.parent.mkdir(exist_ok=True)
         harmonics = model.config.sh_degree > 0
         path = free_path(path)
@@ -253,6 +257,10 @@ class Panel(torch.nn.Module):
         path = save_question(folder, self._answer.question)
         self.note(f"Saved {len(self._answer.texts)} queries in {path}; ns-render draws them.")
 
+    def _choices(self) -> tuple[int | None, str, str]:
+        """What the elements say about drawing: the prompt shown, the part drawn, the colours."""
+        return self._shown(), self.show_4_part.value, self.show_5_colormap.value
+
     def _shown(self) -> int | None:
         """Index of the prompt shown; None: all of them."""
         options, value = self.show_1_prompt.options, self.show_1_prompt.value
@@ -267,7 +275,7 @@ class Panel(torch.nn.Module):
         self._answer = answer
         if not keep:
             texts = () if answer is None else answer.texts
-            self.show_1_prompt.value = _ALL
+            _set(self.show_1_prompt, _ALL)
             self.show_1_prompt.set_options([_ALL, *(f"{i}: {clipped(t, 40)}" for i, t in enumerate(texts))])
         if answer is not None:
             _set(self.show_2_threshold, answer.question.threshold)
@@ -278,7 +286,7 @@ class Panel(torch.nn.Module):
         model = self._model[0]
         if model.field is None:
             return
-        shown, part, colormap = self._shown(), self.show_4_part.value, self.show_5_colormap.value
+        self._rendered = shown, part, colormap = self._choices()
         model.show(make_display(model.field, self._answer, shown=shown, colormap=colormap, part=part))  # type: ignore[arg-type]
         self._report("")
 

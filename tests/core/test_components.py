@@ -22,7 +22,7 @@ def test_only_what_is_selected_connects():
     assert connected_components(line, selected).tolist() == [0] * 30
     selected[10:16] = False
     assert connected_components(line, selected).tolist() == [1] * 10 + [-1] * 6 + [0] * 14
-    assert connected_components(line, selected, reach=8).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
+    assert connected_components(line, selected, reach=8.0).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
 
 
 def test_scale_and_order_do_not_matter():
