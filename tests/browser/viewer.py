@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -104,6 +104,13 @@ class Tab:
     def says(self, text: str, timeout: float = 20_000) -> None:
         """Waits until the page shows a text."""
         self.page.get_by_text(text).first.wait_for(timeout=timeout)
+
+    def until(self, true: Callable[[], bool], what: str, timeout: float = 20) -> None:
+        """Waits until something holds of the page."""
+        deadline = time.monotonic() + timeout
+        while not true():
+            assert time.monotonic() < deadline, f"{what}: not within {timeout} s; the page says {self.status()[-600:]}"
+            self.page.wait_for_timeout(200)
 
     def settle(self) -> None:
         """Waits until the picture does not change any more: the viewer draws coarsely first."""
