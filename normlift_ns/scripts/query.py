@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from normlift_ns.core.files import atomic_path
-from normlift_ns.core.query import RelevancyForm
-from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
+from normlift_ns.scripts.shared import CONSOLE, AskOptions, choose_device, run_command
 
 
 @dataclass
@@ -23,16 +22,7 @@ class NormLiftQuery:
     """Path to config YAML file of the lifted run."""
     text: tuple[str, ...]
     """What to look for, one or several texts."""
-    negatives: tuple[str, ...] | None = None
-    """What to compare with; by default LERF's words for open_clip, none for colour."""
-    relevancy: RelevancyForm | Literal["auto"] = "auto"
-    """cosine; lerf: against each negative; margin: above the best negative. auto: lerf with negatives, else cosine."""
-    threshold: float | None = None
-    """Relevancy above which a Gaussian is selected; by default 0.5 (cosine), 0.5 (lerf) or 0.02 (margin)."""
-    min_reliability: float = 0.0
-    """Least reliability of a selected Gaussian, in 0..1."""
-    refined: bool = True
-    """Ask the refined directions."""
+    rule: AskOptions = field(default_factory=AskOptions)
     save: bool = False
     """Store the question in the run, in place of an earlier one: ns-render and ns-viewer then draw its answer."""
     json: Path | None = None
@@ -61,25 +51,16 @@ class NormLiftQuery:
 
         run = load_run(self.load_config, data=self.data)
         cameras = training_cameras(run, self.render_views)
-        field = load_field(run)
-        answer = ask(
-            field,
-            encoder_of(field, device),
-            self.text,
-            negatives=self.negatives,
-            form=self.relevancy,
-            threshold=self.threshold,
-            min_reliability=self.min_reliability,
-            refined=self.refined,
-        )
-        rows, rule = summarize(answer, field, run.scene), answer.question
+        semantics = load_field(run)
+        answer = ask(semantics, encoder_of(semantics, device), self.text, **self.rule.keywords())
+        rows, rule = summarize(answer, semantics, run.scene), answer.question
         CONSOLE.print(_table(rows, f"{rule.form} > {rule.threshold:g}"))
         if self.json is not None:
             facts = {"relevancy": rule.form, "threshold": rule.threshold, "negatives": list(rule.negatives)}
             with atomic_path(self.json) as temporary:
                 temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
         if self.output_path is not None:
-            tensors = {"relevancy": answer.relevancy, "reliability": field.scalars.reliability, "valid": answer.valid}
+            tensors = {"relevancy": answer.relevancy, "reliability": semantics.scalars.reliability, "valid": answer.valid}
             arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
             with atomic_path(self.output_path) as temporary, temporary.open("wb") as file:
                 np.savez(file, names=np.array(self.text), **arrays)

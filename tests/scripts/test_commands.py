@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo import DemoRoom
 from normlift_ns.plugin import lifting
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ask, encoder_of
@@ -20,41 +19,7 @@ from normlift_ns.plugin.queries import load_question
 from normlift_ns.plugin.run_dir import load_field
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
-
-SMALL = ("--encoder", "colour", "--k", "12")
-
-
-def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
-    """Exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
-    try:
-        entrypoint()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
-@pytest.fixture(scope="module")
-def room() -> DemoRoom:
-    return demo_room(6000)
-
-
-@pytest.fixture(scope="module")
-def trained(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of a run of stock splatfacto in the room."""
-    folder = tmp_path_factory.mktemp("room")
-    write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
-    return write_splatfacto_run(room, folder / "room", folder / "outputs")
-
-
-@pytest.fixture(scope="module")
-def lifted(trained: Path) -> Path:
-    """config.yml of the lifted run."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        flags = ("--load-config", trained, *SMALL, "--timestamp", "one", "--queries", "red", "yellow")
-        assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    return trained.parents[2] / "normlift" / "one" / "config.yml"
-
+from tests.scripts.conftest import SMALL, run_entry
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
     run = load_run(lifted)
