@@ -10,10 +10,10 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from normlift_ns.plugin.model import NormLiftModelConfig
+from normlift_ns.plugin.pipeline import NormLiftPipelineConfig
 
 normlift_method = MethodSpecification(
     config=TrainerConfig(
@@ -24,7 +24,7 @@ normlift_method = MethodSpecification(
         steps_per_eval_all_images=1000,
         max_num_iterations=30000,
         mixed_precision=False,
-        pipeline=VanillaPipelineConfig(
+        pipeline=NormLiftPipelineConfig(
             datamanager=FullImageDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
@@ -54,8 +54,8 @@ normlift_method = MethodSpecification(
                 ),
             },
         },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     ),
-    description="splatfacto that carries the open-vocabulary semantics of ns-normlift.",
+    description="splatfacto, lifted at the end of its training: open-vocabulary semantics that can be asked.",
 )

@@ -90,6 +90,10 @@ class NormLiftModel(SplatfactoModel):
         self._field = semantic_field.to(self.device)
         self.normlift.open(None if question is None else respond(self._field, question))
 
+    def detach(self) -> None:
+        """Forgets the field, because the Gaussians are about to change."""
+        self.config.semantics = self._field = self._display = None
+
     def show(self, display: Display | None) -> None:
         """Replaces what is drawn besides the colours. Safe to call while another thread renders."""
         self._display = display

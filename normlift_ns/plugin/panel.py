@@ -153,8 +153,9 @@ class Panel(torch.nn.Module):
     def _query(self) -> None:
         """Asks what the text boxes say; nothing of an earlier answer stays, whatever happens."""
         before, field = self._answer, self._model[0].field
-        assert field is not None
         self._replace(None)
+        if field is None:
+            raise ValueError(_WAITING)
         prompts, negatives = _parts(self.ask_1_prompts.value), _parts(self.ask_2_negatives.value)
         if len(prompts) == 0:
             raise ValueError("Type what to look for, then press Query.")
@@ -174,8 +175,7 @@ class Panel(torch.nn.Module):
 
     @_reported
     def _clear(self) -> None:
-        self.ask_1_prompts.value = ""
-        self._replace(None)
+        self._replace(None)  # the prompts stay: this waits for a picture, and the user may type meanwhile
 
     @_reported
     def _ask_again(self) -> None:

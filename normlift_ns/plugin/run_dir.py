@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from copy import deepcopy
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -110,6 +111,8 @@ def _lifted_config(source: SourceRun, run_dir: Path) -> TrainerConfig:
     if location.moved_data or config.output_dir.is_absolute():
         set_data(config, location.data)  # a relative one would not be found
     skip_seed_points(config)
+    datamanager: Any = config.pipeline.datamanager
+    datamanager.cache_images = "gpu"  # that is, on the pipeline's device; "cpu" pins memory, which needs CUDA
     return config
 
 

@@ -203,8 +203,9 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
     assert len(tab.status()) < 5000
     crop.uncheck()
 
+    assert "xxxx" in other.status()
     tab.press("Clear")
-    other.says("Nothing is asked.")
+    other.until(lambda: "xxxx" not in other.status() and "Nothing is asked." in other.status(), "cleared")
     tab.type("Prompts", "red")
     tab.press("Query")
     other.until(lambda: selected(tab) == selected(other) == alone, "the same as before")

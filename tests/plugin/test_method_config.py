@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
@@ -45,7 +45,9 @@ def test_it_trains_as_splatfacto_does() -> None:
     ours, theirs = normlift_method.config, method_configs["splatfacto"]
     assert isinstance(theirs, TrainerConfig)
     different = {f.name for f in fields(TrainerConfig) if getattr(ours, f.name) != getattr(theirs, f.name)}
-    assert different == {"method_name", "pipeline"}
+    assert different == {"method_name", "pipeline", "viewer"}
+    assert replace(ours.viewer, websocket_host=theirs.viewer.websocket_host) == theirs.viewer
+    assert ours.viewer.websocket_host == "127.0.0.1"
     assert ours.pipeline.datamanager == theirs.pipeline.datamanager
     assert ours.pipeline.model == NormLiftModelConfig.upgrade(theirs.pipeline.model)  # type: ignore[arg-type]
 

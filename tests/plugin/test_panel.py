@@ -224,7 +224,7 @@ def test_a_form_without_its_negatives_says_so(panel: Any, pipeline: Any) -> None
 
 def test_clear(panel: Any, pipeline: Any) -> None:
     panel.ask_6_clear.cb_hook(panel.ask_6_clear)
-    assert panel.ask_1_prompts.value == ""
+    assert panel.ask_1_prompts.value == "left"
     assert panel.answer is None
     assert not chosen(pipeline).any()
     assert panel.ask_8_status.content == "Nothing is asked."
