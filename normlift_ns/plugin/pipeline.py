@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import torch
 import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -17,6 +18,7 @@ from normlift_ns.core.files import atomic_path
 from normlift_ns.encoders.build import SourceOptions, make_source
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ENCODER_KEYS, pose
+from normlift_ns.plugin.checkpoint import numpy_numbers
 from normlift_ns.plugin.config import FIELD_FOLDER
 from normlift_ns.plugin.lifting import LiftOptions, lift_run
 from normlift_ns.plugin.model import NormLiftModel
@@ -43,6 +45,10 @@ class NormLiftPipeline(VanillaPipeline):
     """Trains as splatfacto does; after the last checkpoint is saved, lifts that checkpoint in the same run."""
 
     config: NormLiftPipelineConfig
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        torch.serialization.add_safe_globals(numpy_numbers())  # nerfstudio loads its own checkpoints without, and fails
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Those of splatfacto, and the lift.

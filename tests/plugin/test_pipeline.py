@@ -36,6 +36,7 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
     def train(timestamp: str, steps: int = 2, **pipeline: Any) -> StockRun:
         def configure(config: TrainerConfig) -> None:
             config.output_dir = Path("trained")
+            config.pipeline.model.num_random = 60  # type: ignore[attr-defined]
             values = {"source": SourceOptions(encoder="colour", region_count=12), "lift": LIFT, **pipeline}
             for name, value in values.items():
                 setattr(config.pipeline, name, value)
