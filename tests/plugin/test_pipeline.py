@@ -15,6 +15,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.method_configs.normlift import normlift_method
+from normlift_ns.method_configs.scannet import scannet_method
 from normlift_ns.plugin import pipeline as module
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ask, encoder_of
@@ -30,10 +31,13 @@ LIFT = LiftOptions(vote=RefineConfig(k=6))
 @pytest.fixture
 def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., StockRun]:
     """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
-    monkeypatch.setattr("tests.plugin.stock_run.method_configs", {"normlift": normlift_method.config})
+    methods = {m.config.method_name: m.config for m in (normlift_method, scannet_method)}
+    monkeypatch.setattr("tests.plugin.stock_run.method_configs", methods)
     monkeypatch.setattr("normlift_ns.plugin.model.rasterization", None)  # splatfacto's is replaced, ours not wanted
 
-    def train(timestamp: str, steps: int = 2, **pipeline: Any) -> StockRun:
+    def train(
+        timestamp: str, method: str = "normlift", prepare: Any = lambda trainer: None, **pipeline: Any
+    ) -> StockRun:
         def configure(config: TrainerConfig) -> None:
             config.output_dir = Path("trained")
             config.pipeline.model.num_random = 60  # type: ignore[attr-defined]
@@ -42,7 +46,7 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
                 setattr(config.pipeline, name, value)
 
         return train_splatfacto(
-            workspace, Path("scene"), method="normlift", timestamp=timestamp, steps=steps, configure=configure
+            workspace, Path("scene"), method=method, timestamp=timestamp, steps=2, configure=configure, prepare=prepare
         )
 
     return train
@@ -121,3 +125,22 @@ def test_training_a_lifted_checkpoint_further_forgets_its_field(train: Callable[
     assert len(callbacks) == 2
     assert first.trainer.pipeline.model.field is None
     assert first.trainer.pipeline.model.config.semantics is None
+
+
+def test_frozen_points_stay_where_they_are(train: Callable[..., StockRun]) -> None:
+    before: dict[str, torch.Tensor] = {}
+
+    def remember(trainer: Any) -> None:
+        before.update({name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()})
+
+    trained = train("frozen", method="normlift-scannet", prepare=remember)
+    after = trained.trainer.pipeline.model.gauss_params
+    assert torch.equal(before["means"], after["means"])
+    assert all(not torch.equal(before[name], after[name]) for name in ("scales", "opacities", "features_dc"))
+    outputs = trained.trainer.pipeline.datamanager.train_dataparser_outputs
+    assert outputs.dataparser_scale == 1
+    assert torch.equal(outputs.dataparser_transform, torch.eye(4)[:3])
+    assert len(outputs.image_filenames) == 10
+    run = load_run(trained.config)
+    assert (run.train.cameras[0].width, run.train.cameras[0].height) == (23, 17)  # half of 48 x 36, undistorted
+    assert len(load_field(run)) == 60
