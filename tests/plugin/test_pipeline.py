@@ -36,11 +36,12 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
     monkeypatch.setattr("normlift_ns.plugin.model.rasterization", None)  # splatfacto's is replaced, ours not wanted
 
     def train(
-        timestamp: str, method: str = "normlift", prepare: Any = lambda trainer: None, **pipeline: Any
+        timestamp: str, method: str = "normlift", checkpoint: Path | None = None, prepare: Any = lambda trainer: None, **pipeline: Any
     ) -> StockRun:
         def configure(config: TrainerConfig) -> None:
             config.output_dir = Path("trained")
             config.pipeline.model.num_random = 60  # type: ignore[attr-defined]
+            config.load_checkpoint = checkpoint
             values = {"source": SourceOptions(encoder="colour", region_count=12), "lift": LIFT, **pipeline}
             for name, value in values.items():
                 setattr(config.pipeline, name, value)
@@ -144,3 +145,14 @@ def test_frozen_points_stay_where_they_are(train: Callable[..., StockRun]) -> No
     run = load_run(trained.config)
     assert (run.train.cameras[0].width, run.train.cameras[0].height) == (23, 17)  # half of 48 x 36, undistorted
     assert len(load_field(run)) == 60
+
+
+def test_a_stock_checkpoint_is_trained_on_and_lifted(train: Callable[..., StockRun], stock: StockRun) -> None:
+    """`ns-train normlift --load-checkpoint …`, with a full checkpoint, optimizers included."""
+    (checkpoint,) = (stock.config.parent / "nerfstudio_models").iterdir()
+    trained = train("further", checkpoint=checkpoint)
+    run = load_run(trained.config)
+    assert run.step == 4  # the stock run ended with step 2
+    assert len(load_field(run)) == 60
+    before = load_run(stock.config).scene
+    assert (run.scene.means - before.means).abs().max() < 1e-2
