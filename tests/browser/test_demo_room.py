@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 from plyfile import PlyData
 
 from normlift_ns.plugin.queries import load_question
-from tests.browser.viewer import CHROMIUM, Tab, chromium, ns_viewer
+from tests.browser.viewer import CHROMIUM, Tab, chromium, coloured, hue_mask, iou, middle, ns_viewer
 
 pytestmark = [
     pytest.mark.slow,
@@ -48,47 +47,6 @@ def tab(address: str) -> Iterator[Tab]:
         assert tab.problems == []
 
 
-def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
-    """Pixels of a hue, strongly coloured; without the axes in the lower left corner."""
-    rgb = picture.astype(float) / 255
-    high, low = rgb.max(axis=2), rgb.min(axis=2)
-    spread = np.maximum(high - low, 1e-6)
-    red, green, blue = np.moveaxis(rgb, 2, 0)
-    turn = np.where(
-        high == red, (green - blue) / spread % 6, np.where(high == green, (blue - red) / spread + 2, 4 + (red - green) / spread)
-    )
-    near = np.abs((turn / 6 - hue + 0.5) % 1 - 0.5) < 0.04
-    return without_axes(near & (spread / np.maximum(high, 1e-6) > saturation) & (high > 0.25))
-
-
-def coloured(picture: np.ndarray) -> np.ndarray:
-    """Pixels that are not grey."""
-    return without_axes(np.ptp(picture.astype(int), axis=2) > 50)
-
-
-def without_axes(mask: np.ndarray) -> np.ndarray:
-    mask = mask.copy()
-    mask[-90:, :90] = False
-    return mask
-
-
-def iou(one: np.ndarray, other: np.ndarray) -> float:
-    return float((one & other).sum() / (one | other).sum())
-
-
-def middle(mask: np.ndarray) -> tuple[float, float]:
-    """x and y of the pixel of a mask that is nearest to its centre."""
-    y, x = np.nonzero(mask)
-    nearest = np.argmin((y - y.mean()) ** 2 + (x - x.mean()) ** 2)
-    return float(x[nearest]), float(y[nearest])
-
-
-def selected(tab: Tab) -> int:
-    """What the panel says; -1 where nothing is asked."""
-    found = re.findall(r"([\d,]+) of [\d,]+ Gaussians selected", tab.status())
-    return int(found[0].replace(",", "")) if found else -1
-
-
 def test_a_person_asks_clicks_isolates_and_exports(tab: Tab, run_dir: Path, pictures: Path) -> None:
     photo = tab.picture()
     things = {name: hue_mask(photo, *rule) for name, rule in (("red", RED), ("yellow", YELLOW), ("blue", BLUE))}
@@ -103,11 +61,11 @@ def test_a_person_asks_clicks_isolates_and_exports(tab: Tab, run_dir: Path, pict
     overlay = coloured(tab.picture())
     print("overlay of red: IoU", iou(overlay, things["red"]))
     assert iou(overlay, things["red"]) > 0.75
-    some = selected(tab)
+    some = tab.selected()
 
     tab.type("Threshold", "0.98")
     tab.settle()
-    few = selected(tab)
+    few = tab.selected()
     print("selected", some, "above 0.5,", few, "above 0.98")
     assert 0 <= few < some
     assert coloured(tab.picture()).sum() < overlay.sum()
@@ -135,7 +93,7 @@ def test_a_person_asks_clicks_isolates_and_exports(tab: Tab, run_dir: Path, pict
     tab.page.screenshot(path=pictures / "demo_click.png")
     print("clicked yellow: IoU", iou(coloured(tab.picture()), things["yellow"]))
     assert iou(coloured(tab.picture()), things["yellow"]) > 0.6
-    alike = selected(tab)
+    alike = tab.selected()
 
     tab.choose("Output type", "rgb")
     tab.choose("Draw", "the selection alone")
@@ -176,7 +134,7 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
     tab.choose("Output type", "overlay")
     tab.type("Prompts", "red; yellow")
     tab.press("Query")
-    other.until(lambda: other.status().count("■") == 2 and selected(other) == selected(tab) > 0, "both tabs agree")
+    other.until(lambda: other.status().count("■") == 2 and other.selected() == tab.selected() > 0, "both tabs agree")
     assert other.field("Prompts").input_value() == "red; yellow"
 
     for i in range(4):  # a prompt typed while the camera moves, asked while the picture is drawn
@@ -186,8 +144,8 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
         tab.press("Query")
     tab.type("Prompts", "red")
     tab.press("Query")
-    tab.until(lambda: tab.status().count("■") == 1 and 0 < selected(tab) < 1000, "only red is left")
-    alone = selected(tab)
+    tab.until(lambda: tab.status().count("■") == 1 and 0 < tab.selected() < 1000, "only red is left")
+    alone = tab.selected()
 
     crop = tab.page.locator('xpath=//*[text()="Crop Viewport"]/following::input[@type="checkbox"][1]')
     crop.check()
@@ -198,7 +156,7 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
         other.drag(15, 0)
         for one in (tab, other):
             one.until(lambda one=one, prompts=prompts: one.status().count("■") == prompts, f"asked {text[:20]!r}")
-            assert (selected(one) > 0) is (prompts > 0)
+            assert (one.selected() > 0) is (prompts > 0)
         tab.settle()
     assert len(tab.status()) < 5000
     crop.uncheck()
@@ -208,7 +166,7 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
     other.until(lambda: "xxxx" not in other.status() and "Nothing is asked." in other.status(), "cleared")
     tab.type("Prompts", "red")
     tab.press("Query")
-    other.until(lambda: selected(tab) == selected(other) == alone, "the same as before")
+    other.until(lambda: tab.selected() == other.selected() == alone, "the same as before")
     assert other.problems == []
     other.page.close()
     assert "Traceback" not in log.read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 import socket
 import subprocess
@@ -12,6 +13,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from PIL import Image
@@ -105,6 +107,11 @@ class Tab:
         """Waits until the page shows a text."""
         self.page.get_by_text(text).first.wait_for(timeout=timeout)
 
+    def selected(self) -> int:
+        """Number of selected Gaussians that the panel shows; -1 where nothing is asked."""
+        found = re.findall(r"([\d,]+) of [\d,]+ Gaussians selected", self.status())
+        return int(found[0].replace(",", "")) if found else -1
+
     def until(self, true: Callable[[], bool], what: str, timeout: float = 20) -> None:
         """Waits until something holds of the page."""
         deadline = time.monotonic() + timeout
@@ -130,10 +137,45 @@ class Tab:
         """Clicks on the picture, pixels from its upper left corner."""
         self.page.mouse.click(x, TITLE + y)
 
-    def drag(self, x: float, y: float) -> None:
-        """Turns the camera: drags from the middle of the picture."""
+    def drag(self, x: float, y: float, button: Literal["left", "right"] = "left") -> None:
+        """Drags from the middle of the picture: turns the camera, with the right button moves it."""
         middle = ((_SIZE[0] - PANEL) / 2, (TITLE + _SIZE[1]) / 2)
         self.page.mouse.move(*middle)
-        self.page.mouse.down()
+        self.page.mouse.down(button=button)
         self.page.mouse.move(middle[0] + x, middle[1] + y, steps=10)
-        self.page.mouse.up()
+        self.page.mouse.up(button=button)
+
+
+def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
+    """Pixels of a hue, strongly coloured; without the axes in the lower left corner."""
+    rgb = picture.astype(float) / 255
+    high, low = rgb.max(axis=2), rgb.min(axis=2)
+    spread = np.maximum(high - low, 1e-6)
+    red, green, blue = np.moveaxis(rgb, 2, 0)
+    turn = np.where(
+        high == red, (green - blue) / spread % 6, np.where(high == green, (blue - red) / spread + 2, 4 + (red - green) / spread)
+    )
+    near = np.abs((turn / 6 - hue + 0.5) % 1 - 0.5) < 0.04
+    return without_axes(near & (spread / np.maximum(high, 1e-6) > saturation) & (high > 0.25))
+
+
+def coloured(picture: np.ndarray) -> np.ndarray:
+    """Pixels that are not grey."""
+    return without_axes(np.ptp(picture.astype(int), axis=2) > 50)
+
+
+def without_axes(mask: np.ndarray) -> np.ndarray:
+    mask = mask.copy()
+    mask[-90:, :90] = False
+    return mask
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return float((one & other).sum() / (one | other).sum())
+
+
+def middle(mask: np.ndarray) -> tuple[float, float]:
+    """x and y of the pixel of a mask that is nearest to its centre."""
+    y, x = np.nonzero(mask)
+    nearest = np.argmin((y - y.mean()) ** 2 + (x - x.mean()) ** 2)
+    return float(x[nearest]), float(y[nearest])
