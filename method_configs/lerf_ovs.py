@@ -14,9 +14,7 @@ from normlift_ns.plugin.model import NormLiftModelConfig
 lerf_ovs_method = MethodSpecification(
     config=trainer_config(
         "normlift-lerf-ovs",
-        ColmapDataParserConfig(
-            load_3D_points=True, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"
-        ),
+        ColmapDataParserConfig(load_3D_points=True, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"),
         NormLiftModelConfig(),
     ),
     description="normlift for scenes of the LERF-OVS benchmark: COLMAP folders, all images train.",

@@ -1,8 +1,8 @@
 """The panel in nerfstudio's viewer: what is asked, what is shown of the answer, and what is written.
 
-nerfstudio finds the elements by walking the attributes of the model, in alphabetical order, once when the viewer starts.
-It calls their hooks under its render lock. Rendering happens in other threads, which read nothing of this but the
-`Display` that the model got last.
+nerfstudio finds the elements by walking the attributes of the model, in alphabetical order, once when the viewer
+starts. It calls their hooks under its render lock. Rendering happens in other threads, which read nothing of this but
+the `Display` that the model got last.
 """
 
 from __future__ import annotations
@@ -93,31 +93,32 @@ class Panel(torch.nn.Module):
         self._answer: Answer | None = None
         self._rendered: tuple[int | None, str, str] | None = None
         self.control = ViewerControl()
-        off = {"disabled": True}
-        self.ask_1_prompts = _Text("Prompts", "", **off, hint="What to look for; several are separated by ;")
-        self.ask_2_negatives = _Text("Negatives", "", **off, hint="What to compare with; several are separated by ;")
+        self.ask_1_prompts = _Text("Prompts", "", hint="What to look for; several are separated by ;")
+        self.ask_2_negatives = _Text("Negatives", "", hint="What to compare with; several are separated by ;")
         forms = ["auto", *THRESHOLDS]
-        self.ask_3_relevancy = ViewerDropdown("Relevancy", "auto", forms, **off, hint="lerf and margin use negatives")
-        self.ask_4_refined = ViewerCheckbox("Refined", True, **off, cb_hook=self._ask_again, hint="Ask voted directions")
-        self.ask_5_query = ViewerButton("Query", self._query, **off)
-        self.ask_6_clear = ViewerButton("Clear", self._clear, **off)
-        self.ask_7_click = ViewerButton("Click: more like this", self._arm, **off)
+        self.ask_3_relevancy = ViewerDropdown("Relevancy", "auto", forms, hint="lerf and margin use negatives")
+        self.ask_4_refined = ViewerCheckbox("Refined", True, cb_hook=self._ask_again, hint="Ask voted directions")
+        self.ask_5_query = ViewerButton("Query", self._query)
+        self.ask_6_clear = ViewerButton("Clear", self._clear)
+        self.ask_7_click = ViewerButton("Click: more like this", self._arm)
         self.ask_8_status = _Markdown(_WAITING)
         self.show_1_prompt = ViewerDropdown(
-            "Prompt shown", _ALL, [_ALL], **off, cb_hook=self._show, hint="In overlay and selection"
+            "Prompt shown", _ALL, [_ALL], cb_hook=self._show, hint="In overlay and selection"
         )
         self.show_2_threshold = ViewerSlider(
-            "Threshold", 0.5, -0.2, 1.0, 0.005, **off, cb_hook=self._judge, hint="Relevancy above which to select"
+            "Threshold", 0.5, -0.2, 1.0, 0.005, cb_hook=self._judge, hint="Relevancy above which to select"
         )
         self.show_3_reliability = ViewerSlider(
-            "Min reliability", 0.0, 0.0, 1.0, 0.01, **off, cb_hook=self._judge, hint="Least reliability to select"
+            "Min reliability", 0.0, 0.0, 1.0, 0.01, cb_hook=self._judge, hint="Least reliability to select"
         )
-        self.show_4_part = ViewerDropdown("Draw", PARTS[0], list(PARTS), **off, cb_hook=self._show, hint="What is drawn")
+        self.show_4_part = ViewerDropdown("Draw", PARTS[0], list(PARTS), cb_hook=self._show, hint="What is drawn")
         self.show_5_colormap = ViewerDropdown(
-            "Overlay colours", COLORMAPS[0], list(COLORMAPS), **off, cb_hook=self._show, hint="Of the overlay"
+            "Overlay colours", COLORMAPS[0], list(COLORMAPS), cb_hook=self._show, hint="Of the overlay"
         )
-        self.write_1_export = ViewerButton("Export selection", self._export, **off)
-        self.write_2_save = ViewerButton("Save queries in run", self._save, **off)
+        self.write_1_export = ViewerButton("Export selection", self._export)
+        self.write_2_save = ViewerButton("Save queries in run", self._save)
+        for element in self._elements():
+            element.disabled = True
 
     @property
     def answer(self) -> Answer | None:
@@ -128,11 +129,10 @@ class Panel(torch.nn.Module):
         """Lets the panel be used, once the model has a field, and shows an answer."""
         field = self._model[0].field
         assert field is not None
-        for element in vars(self).values():
-            if isinstance(element, ViewerElement) and element.disabled:
-                element.disabled = False
-                if element.gui_handle is not None:
-                    element.set_disabled(False)
+        for element in self._elements():
+            element.disabled = False
+            if element.gui_handle is not None:
+                element.set_disabled(False)
         if answer is None:
             self.ask_2_negatives.value = "; ".join(default_negatives(field))
         else:
@@ -144,6 +144,11 @@ class Panel(torch.nn.Module):
             self.ask_4_refined.value = question.refined
             self.show_3_reliability.value = question.min_reliability
         self._replace(answer)
+
+    def _elements(self) -> list[ViewerElement[Any]]:
+        """All but the text."""
+        found = [element for element in vars(self).values() if isinstance(element, ViewerElement)]
+        return [element for element in found if element is not self.ask_8_status]
 
     def note(self, text: str) -> None:
         """Shows a message, and below it what is shown now."""
@@ -245,7 +250,7 @@ class Panel(torch.nn.Module):
         harmonics = model.config.sh_degree > 0
         path = free_path(path)
         rows = write_splats(
-            path, model.gauss_params, model.field, self._answer, keep=chosen, spherical_harmonics=harmonics
+            path, dict(model.gauss_params), model.field, self._answer, keep=chosen, spherical_harmonics=harmonics
         )
         self.note(f"{len(rows):,} Gaussians written to {path}")
 

@@ -50,7 +50,9 @@ class NormLiftPipeline(VanillaPipeline):
         super().__init__(*args, **kwargs)
         torch.serialization.add_safe_globals(numpy_numbers())  # nerfstudio loads its own checkpoints without, and fails
 
-    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
         """Those of splatfacto, and the lift.
 
         Raises:

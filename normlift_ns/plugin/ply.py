@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64
 from nerfstudio.models.splatfacto import RGB2SH
-from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
@@ -76,6 +75,8 @@ def write_splats(
     Raises:
         ValueError: none of them can be written.
     """
+    from plyfile import PlyData, PlyElement  # noqa: PLC0415 (import-light: every ns-* command loads this module)
+
     columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
     rows = exported_rows(columns, keep)
     if len(rows) == 0:

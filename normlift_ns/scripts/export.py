@@ -47,7 +47,9 @@ class NormLiftExport:
         beside = {kind: target.with_name(f"{target.stem}_{kind}") for kind in ("rows.npy", "objects.json")}
         found = [path for path in (target, *beside.values()) if path.exists()]
         if len(found) > 0 and not self.overwrite:
-            raise FileExistsError(f"{found[0]} exists; give another --output-dir or --output-filename, or --overwrite True.")
+            raise FileExistsError(
+                f"{found[0]} exists; give another --output-dir or --output-filename, or --overwrite True."
+            )
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
         from normlift_ns.plugin.asking import encoder_of, pose, respond  # noqa: PLC0415
@@ -103,7 +105,9 @@ def _table(tables: list[dict[str, Any]]) -> Table:
             vectors = (" ".join(f"{x:.2f}" for x in row) for row in (found["centroid"], sides))
             numbers = (f"{found['size']:,}", *vectors, f"{found['mean_reliability']:.3f}")
             table.add_row(entry["text"] if i == 0 else "", str(i), *numbers)
-        table.add_row("" if entry["objects"] else entry["text"], "smaller", f"{entry['in_smaller_parts']:,}", "", "", "")
+        table.add_row(
+            "" if entry["objects"] else entry["text"], "smaller", f"{entry['in_smaller_parts']:,}", "", "", ""
+        )
     return table
 
 

@@ -60,7 +60,11 @@ class NormLiftQuery:
             with atomic_path(self.json) as temporary:
                 temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
         if self.output_path is not None:
-            tensors = {"relevancy": answer.relevancy, "reliability": semantics.scalars.reliability, "valid": answer.valid}
+            tensors = {
+                "relevancy": answer.relevancy,
+                "reliability": semantics.scalars.reliability,
+                "valid": answer.valid,
+            }
             arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
             with atomic_path(self.output_path) as temporary, temporary.open("wb") as file:
                 np.savez(file, names=np.array(self.text), **arrays)

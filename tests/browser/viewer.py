@@ -153,7 +153,9 @@ def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
     spread = np.maximum(high - low, 1e-6)
     red, green, blue = np.moveaxis(rgb, 2, 0)
     turn = np.where(
-        high == red, (green - blue) / spread % 6, np.where(high == green, (blue - red) / spread + 2, 4 + (red - green) / spread)
+        high == red,
+        (green - blue) / spread % 6,
+        np.where(high == green, (blue - red) / spread + 2, 4 + (red - green) / spread),
     )
     near = np.abs((turn / 6 - hue + 0.5) % 1 - 0.5) < 0.04
     return without_axes(near & (spread / np.maximum(high, 1e-6) > saturation) & (high > 0.25))

@@ -5,7 +5,7 @@ import pytest
 from normlift_ns.core.files import file_name, free_path
 
 
-@pytest.mark.parametrize("text", ["../../etc/passwd", "a\\b:c*?\"<>|", "x" * 300, "tea\npot\0", "..", "~", "größe 7"])
+@pytest.mark.parametrize("text", ["../../etc/passwd", 'a\\b:c*?"<>|', "x" * 300, "tea\npot\0", "..", "~", "größe 7"])
 def test_a_text_never_leaves_its_folder(text: str, tmp_path: Path):
     path = tmp_path / f"{file_name(text)}.ply"
     assert path.resolve().parent == tmp_path.resolve()

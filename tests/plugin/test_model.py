@@ -12,10 +12,10 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns.plugin.adapters import load_run
-from normlift_ns.plugin.config import rerooted
-from normlift_ns.plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.plugin.asking import respond
+from normlift_ns.plugin.config import rerooted
 from normlift_ns.plugin.display import make_display
+from normlift_ns.plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.plugin.queries import Question
 from normlift_ns.plugin.run_dir import write_run
 from normlift_ns.raster.rasterize import render
@@ -166,8 +166,10 @@ def test_hidden_gaussians_are_not_drawn_at_all(pipeline, stock: StockRun, monkey
     answer = respond(model.field, QUESTION)
     drawn = answer.selected[:, 0] == (part == "the selection alone")
     assert 5 < int(drawn.sum()) < 55
-    expected, alpha = render(
-        _rows(load_run(stock.config).scene, drawn), load_run(stock.config).train.cameras[0], torch.ones(int(drawn.sum()), 1)
+    _, alpha = render(
+        _rows(load_run(stock.config).scene, drawn),
+        load_run(stock.config).train.cameras[0],
+        torch.ones(int(drawn.sum()), 1),
     )
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)

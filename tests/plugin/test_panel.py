@@ -22,8 +22,8 @@ from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerElement
 from plyfile import PlyData
 
-from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ENCODER_KEYS, respond
 from normlift_ns.plugin.config import rerooted

@@ -36,7 +36,11 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
     monkeypatch.setattr("normlift_ns.plugin.model.rasterization", None)  # splatfacto's is replaced, ours not wanted
 
     def train(
-        timestamp: str, method: str = "normlift", checkpoint: Path | None = None, prepare: Any = lambda trainer: None, **pipeline: Any
+        timestamp: str,
+        method: str = "normlift",
+        checkpoint: Path | None = None,
+        prepare: Any = lambda trainer: None,
+        **pipeline: Any,
     ) -> StockRun:
         def configure(config: TrainerConfig) -> None:
             config.output_dir = Path("trained")

@@ -21,6 +21,7 @@ from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.scripts.conftest import SMALL, run_entry
 
+
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
     run = load_run(lifted)
     field = load_field(run)

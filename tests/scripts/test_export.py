@@ -43,7 +43,9 @@ def ns_export(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     sys.modules.pop("nerfstudio.scripts.exporter")
 
 
-def test_the_file_is_that_of_ns_export_and_more(scene_ply: Path, lifted: Path, ns_export, monkeypatch, tmp_path) -> None:
+def test_the_file_is_that_of_ns_export_and_more(
+    scene_ply: Path, lifted: Path, ns_export, monkeypatch, tmp_path
+) -> None:
     setup = ns_export.eval_setup
 
     def spoiled(config: Path, **options):
@@ -95,7 +97,9 @@ def test_open3d_opens_it(scene_ply: Path) -> None:
     assert cloud.point.reliability.numpy().max() < 1
 
 
-def test_selection_and_rest_make_up_the_scene(scene_ply: Path, lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_selection_and_rest_make_up_the_scene(
+    scene_ply: Path, lifted: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
     rows = {}
     for part in ("selection", "rest"):
         flags = ("--load-config", lifted, "--output-dir", tmp_path, "--part", part, "--text", "red")
@@ -134,7 +138,9 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     ],
 )
 def test_mistakes_have_a_message(flags, message, lifted, tmp_path, monkeypatch, capsys) -> None:
-    assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path / "x", *flags) == 1
+    assert (
+        run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path / "x", *flags) == 1
+    )
     shown = capsys.readouterr()
     assert message in " ".join((shown.out + shown.err).split())
     assert not list((tmp_path / "x").glob("*"))
