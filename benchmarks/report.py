@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
-PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat")
+PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat", "transformers")
 
 
 @dataclass(frozen=True)

@@ -29,3 +29,16 @@ def test_quick_cpu_benchmark(tmp_path):
     assert metrics["fox_directions_s"]["error"] < 1e-4
     assert metrics["fox_refine_s"]["error"] < 5e-3
     assert metrics["fox_evidence_peak_gib"]["value"] < 3
+
+
+@pytest.mark.slow
+def test_quick_front_ends_benchmark(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.front_ends", "--quick", "--device", "cpu", "--output", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    print(done.stdout)
+    metrics = {metric["key"]: metric for metric in json.loads((tmp_path / "front_ends.json").read_text())["metrics"]}
+    assert {"sam_network_rate", "sam_labels_s", "nms_10_s", "encode_10_s", "share_10", "patches_s"} <= set(metrics)
+    assert all(metrics[f"sam_masks_{level}"]["value"] > 0 for level in ("default", "s", "m", "l"))
+    assert metrics["nms_10_s"]["error"] == 0
+    assert metrics["encode_10_s"]["error"] < 1e-5 and metrics["patches_s"]["error"] < 1e-5

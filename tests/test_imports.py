@@ -22,11 +22,13 @@ ALLOWED = {
         "skimage",
         "PIL",
         "huggingface_hub",
+        "torchvision",
+        "cv2",
         *(f"normlift_ns.{x}" for x in ("core", "encoders")),
     },
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},
     "plugin": BASE
-    | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib"}
+    | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib", "plyfile"}
     | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin")},
 }
 

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED
 from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.crops import Fill
 from normlift_ns.encoders.langsplat import LangSplat, Missing
-from normlift_ns.encoders.open_clip import Fill, OpenClipEncoder
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.patches import PatchFeatures, why_not_dense
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
+from normlift_ns.encoders.sam import SamMasks
+from normlift_ns.encoders.sam_weights import DEFAULT_SAM, local_sam
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
 from normlift_ns.encoders.text_vectors import TextVectors
 
 EncoderName = Literal["open_clip", "colour"]
-RegionsName = Literal["auto", "superpixel", "grid", "files"]
+RegionsName = Literal["auto", "sam", "patches", "superpixel", "grid", "files"]
 FeaturesName = Literal["none", "langsplat"]
 
 
@@ -24,17 +29,26 @@ class SourceOptions:
     """What to see in the images: an encoder, and the regions that it looks at."""
 
     encoder: EncoderName = "open_clip"
-    """open_clip: CLIP features of masked crops. colour: mean colours against colour names, without learned weights."""
+    """open_clip: CLIP features of masked crops, or of patches. colour: mean colours against colour names, without
+    learned weights."""
     encoder_model: str = DEFAULT_MODEL
     """Architecture of the open_clip encoder."""
     encoder_pretrained: str = DEFAULT_PRETRAINED
     """Weights of the open_clip encoder: a tag to download, or a local file of that architecture."""
     crop_fill: Fill = "black"
     """What the open_clip encoder sees around a region."""
+    text_template: str = "{}"
+    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
+    seven. The default is the bare text."""
     regions: RegionsName = "auto"
-    """superpixel, grid, files: label maps from regions_dir. auto: files if regions_dir is given, else superpixel."""
-    region_count: int = 256
-    """Regions per image, about, of superpixel and grid."""
+    """sam: SAM's masks. patches: the patches of a CLIP vision transformer, each with a feature of its own. superpixel,
+    grid. files: label maps from regions_dir. auto: files if regions_dir is given, sam if sam_model is; else, for
+    open_clip, sam on a GPU if its weights are on this machine, or else patches; superpixel for encoders without."""
+    region_count: int | None = None
+    """Regions per image, about: of superpixel and grid 256 by default, of patches 1024."""
+    sam_model: str | None = None
+    """Weights of sam: a folder as transformers writes it, a file as Meta publishes it, or a name to download. By
+    default facebook/sam-vit-huge, LangSplat's."""
     regions_dir: Path | None = None
     """Folder with one label map per image, PNG or NPY of the same stem."""
     regions_background: int = 0
@@ -42,8 +56,9 @@ class SourceOptions:
     regions_resample: bool = False
     """Bring label maps of another size to the image's by nearest neighbour, instead of refusing them."""
     level: str | None = None
-    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. langsplat: s, m, l (the
-    default), default (all of SAM's masks in one map), or sum (the vectors of all levels added up)."""
+    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. sam and langsplat: s, m, l
+    (subparts, parts, wholes; l by default) or default (all of SAM's masks in one map); langsplat also sum (the vectors
+    of all levels added up)."""
     features: FeaturesName = "none"
     """Take regions and features from features_dir instead of looking at images. langsplat: its preprocessing."""
     features_dir: Path | None = None
@@ -73,7 +88,10 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             raise ValueError(
                 f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat"
             )
-        return RegionFeatures(make_regions(options), make_encoder(options, device))
+        options = replace(options, regions=resolve_regions(options, device))
+        if options.regions == "patches":
+            return _make_patches(options, device)
+        return RegionFeatures(make_regions(options, device), make_encoder(options, device))
     if options.features_dir is None:
         raise ValueError(f"features {options.features!r} need their folder: give it with --features-dir")
     if options.regions != "auto" or options.regions_dir is not None:
@@ -105,24 +123,48 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
         FileNotFoundError: a weight file that does not exist.
     """
     if options.encoder == "open_clip":
-        return OpenClipEncoder(options.encoder_model, options.encoder_pretrained, options.crop_fill, device)
+        return _make_clip(options, device)
     if options.encoder == "colour":
+        if options.text_template != "{}":
+            raise ValueError(f"--text-template {options.text_template!r} is for --encoder open_clip; leave it out")
         return ColourEncoder()
     raise ValueError(f"unknown encoder {options.encoder!r}; --encoder is one of {', '.join(get_args(EncoderName))}")
 
 
-def make_regions(options: SourceOptions) -> Regions:
-    """The regions of the options.
+def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
+    """The regions of the options, "auto" decided.
 
     Raises:
-        ValueError: unknown regions, "files" without a folder, a folder or a level that the regions have no use for.
-        FileNotFoundError: the folder does not exist.
+        ValueError: unknown regions.
     """
-    kind = options.regions
-    if kind not in get_args(RegionsName):
-        raise ValueError(f"unknown regions {kind!r}; --regions is one of {', '.join(get_args(RegionsName))}")
-    if kind == "auto":
-        kind = "superpixel" if options.regions_dir is None else "files"
+    if options.regions not in get_args(RegionsName):
+        raise ValueError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionsName))}")
+    if options.regions != "auto":
+        return options.regions
+    if options.regions_dir is not None:
+        return "files"
+    if options.sam_model is not None:
+        return "sam"
+    if options.encoder != "open_clip":
+        return "superpixel"
+    if device.startswith("cuda") and find_spec("transformers") is not None and local_sam(DEFAULT_SAM) is not None:
+        return "sam"
+    return "patches" if why_not_dense(options.encoder_model) is None else "superpixel"
+
+
+def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
+    """The regions of the options, but for patches, which are not to be had without their features.
+
+    Args:
+        device: where a network runs, such as "cuda"; results are on the CPU anyway.
+    Raises:
+        ValueError: unknown regions, "files" without a folder, a folder or a level that the regions have no use for;
+            what `SamMasks` raises.
+        FileNotFoundError: the folder, or the checkpoint of sam, does not exist.
+    """
+    kind = resolve_regions(options, device)
+    if kind != "sam":
+        _refuse(options.sam_model, "--sam-model", kind, "sam")
     if kind == "files":
         if options.regions_dir is None:
             raise ValueError(
@@ -130,10 +172,35 @@ def make_regions(options: SourceOptions) -> Regions:
             )
         level = _number(options.level)
         return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
-    for flag, value in (("--regions-dir", options.regions_dir), ("--level", options.level)):
-        if value is not None:
-            raise ValueError(f'{flag} {value} is for --regions files, not for "{kind}"; leave one of the two out')
-    return Superpixels(options.region_count) if kind == "superpixel" else Grid(options.region_count)
+    _refuse(options.regions_dir, "--regions-dir", kind, "files")
+    if kind == "sam":
+        level: Any = options.level or "l"
+        return SamMasks(options.sam_model or DEFAULT_SAM, level, device)
+    _refuse(options.level, "--level", kind, "files or sam")
+    count = 256 if options.region_count is None else options.region_count
+    if kind == "patches":
+        raise ValueError("patches are no regions that another encoder could look at; use make_source")
+    return Superpixels(count) if kind == "superpixel" else Grid(count)
+
+
+def _make_patches(options: SourceOptions, device: str) -> PatchFeatures:
+    _refuse(options.sam_model, "--sam-model", "patches", "sam")
+    _refuse(options.regions_dir, "--regions-dir", "patches", "files")
+    _refuse(options.level, "--level", "patches", "files or sam")
+    if options.encoder != "open_clip":
+        raise ValueError(f"--regions patches are those of --encoder open_clip; {options.encoder!r} has none")
+    return PatchFeatures(_make_clip(options, device), 1024 if options.region_count is None else options.region_count)
+
+
+def _make_clip(options: SourceOptions, device: str) -> OpenClipEncoder:
+    return OpenClipEncoder(
+        options.encoder_model, options.encoder_pretrained, options.crop_fill, device, options.text_template
+    )
+
+
+def _refuse(value: object, flag: str, kind: str, meant: str) -> None:
+    if value is not None:
+        raise ValueError(f'{flag} {value} is for --regions {meant}, not for "{kind}"; leave one of the two out')
 
 
 def _number(level: str | None) -> int | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -20,7 +21,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from normlift_ns.core.files import atomic_path
-from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, ViewFeatures, check_prompts
 
 _FORMAT = "normlift_ns.encoders/2"
 """Part of every key: to be raised when labels or features change for the same settings."""
@@ -32,6 +35,8 @@ def cached(source: FeatureSource, folder: Path) -> FeatureSource:
     Raises (later, where a view is asked for):
         OSError: the folder cannot be written to, as when the disk is full.
     """
+    if isinstance(source, PatchFeatures):
+        return CachedPatches(source, folder / "features")
     if not isinstance(source, RegionFeatures):
         return source
     regions, encoder = (
@@ -63,7 +68,7 @@ class CachedRegions:
     def files(self, name: str) -> tuple[Path, ...]:
         return self.regions.files(name)
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
         found = _read(path, "labels")
         if found is None:
@@ -92,7 +97,7 @@ class CachedEncoder:
     def identity(self) -> dict[str, Any]:
         return self.encoder.identity
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         path = self.path(image, labels)
         found = _read(path, "features")
         if found is None:
@@ -103,9 +108,67 @@ class CachedEncoder:
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
 
-    def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Path:
+    def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Where the features of an image's regions are kept, whether they exist or not."""
         return _path(self.folder, self.identity, *_parts(image), *_parts(labels))
+
+
+@dataclass(frozen=True)
+class CachedPatches:
+    """A `PatchFeatures` that keeps the features of images that it has seen.
+
+    The key: the image, and the settings.
+    """
+
+    source: PatchFeatures
+    folder: Path
+    """Holds one safetensors file per image; made if it does not exist."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return self.source.identity
+
+    def available(self, names: Sequence[str]) -> list[str]:
+        return self.source.available(names)
+
+    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
+        path = _path(self.folder, self.identity, *_parts(image))
+        found = _read(path, "features")
+        if found is None:
+            found = self.source.features(image, name)
+            _write(path, "features", found)
+        return ViewFeatures(self.source.labels(image), found)
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        return self.source.text(prompts)
+
+
+@dataclass(frozen=True)
+class CachedTexts:
+    """The texts of an `OpenClipEncoder`, kept, so that a question asked again needs no network.
+
+    The key: the text, and the settings that change its vector.
+    """
+
+    encoder: OpenClipEncoder
+    folder: Path
+    """Holds one safetensors file per text; made if it does not exist. Where it cannot be written to, nothing is
+    kept."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return self.encoder.identity
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        check_prompts(prompts)
+        paths = {prompt: _path(self.folder, self.encoder.text_identity, prompt.encode()) for prompt in prompts}
+        rows = {prompt: _read(path, "text") for prompt, path in paths.items()}
+        new = [prompt for prompt, row in rows.items() if row is None]
+        for prompt, row in zip(new, self.encoder.text(new) if len(new) > 0 else []):
+            rows[prompt] = row
+            with suppress(OSError):
+                _write(paths[prompt], "text", row)
+        return torch.stack([row for prompt in prompts if (row := rows[prompt]) is not None])
 
 
 def _parts(tensor: Tensor) -> tuple[bytes, bytes]:

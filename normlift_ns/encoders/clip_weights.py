@@ -5,11 +5,11 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
-import urllib.error
-import urllib.request
 import warnings
 from pathlib import Path
 from typing import Any
+
+from normlift_ns.encoders.weights import first_line, probe
 
 DEFAULT_MODEL = "ViT-B-16"
 DEFAULT_PRETRAINED = "laion2b_s34b_b88k"
@@ -18,7 +18,6 @@ REMEDY = (
     "the encoder that needs no weights: --encoder colour"
 )
 _SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_PROBE_SECONDS = 10
 
 
 def import_open_clip() -> Any:
@@ -33,7 +32,8 @@ def check_names(model: str, pretrained: str) -> None:
     """Checks an architecture and its weights by name, without loading or downloading anything.
 
     Raises:
-        ValueError: a model or a tag of weights that open_clip does not know.
+        ValueError: a model or a tag of weights that open_clip does not know, or a model that the installed timm does
+            not know.
         FileNotFoundError: what looks like a weight file does not exist.
     """
     open_clip = import_open_clip()
@@ -42,6 +42,14 @@ def check_names(model: str, pretrained: str) -> None:
         raise ValueError(
             f"unknown OpenCLIP model {model!r} (--encoder-model); near names: {near}. All of them: "
             'python -c "import open_clip; print(open_clip.list_models())"'
+        )
+    tower = open_clip.get_model_config(model)["vision_cfg"].get("timm_model_name")
+    timm = importlib.import_module("timm")
+    if tower is not None and not timm.is_model(tower):
+        raise ValueError(
+            f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
+            f"{timm.__version__} does not have (nerfstudio pins an old one); take a model that open_clip builds "
+            f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
         )
     path = Path(pretrained)
     if path.is_file() or open_clip.is_pretrained_cfg(model, pretrained):
@@ -79,12 +87,6 @@ def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
         ) from None
 
 
-def first_line(error: Exception) -> str:
-    """The beginning of a foreign error, for a message of ours."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if len(lines) > 0 else type(error).__name__
-
-
 def _cached(published: dict[str, Any]) -> Path | None:
     """The file in the cache of the Hugging Face hub, looked for without the network."""
     hub = importlib.import_module("huggingface_hub")
@@ -99,15 +101,5 @@ def _cached(published: dict[str, Any]) -> Path | None:
 
 def _download(published: dict[str, Any]) -> Path:
     if published.get("hf_hub"):
-        _probe(importlib.import_module("huggingface_hub").constants.ENDPOINT)
+        probe(importlib.import_module("huggingface_hub").constants.ENDPOINT)
     return Path(import_open_clip().download_pretrained(published))
-
-
-def _probe(address: str) -> None:
-    """Raises OSError if a server does not answer: the hub's own client would retry for most of a minute."""
-    try:
-        urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
-    except urllib.error.HTTPError:  # an answer
-        pass
-    except OSError as error:
-        raise ConnectionError(f"{address} cannot be reached, {error}") from error

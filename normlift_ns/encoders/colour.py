@@ -54,10 +54,9 @@ class ColourEncoder:
     def identity(self) -> dict[str, Any]:
         return {"kind": "colour", "sigma": SIGMA}
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
-        lab = torch.from_numpy(rgb2lab(image.numpy())).flatten(0, 1)
-        region = labels.flatten().long()
-        lab, region = lab[region >= 0], region[region >= 0]
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        depth, y, x = (labels >= 0).nonzero(as_tuple=True)
+        lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()
         pixels = torch.bincount(region)
         total = torch.zeros(len(pixels), 3, dtype=torch.float64).index_add_(0, region, lab.double())
         return embed(total / pixels[:, None]).float()

@@ -201,7 +201,7 @@ def write_langsplat(
     if isinstance(source, RegionFeatures):
         maps = source.regions.labels(image, name)
         if len(maps) == len(LEVELS):
-            levels = [(labels, source.encoder.encode(image, labels)) for labels in maps]
+            levels = [(labels[0], source.encoder.encode(image, labels)) for labels in maps]
     if len(levels) == 0:
         view = source.view(image, name)
         if len(view.region_of_cell) != 1:

@@ -1,47 +1,27 @@
-"""OpenCLIP as an encoder: masked square crops of regions, as LangSplat cuts them, against texts.
-
-For every region: pixels outside of it are filled, the image is cropped to its box, padded with black to a centred
-square, resized bilinearly to the size of the model and normalised with the model's mean and standard deviation.
-LangSplat fills with black; LaGa and SFS fill with white (and pad with black too). LangSplat's boxes, which come from
-SAM, leave out the last row and column of a mask; ours do not.
-"""
+"""OpenCLIP as an encoder: masked square crops of regions against texts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, get_args
 
 import torch
 from jaxtyping import Float, Float32, Int32, UInt8
-from scipy.ndimage import find_objects
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize, pad
+from torch.nn.functional import normalize
 
-from normlift_ns.encoders.clip_weights import (
-    DEFAULT_MODEL,
-    DEFAULT_PRETRAINED,
-    REMEDY,
-    check_names,
-    find_weights,
-    first_line,
-    import_open_clip,
-)
+from normlift_ns.encoders.batches import Batches
+from normlift_ns.encoders.clip_network import ClipNetwork, load_clip
+from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED, check_names, import_open_clip
+from normlift_ns.encoders.crops import Fill, masked_crops, region_boxes
 from normlift_ns.encoders.source import check_prompts
+from normlift_ns.encoders.weights import content_identity
 
-Fill = Literal["black", "white"]
-_BATCH = 64
-
-
-class _Network(NamedTuple):
-    model: Any
-    tokenizer: Any
-    size: tuple[int, int]
-    mean: Tensor
-    std: Tensor
+ENSEMBLE = "ensemble"
+_BATCH = {"cuda": 256, "cpu": 64}
 
 
 @dataclass(frozen=True)
@@ -50,7 +30,8 @@ class OpenClipEncoder:
     GPU, in float32 elsewhere; vectors are normalised in float32.
 
     Raises:
-        ValueError: a model or a tag of weights that open_clip does not know, an unknown fill.
+        ValueError: a model or a tag of weights that open_clip does not know, a model that the installed timm does not
+            know, an unknown fill, a template without a place for the text.
         FileNotFoundError: a weight file that does not exist.
     """
 
@@ -62,10 +43,17 @@ class OpenClipEncoder:
     """What the pixels outside of a region become."""
     device: str = "cpu"
     """Where the network runs; results are on the CPU anyway."""
+    template: str = "{}"
+    """What the network reads for a text, which takes the place of {}; "ensemble": the mean of open_clip's seven."""
 
     def __post_init__(self) -> None:
         if self.fill not in get_args(Fill):
             raise ValueError(f"fill of crops must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
+        if self.template != ENSEMBLE and "{}" not in self.template:
+            raise ValueError(
+                f"text template {self.template!r} has no {{}} where the text belongs; write it like "
+                f'"a photo of a {{}}", or {ENSEMBLE} for the mean of several'
+            )
         check_names(self.model, self.pretrained)
 
     @property
@@ -73,100 +61,65 @@ class OpenClipEncoder:
         """A weight file counts by its content, wherever it lies."""
         return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
+    @property
+    def text_identity(self) -> dict[str, Any]:
+        """Every setting that changes `text`."""
+        return {"model": self.model, "pretrained": self._weights_identity, "template": self.template}
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         """As in `Encoder`.
 
         Raises:
             FileNotFoundError: the weights cannot be downloaded.
             ValueError: a weight file that is damaged or of another architecture.
+            MemoryError: the memory of the device does not hold a single crop.
         """
-        boxes = find_objects(labels.numpy() + 1)
-        features = torch.empty(len(boxes), import_open_clip().get_model_config(self.model)["embed_dim"])
         image, labels = image.to(self.device), labels.to(self.device)
-        for first in range(0, len(boxes), _BATCH):
-            crops = [
-                masked_crop(image, labels, region, box, self._network.size, self.fill)
-                for region, box in enumerate(boxes[first : first + _BATCH], start=first)
-            ]
-            features[first : first + _BATCH] = self._encode_crops(torch.stack(crops))
-        return features
+        boxes = region_boxes(labels)
+        if len(boxes) == 0:
+            return torch.empty(0, import_open_clip().get_model_config(self.model)["embed_dim"])
+
+        def encode(regions: Tensor) -> Tensor:
+            return self._image_rows(masked_crops(image, labels, regions, boxes[regions], self.network.size, self.fill))
+
+        return torch.cat(list(self._crops(encode, torch.arange(len(boxes), device=self.device))))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """One unit row per prompt; raises as `encode`, and ValueError for an empty prompt or none."""
         check_prompts(prompts)
-        tokens = self._network.tokenizer(list(prompts)).to(self.device)
-        with torch.no_grad():
-            rows = [self._network.model.encode_text(batch).float() for batch in tokens.split(_BATCH)]
-        return normalize(torch.cat(rows), dim=1).cpu()
+        templates = _templates(self.template)
+        tokens = self.network.tokenizer([template(prompt) for prompt in prompts for template in templates])
+        rows = torch.cat(list(self._texts(self._text_rows, tokens.to(self.device))))
+        return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
 
     @torch.no_grad()
-    def _encode_crops(self, crops: Tensor) -> Tensor:
-        pixels = (crops / 255 - self._network.mean) / self._network.std
-        if torch.device(self.device).type == "cuda":
-            pixels = pixels.half()
-        return normalize(self._network.model.encode_image(pixels).float(), dim=1).cpu()
+    def _image_rows(self, crops: Float[Tensor, "b 3 y x"]) -> Float32[Tensor, "b d"]:
+        return normalize(self.network.model.encode_image(self.network.normalized(crops)).float(), dim=1).cpu()
+
+    @torch.no_grad()
+    def _text_rows(self, tokens: Tensor) -> Float32[Tensor, "b d"]:
+        return normalize(self.network.model.encode_text(tokens).float(), dim=1).cpu()
 
     @cached_property
     def _weights_identity(self) -> str:
         path = Path(self.pretrained)
-        if not path.is_file():
-            return self.pretrained
-        digest = blake2b(digest_size=16)
-        with path.open("rb") as file:
-            while block := file.read(2**24):
-                digest.update(block)
-        return f"blake2b:{digest.hexdigest()}"
+        return content_identity(path) if path.is_file() else self.pretrained
 
     @cached_property
-    def _network(self) -> _Network:
-        open_clip = import_open_clip()
-        path, training = find_weights(self.model, self.pretrained)
-        try:
-            model = open_clip.create_model(
-                self.model,
-                pretrained=str(path),
-                precision="fp16" if torch.device(self.device).type == "cuda" else "fp32",
-                force_quick_gelu=training.get("quick_gelu", False),
-                force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
-            )
-        except Exception as error:  # whatever a foreign file makes torch, safetensors and open_clip raise
-            raise ValueError(
-                f"weight file {path} is damaged or not of OpenCLIP model {self.model} ({first_line(error)}); name its "
-                f"architecture with --encoder-model, or {REMEDY}"
-            ) from None
-        try:
-            tokenizer = open_clip.get_tokenizer(self.model)
-        except Exception as error:  # whatever a download makes its libraries raise
-            raise FileNotFoundError(
-                f"the tokenizer of OpenCLIP model {self.model} cannot be had ({first_line(error)}); go online once, "
-                f"use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that needs "
-                "none: --encoder colour"
-            ) from None
-        settings = open_clip.get_model_preprocess_cfg(model)
-        size = settings["size"]
-        mean, std = (torch.tensor(settings[key], device=self.device)[:, None, None] for key in ("mean", "std"))
-        size = (size, size) if isinstance(size, int) else tuple(size)
-        return _Network(model.to(self.device).eval(), tokenizer, size, mean, std)
+    def network(self) -> ClipNetwork:
+        """The model with its weights, loaded at the first use; raises as `encode`."""
+        return load_clip(self.model, self.pretrained, self.device)
+
+    @cached_property
+    def _crops(self) -> Batches:
+        return Batches(_BATCH[torch.device(self.device).type])
+
+    @cached_property
+    def _texts(self) -> Batches:
+        return Batches(_BATCH[torch.device(self.device).type])
 
 
-def masked_crop(
-    image: UInt8[Tensor, "h w 3"],
-    labels: Int32[Tensor, "h w"],
-    region: int,
-    box: tuple[slice, slice],
-    size: tuple[int, int],
-    fill: Fill,
-) -> Float[Tensor, "3 size_y size_x"]:
-    """One region, 0..255, as the top of this file describes it.
-
-    Args:
-        box: rows and columns that hold the region.
-        size: height and width of the result.
-    """
-    outside = (labels[box] != region)[:, :, None]
-    crop = image[box].float().masked_fill(outside, 255.0 if fill == "white" else 0.0).permute(2, 0, 1)
-    height, width = crop.shape[1:]
-    side = max(height, width)
-    left, top = (side - width) // 2, (side - height) // 2
-    square = pad(crop, (left, side - width - left, top, side - height - top))
-    return interpolate(square[None], size, mode="bilinear", align_corners=False)[0]
+def _templates(template: str) -> Sequence[Callable[[str], str]]:
+    if template == ENSEMBLE:
+        return import_open_clip().SIMPLE_IMAGENET_TEMPLATES
+    return [lambda text: template.replace("{}", text)]

@@ -48,9 +48,9 @@ class Superpixels:
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
         found = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
-        return _compact(found, np.ones(found.shape, dtype=bool))[None]
+        return _compact(found, np.ones(found.shape, dtype=bool))[None, None]
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ class Grid:
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
         height, width = image.shape[:2]
         side = max(1, round(math.sqrt(height * width / self.count)))
         rows, columns = torch.arange(height) // side, torch.arange(width) // side
-        return (rows[:, None] * math.ceil(width / side) + columns).int()[None]
+        return (rows[:, None] * math.ceil(width / side) + columns).int()[None, None]
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class LabelFiles:
             f"image {name} has no label map in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
         )
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels 1 h w"]:
         """As in `Regions`.
 
         Raises:
@@ -163,7 +163,7 @@ class LabelFiles:
                     "resample them by nearest neighbour: --regions-resample True"
                 )
             found = resample_nearest(found, height, width)
-        return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in found])
+        return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in found])[:, None]
 
     def _read(self, path: Path) -> np.ndarray:
         found = read_npy(path, "label map") if path.suffix == ".npy" else read_pixels(path)

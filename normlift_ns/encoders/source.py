@@ -141,9 +141,13 @@ class Regions(Protocol):
         """
         ...
 
-    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels h w"]:
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Region of every pixel in every level that there is, chosen or not; in each, ids 0..R-1 without gaps, -1 for
-        none. A rule without levels returns one."""
+        none. A rule without levels returns one.
+
+        Where regions overlap, the one that counts is on top, at depth 0; those beneath are seen by the encoder only. A
+        rule without overlaps returns depth 1.
+        """
         ...
 
 
@@ -163,8 +167,9 @@ class TextEncoder(Protocol):
 class Encoder(TextEncoder, Protocol):
     """A joint space of image regions and texts."""
 
-    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "h w"]) -> Float32[Tensor, "r d"]:
-        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level."""
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level: a region is all
+        pixels that have its id at any depth."""
         ...
 
 
@@ -186,10 +191,7 @@ class RegionFeatures:
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
-            raise ValueError(
-                f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
-            )
+        check_image(image, name)
         image = image.cpu()
         maps = self.regions.labels(image, name)
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
@@ -197,13 +199,21 @@ class RegionFeatures:
             found = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
             raise ValueError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
         features = [self.encoder.encode(image, maps[level]) for level in chosen]
-        cells, regions = joint_partition(maps)
+        cells, regions = joint_partition(maps[:, 0])
         first = torch.tensor([0, *(len(rows) for rows in features)]).cumsum(0)[:-1, None].int()
         regions = regions[list(chosen)]
         return ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + first, -1))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
+
+
+def check_image(image: Tensor, name: str) -> None:
+    """Raises ValueError unless `image` is a picture."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
+        raise ValueError(
+            f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
+        )
 
 
 def check_prompts(prompts: Sequence[str]) -> None:

@@ -1,6 +1,6 @@
 """The cache of regions and features: what finds an entry again, and what does not."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +8,12 @@ import pytest
 import torch
 
 from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
-from normlift_ns.encoders.cache import CachedEncoder, CachedRegions
+from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, CachedTexts
 from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles
+from tests.encoders.tiny import CLIP, write_clip
 
 IMAGE = torch.randint(0, 256, (20, 30, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
@@ -159,3 +162,52 @@ def test_identity_and_texts_are_those_of_the_source(tmp_path):
     expected = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
     assert kept.identity == source.identity == expected
     assert torch.equal(kept.text(["red"]), source.text(["red"]))
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clip")
+    write_clip(folder)
+    return OpenClipEncoder(CLIP, str(folder / "tiny.pt"))
+
+
+def unusable(encoder: OpenClipEncoder) -> OpenClipEncoder:
+    """The same settings, without a network."""
+    copy = replace(encoder)
+    vars(copy)["network"] = None
+    return copy
+
+
+def test_texts_asked_again_need_no_network(clip, tmp_path):
+    prompts = ["a red mug", "table", "a red mug"]
+    expected = CachedTexts(clip, tmp_path / "texts").text(prompts)
+    torch.testing.assert_close(expected, clip.text(prompts), rtol=0, atol=1e-6)
+    again = CachedTexts(unusable(clip), tmp_path / "texts")
+    assert torch.equal(again.text(prompts), expected)
+    assert again.identity == clip.identity
+    with pytest.raises(AttributeError):
+        again.text(["chair"])
+    for change in ({"template": "a {}"}, {"pretrained": clip.pretrained.replace(".pt", ".safetensors")}):
+        with pytest.raises(AttributeError):
+            CachedTexts(unusable(replace(clip, **change)), tmp_path / "texts").text(["table"])
+
+
+def test_texts_of_a_folder_that_cannot_be_written_to(clip, tmp_path):
+    (tmp_path / "file").write_text("")
+    rows = CachedTexts(clip, tmp_path / "file" / "texts").text(["table"])
+    assert torch.equal(rows, clip.text(["table"]))
+    with pytest.raises(ValueError, match="text 1 of 1 is empty"):
+        CachedTexts(clip, tmp_path).text([" "])
+
+
+def test_patches_seen_before_need_no_network(clip, tmp_path):
+    source = PatchFeatures(clip, 20)
+    expected = source.view(IMAGE, "a.jpg")
+    for encoder in (clip, unusable(clip)):
+        kept = cached(PatchFeatures(encoder, 20), tmp_path)
+        view = kept.view(IMAGE, "a.jpg")
+        assert torch.equal(view.labels, expected.labels) and torch.equal(view.features, expected.features)
+        assert kept.identity == source.identity and kept.available(["a.jpg"]) == ["a.jpg"]
+    assert torch.equal(cached(source, tmp_path).text(["red"]), clip.text(["red"]))
+    with pytest.raises(AttributeError):
+        cached(PatchFeatures(unusable(clip), 30), tmp_path).view(IMAGE, "a.jpg")

@@ -1,6 +1,8 @@
 """What the colour encoder makes of real photographs. The captures lie beside the repository and are not part of it."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -63,3 +65,36 @@ def test_objects_of_the_tabletop():
     assert score["red coffee mug"][red] > 5 * score["table"][red]
     assert score["wine bottle"][black] > 10 * score["table"][black]
     assert score["white bowl"][white] == max(row[white] for row in score.values())
+
+
+SEE_ALL = """
+import resource, sys
+from pathlib import Path
+from normlift_ns.encoders import RegionFeatures, cached, read_image
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.encoders.sam import MaskRules, SamMasks
+from tests.encoders.tiny import write_clip, write_sam
+
+folder, images = Path(sys.argv[1]), sorted(Path(sys.argv[2]).iterdir())
+write_clip(folder, "normlift-wide", 512)
+write_sam(folder / "sam.pth", seed=1, gain=6)
+clip = OpenClipEncoder("normlift-wide", str(folder / "tiny.pt"))
+sam = SamMasks(str(folder / "sam.pth"), rules=MaskRules(points_per_side=2, predicted_iou=0.5, stability=0.3))
+for source in (cached(RegionFeatures(sam, clip), folder / "cache"), cached(PatchFeatures(clip), folder / "cache")):
+    views = [source.view(read_image(path), f"images/{path.name}") for path in images]
+    print(len(views), sum(len(view.features) for view in views), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def test_features_of_50_views_fit_into_2_gb(tmp_path):
+    """With SAM's masks and with patches, the libraries included; the networks are small."""
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", SEE_ALL, str(tmp_path), str(CAPTURES / "fox" / "images")]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    masks, patches = ([int(number) for number in line.split()] for line in done.stdout.splitlines())
+    print(done.stdout)
+    assert masks[0] == patches[0] == 50
+    assert masks[1] >= 50 and patches[1] == 50 * 43 * 24
+    assert patches[2] * 1024 < 2e9

@@ -67,7 +67,7 @@ def test_numbers_of_familiar_colours():
 def test_a_region_is_its_mean_cielab_colour():
     colours = lab([(0.9, 0.1, 0.2), (0.1, 0.2, 0.7), (0.4, 0.8, 0.3)])
     image = torch.from_numpy(lab2rgb(colours.numpy()) * 255).round().to(torch.uint8)[None].expand(2, 3, 3)
-    labels = torch.tensor([[0, 0, 1], [-1, 0, -1]], dtype=torch.int32)
+    labels = torch.tensor([[[0, 0, 1], [-1, 0, -1]]], dtype=torch.int32)
     exact = lab(image[0].double() / 255)
     expected = embed(torch.stack([(exact[0] + 2 * exact[1]) / 3, exact[2]]))
     torch.testing.assert_close(COLOUR.encode(image, labels), expected.float(), rtol=0, atol=1e-6)
@@ -75,7 +75,7 @@ def test_a_region_is_its_mean_cielab_colour():
 
 def test_no_region_no_row():
     image = torch.zeros(2, 2, 3, dtype=torch.uint8)
-    assert COLOUR.encode(image, torch.full((2, 2), -1, dtype=torch.int32)).shape == (0, 343)
+    assert COLOUR.encode(image, torch.full((1, 2, 2), -1, dtype=torch.int32)).shape == (0, 343)
 
 
 def test_every_name_is_understood():
@@ -92,7 +92,7 @@ def test_basic_colours_are_found_in_shade():
     colour = torch.tensor([to_rgb(XKCD_COLORS[f"xkcd:{name}"]) for name in names])
     for shade in (0.8, 0.9, 1.0):  # of sRGB: down to three fifths of the light
         image = (colour * shade * 255).round().to(torch.uint8)[None]
-        labels = torch.arange(len(names), dtype=torch.int32)[None]
+        labels = torch.arange(len(names), dtype=torch.int32)[None, None]
         best = (COLOUR.encode(image, labels) @ COLOUR.text(names).T).argmax(dim=1)
         assert [names[i] for i in best] == names
 

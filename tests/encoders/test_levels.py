@@ -61,7 +61,7 @@ def test_every_level_has_the_same_cells_and_its_own_features(folder):
     assert all(torch.equal(view.labels, views[0].labels) for view in views)
     for level, view in enumerate(views):
         alone = LabelFiles(folder).labels(IMAGE, "a.jpg")[level]
-        assert torch.equal(view.region_of_cell[0, view.labels.long()], alone)
+        assert torch.equal(view.region_of_cell[0, view.labels.long()], alone[0])
         assert torch.equal(view.features, ColourEncoder().encode(IMAGE, alone))
     assert views[2].features.shape[0] == 0
 

@@ -16,32 +16,24 @@ import torch
 from safetensors.torch import save_file
 
 from normlift_ns.encoders import SourceOptions, make_encoder
-from normlift_ns.encoders.open_clip import OpenClipEncoder, masked_crop
+from normlift_ns.encoders.crops import masked_crops, region_boxes
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from tests.encoders.tiny import CLIP as NAME
+from tests.encoders.tiny import write_clip
 
-NAME = "normlift-tiny"
-CONFIG = {
-    "embed_dim": 24,
-    "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
-    "text_cfg": {"context_length": 77, "vocab_size": 49408, "width": 32, "heads": 2, "layers": 2},
-}
 IMAGE = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 LABELS = torch.full((48, 64), -1, dtype=torch.int32)
 LABELS[3:20, 5:50] = 0  # wide
 LABELS[10:47, 30:41] = 1  # tall, cuts into the first
 LABELS[47, 63] = 2  # a pixel in the corner
+MAPS = LABELS[None]
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     """A folder with tiny.pt and tiny.safetensors of the same random weights."""
     folder = tmp_path_factory.mktemp("weights")
-    (folder / f"{NAME}.json").write_text(json.dumps(CONFIG))
-    open_clip.add_model_config(folder / f"{NAME}.json")
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        state = open_clip.create_model(NAME).state_dict()
-    torch.save(state, folder / "tiny.pt")
-    save_file({key: value.contiguous() for key, value in state.items()}, folder / "tiny.safetensors")
+    write_clip(folder)
     return folder
 
 
@@ -88,15 +80,33 @@ def square_by_hand(region: int, fill: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("fill", "value"), [("black", 0), ("white", 255)])
-@pytest.mark.parametrize(("region", "box"), [(0, (3, 20, 5, 50)), (1, (10, 47, 30, 41)), (2, (47, 48, 63, 64))])
+@pytest.mark.parametrize(("region", "box"), [(0, [5, 3, 49, 19]), (1, [30, 10, 40, 46]), (2, [63, 47, 63, 47])])
 def test_crops_are_those_of_the_protocol(region, box, fill, value):
+    boxes = region_boxes(MAPS)
+    assert boxes[region].tolist() == box
+    chosen = torch.tensor([region])
     square = square_by_hand(region, value)
-    slices = slice(*box[:2]), slice(*box[2:])
     side = len(square)
-    exact = masked_crop(IMAGE, LABELS, region, slices, (side, side), fill)
-    assert torch.equal(exact, torch.from_numpy(square).permute(2, 0, 1).float())
-    resized = masked_crop(IMAGE, LABELS, region, slices, (32, 32), fill).permute(1, 2, 0).numpy()
-    assert np.abs(resized - cv2.resize(square, (32, 32))).max() <= 1  # cv2 rounds to 8 bit
+    (exact,) = masked_crops(IMAGE, MAPS, chosen, boxes[chosen], (side, side), fill)
+    pixels = torch.from_numpy(square).permute(2, 0, 1).float()
+    assert torch.equal(exact, pixels)
+    for size in ((32, 32), (60, 45)):
+        (resized,) = masked_crops(IMAGE, MAPS, chosen, boxes[chosen], size, fill)
+        expected = torch.nn.functional.interpolate(pixels[None], size, mode="bilinear", align_corners=False)[0]
+        torch.testing.assert_close(resized, expected, rtol=0, atol=1e-3)
+        assert np.abs(resized.permute(1, 2, 0).numpy() - cv2.resize(square, size[::-1])).max() <= 1  # cv2 rounds
+
+
+def test_a_crop_shows_all_of_a_region_whatever_lies_on_it():
+    beneath = torch.full((48, 64), -1, dtype=torch.int32)
+    beneath[10:20, 30:41] = 0  # what the second took from the first
+    whole = LABELS.where(beneath == -1, 0)
+    maps = torch.stack([LABELS, beneath])
+    boxes, alone = region_boxes(maps), torch.stack([LABELS[None], whole[None]])
+    assert torch.equal(boxes[1:], region_boxes(MAPS)[1:])
+    crops = masked_crops(IMAGE, maps, torch.arange(3), boxes, (40, 40), "black")
+    assert torch.equal(crops[0], masked_crops(IMAGE, alone[1], torch.tensor([0]), boxes[:1], (40, 40), "black")[0])
+    assert torch.equal(crops[1], masked_crops(IMAGE, alone[0], torch.tensor([1]), boxes[1:2], (40, 40), "black")[0])
 
 
 def test_features_are_those_of_the_model(encoder, weights):
@@ -105,7 +115,7 @@ def test_features_are_those_of_the_model(encoder, weights):
     crops = [(cv2.resize(square_by_hand(region, 0), (32, 32)) / 255 - mean) / std for region in range(3)]
     with torch.no_grad():
         expected = model.encode_image(torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float(), normalize=True)
-    features = encoder.encode(IMAGE, LABELS)
+    features = encoder.encode(IMAGE, MAPS)
     assert features.dtype == torch.float32 and features.shape == (3, 24)
     assert torch.linalg.vector_norm(features, dim=1).tolist() == pytest.approx([1, 1, 1], abs=1e-6)
     assert (features * expected).sum(dim=1).min() > 0.999  # but for the rounding of cv2
@@ -120,9 +130,22 @@ def test_texts_are_those_of_the_model(encoder, weights):
     torch.testing.assert_close(encoder.text(prompts), expected, rtol=0, atol=1e-6)
 
 
+def test_templates_and_their_ensemble(encoder):
+    photo = replace(encoder, template="a photo of a {}, {}")
+    assert torch.equal(photo.text(["mug"]), encoder.text(["a photo of a mug, mug"]))
+    prompts = ["red mug", "table"]
+    for prompt, row in zip(prompts, replace(encoder, template="ensemble").text(prompts), strict=True):
+        every = [template(prompt) for template in open_clip.SIMPLE_IMAGENET_TEMPLATES]
+        assert len(every) == 7
+        expected = torch.nn.functional.normalize(encoder.text(every).double().mean(dim=0), dim=0)
+        torch.testing.assert_close(row.double(), expected, rtol=0, atol=1e-6)
+    assert photo.identity == encoder.identity  # features of images stay what they are
+    assert photo.text_identity != encoder.text_identity
+
+
 def test_batches_change_nothing(encoder):
     count = 70  # more than a batch
-    labels = (torch.arange(48 * 64).reshape(48, 64) * count // (48 * 64)).int()
+    labels = (torch.arange(48 * 64).reshape(1, 48, 64) * count // (48 * 64)).int()
     features = encoder.encode(IMAGE, labels)
     for region in (0, 63, 64, 69):
         single = torch.where(labels == region, 0, -1).int()
@@ -133,18 +156,18 @@ def test_batches_change_nothing(encoder):
 
 def test_no_region_needs_no_weights(weights):
     encoder = OpenClipEncoder(NAME, str(weights / "tiny.pt"))
-    assert encoder.encode(IMAGE, torch.full((48, 64), -1, dtype=torch.int32)).shape == (0, 24)
-    assert "_network" not in vars(encoder)
+    assert encoder.encode(IMAGE, torch.full((1, 48, 64), -1, dtype=torch.int32)).shape == (0, 24)
+    assert "network" not in vars(encoder)
 
 
 def test_safetensors_and_pickle_agree(encoder, weights):
     other = replace(encoder, pretrained=str(weights / "tiny.safetensors"))
-    assert torch.equal(other.encode(IMAGE, LABELS), encoder.encode(IMAGE, LABELS))
+    assert torch.equal(other.encode(IMAGE, MAPS), encoder.encode(IMAGE, MAPS))
 
 
 def test_fill_changes_features_and_identity(encoder):
     white = replace(encoder, fill="white")
-    assert not torch.allclose(white.encode(IMAGE, LABELS), encoder.encode(IMAGE, LABELS), atol=1e-3)
+    assert not torch.allclose(white.encode(IMAGE, MAPS), encoder.encode(IMAGE, MAPS), atol=1e-3)
     assert white.identity != encoder.identity
 
 
@@ -165,7 +188,7 @@ def test_half_precision_costs_little(encoder):
         pytest.skip("needs a CUDA GPU")
     gpu = replace(encoder, device="cuda")
     for on_gpu, on_cpu in (
-        (gpu.encode(IMAGE, LABELS), encoder.encode(IMAGE, LABELS)),
+        (gpu.encode(IMAGE, MAPS), encoder.encode(IMAGE, MAPS)),
         (gpu.text(["red"]), encoder.text(["red"])),
     ):
         assert on_gpu.dtype == torch.float32 and on_gpu.device.type == "cpu"
@@ -227,9 +250,9 @@ def test_cached_downloads_need_no_network(offline, weights, monkeypatch):
     local = OpenClipEncoder(NAME, str(weights / "tiny.pt"))
     assert torch.equal(encoder.text(["red"]), local.text(["red"]))
     # Both take the published mean and standard deviation, not those of OpenAI.
-    for network in (encoder._network, local._network):
+    for network in (encoder.network, local.network):
         assert network.mean.flatten().tolist() == [0.5] * 3 and network.std.flatten().tolist() == [0.25] * 3
-    assert torch.equal(encoder.encode(IMAGE, LABELS), local.encode(IMAGE, LABELS))
+    assert torch.equal(encoder.encode(IMAGE, MAPS), local.encode(IMAGE, MAPS))
 
 
 def test_downloads_use_the_activation_they_were_trained_with(offline, weights, monkeypatch):
@@ -249,6 +272,13 @@ def test_downloads_use_the_activation_they_were_trained_with(offline, weights, m
         ({"encoder_pretrained": "laion2b"}, ValueError, "unknown weights 'laion2b'.*laion2b_s34b_b88k"),
         ({"encoder_pretrained": "my/clip"}, FileNotFoundError, "weight file my/clip does not exist"),
         ({"encoder_pretrained": "clip.safetensors"}, FileNotFoundError, r"clip\.safetensors does not exist.*colour"),
+        ({"text_template": "a photo"}, ValueError, "template 'a photo' has no {} where the text belongs"),
+        ({"encoder_model": "ViT-B-16-SigLIP"}, ValueError, r"needs vit_base_patch16_siglip_224 of timm.*timm [\d.]+"),
+        (
+            {"encoder": "colour", "text_template": "a {}"},
+            ValueError,
+            "--text-template 'a {}' is for --encoder open_clip",
+        ),
         ({"crop_fill": "grey"}, ValueError, "fill of crops must be one of black, white; got 'grey'"),
     ],
 )

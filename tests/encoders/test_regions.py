@@ -25,7 +25,7 @@ def assert_compact(labels: torch.Tensor) -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(1, 400))
 def test_grid_cells_are_squares_of_one_size(height, width, count):
-    labels = Grid(count).labels(torch.zeros(height, width, 3, dtype=torch.uint8), "")[0]
+    labels = Grid(count).labels(torch.zeros(height, width, 3, dtype=torch.uint8), "")[0, 0]
     assert_compact(labels)
     side = max(1, round((height * width / count) ** 0.5))
     assert (labels == labels[0, 0]).sum() == min(side, height) * min(side, width)
@@ -33,14 +33,14 @@ def test_grid_cells_are_squares_of_one_size(height, width, count):
 
 
 def test_grid_by_hand():
-    labels = Grid(6).labels(torch.zeros(4, 5, 3, dtype=torch.uint8), "")[0]
+    labels = Grid(6).labels(torch.zeros(4, 5, 3, dtype=torch.uint8), "")[0, 0]
     assert labels.tolist() == [[0, 0, 1, 1, 2], [0, 0, 1, 1, 2], [3, 3, 4, 4, 5], [3, 3, 4, 4, 5]]
 
 
 def test_superpixels_keep_to_edges():
     image = torch.full((60, 81, 3), 40, dtype=torch.uint8)
     image[:, 37:] = 215
-    labels = Superpixels(30).labels(image, "")[0]
+    labels = Superpixels(30).labels(image, "")[0, 0]
     assert_compact(labels)
     assert set(labels[:, :37].unique().tolist()).isdisjoint(labels[:, 37:].unique().tolist())
     assert 20 <= int(labels.max()) + 1 <= 45
@@ -50,7 +50,7 @@ def test_superpixels_keep_to_edges():
 @pytest.mark.parametrize("flat", [True, False])
 def test_superpixels_of_tiny_images(size, flat):
     image = torch.full((*size, 3), 9, dtype=torch.uint8) if flat else noise(*size)
-    labels = Superpixels(256).labels(image, "")[0]
+    labels = Superpixels(256).labels(image, "")[0, 0]
     assert labels.shape == size
     assert_compact(labels)
     assert int(labels.min()) == 0
@@ -96,27 +96,27 @@ def palette_png(path):
 )
 def test_label_files_of_every_integer_type(tmp_path, file, write):
     write(tmp_path / file)
-    labels = LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg")[0]
+    labels = LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg")[0, 0]
     assert labels.dtype == torch.int32
     assert labels.tolist() == COMPACT
 
 
 def test_large_16_bit_ids_stay_apart(tmp_path):
     Image.fromarray(np.array([[256, 512, 65535]], dtype=np.uint16)).save(tmp_path / "a.png")
-    assert LabelFiles(tmp_path).labels(torch.zeros(1, 3, 3), "a.jpg")[0].tolist() == [[0, 1, 2]]
+    assert LabelFiles(tmp_path).labels(torch.zeros(1, 3, 3), "a.jpg")[0, 0].tolist() == [[0, 1, 2]]
 
 
 def test_1_bit_masks_are_one_region(tmp_path):
     Image.fromarray(MAP == 7).save(tmp_path / "a.png")
-    assert LabelFiles(tmp_path).labels(IMAGE, "a.jpg")[0].tolist() == [[-1, 0, 0], [-1, -1, -1]]
+    assert LabelFiles(tmp_path).labels(IMAGE, "a.jpg")[0, 0].tolist() == [[-1, 0, 0], [-1, -1, -1]]
 
 
 def test_the_background_is_a_choice(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[-1, 0, 255]]))
     image = torch.zeros(1, 3, 3)
-    assert LabelFiles(tmp_path).labels(image, "a.jpg")[0].tolist() == [[-1, -1, 0]]
-    assert LabelFiles(tmp_path, background=-1).labels(image, "a.jpg")[0].tolist() == [[-1, 0, 1]]
-    assert LabelFiles(tmp_path, background=255).labels(image, "a.jpg")[0].tolist() == [[-1, 0, -1]]
+    assert LabelFiles(tmp_path).labels(image, "a.jpg")[0, 0].tolist() == [[-1, -1, 0]]
+    assert LabelFiles(tmp_path, background=-1).labels(image, "a.jpg")[0, 0].tolist() == [[-1, 0, 1]]
+    assert LabelFiles(tmp_path, background=255).labels(image, "a.jpg")[0, 0].tolist() == [[-1, 0, -1]]
 
 
 @settings(max_examples=50, deadline=None)
@@ -124,7 +124,7 @@ def test_the_background_is_a_choice(tmp_path):
 def test_labels_are_equal_where_values_are(tmp_path_factory, values):
     folder = tmp_path_factory.mktemp("labels")
     np.save(folder / "a.npy", values)
-    labels = LabelFiles(folder).labels(torch.zeros(*values.shape, 3), "a.jpg")[0]
+    labels = LabelFiles(folder).labels(torch.zeros(*values.shape, 3), "a.jpg")[0, 0]
     assert_compact(labels)
     flat, found = values.ravel(), labels.numpy().ravel()
     assert ((found == -1) == (flat <= 0)).all()
@@ -134,13 +134,13 @@ def test_labels_are_equal_where_values_are(tmp_path_factory, values):
 
 def test_a_map_without_any_region(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((2, 3), dtype=int))
-    assert LabelFiles(tmp_path).labels(IMAGE, "a.jpg")[0].unique().tolist() == [-1]
+    assert LabelFiles(tmp_path).labels(IMAGE, "a.jpg")[0, 0].unique().tolist() == [-1]
 
 
 def test_levels_of_one_file(tmp_path):
     np.save(tmp_path / "a.npy", np.stack([5 * np.ones_like(MAP), MAP]))
     maps = LabelFiles(tmp_path, level=1).labels(IMAGE, "a.jpg")
-    assert maps.tolist() == [[[0, 0, 0]] * 2, COMPACT]
+    assert maps.tolist() == [[[[0, 0, 0]] * 2], [COMPACT]]
     assert torch.equal(LabelFiles(tmp_path).labels(IMAGE, "a.jpg"), maps)
     assert LabelFiles(tmp_path, level=1).chosen == (1,)
     assert LabelFiles(tmp_path).chosen == ()
@@ -163,11 +163,11 @@ def test_another_size_is_refused_or_resampled_when_asked(tmp_path):
     image = torch.zeros(6, 5, 3)
     with pytest.raises(ValueError, match=r"a\.npy is 4x3 \(width x height\), its image a\.jpg is 5x6; .*--regions-res"):
         LabelFiles(tmp_path).labels(image, "a.jpg")
-    labels = LabelFiles(tmp_path, resample=True).labels(image, "a.jpg")[0]
+    labels = LabelFiles(tmp_path, resample=True).labels(image, "a.jpg")[0, 0]
     # Centres (x + .5) * 4 / 5 = .4, 1.2, 2, 2.8, 3.6 and (y + .5) / 2 = .25, .75, 1.25, ...
     assert labels[0].tolist() == [0, 1, 2, 2, 3]
     assert labels[:, 0].tolist() == [0, 0, 4, 4, 8, 8]
-    shrunk = LabelFiles(tmp_path, resample=True).labels(torch.zeros(1, 2, 3), "a.jpg")[0]
+    shrunk = LabelFiles(tmp_path, resample=True).labels(torch.zeros(1, 2, 3), "a.jpg")[0, 0]
     assert shrunk.tolist() == [[0, 1]]  # values 6 and 8, compacted
 
 

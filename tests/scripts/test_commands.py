@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,50 +12,20 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo import DemoRoom
 from normlift_ns.encoders import RegionFeatures, write_langsplat
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
+from normlift_ns.encoders.sam import MaskRules, SamMasks
 from normlift_ns.plugin import lifting
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ask, encoder_of
+from normlift_ns.plugin.queries import load_question
 from normlift_ns.plugin.run_dir import load_field
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
-
-SMALL = ("--encoder", "colour", "--k", "12")
-
-
-def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
-    """Exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
-    try:
-        entrypoint()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
-@pytest.fixture(scope="module")
-def room() -> DemoRoom:
-    return demo_room(6000)
-
-
-@pytest.fixture(scope="module")
-def trained(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of a run of stock splatfacto in the room."""
-    folder = tmp_path_factory.mktemp("room")
-    write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
-    return write_splatfacto_run(room, folder / "room", folder / "outputs")
-
-
-@pytest.fixture(scope="module")
-def lifted(trained: Path) -> Path:
-    """config.yml of the lifted run."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        flags = ("--load-config", trained, *SMALL, "--timestamp", "one", "--queries", "red", "yellow")
-        assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    return trained.parents[2] / "normlift" / "one" / "config.yml"
+from tests.encoders.tiny import CLIP, write_clip, write_sam
+from tests.scripts.conftest import SMALL, run_entry
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
@@ -70,7 +40,9 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
     assert after > 0.7
     assert field.manifest["encoder"]["encoder"] == "colour"
     assert field.manifest["statistics"]["views"] == 12
-    assert run.model_config.queries == ("red", "yellow")  # pyright: ignore[reportAttributeAccessIssue]
+    question = load_question(lifted.parent / "normlift")
+    assert question is not None
+    assert question.texts == ("red", "yellow")
     assert sorted(p.name for p in lifted.parent.iterdir()) == [
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
     ]  # fmt: skip
@@ -210,6 +182,59 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     capsys.readouterr()
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--timestamp", "none") == 1
     assert "has 2 levels of regions, 0..1; choose one with --level" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> tuple[object, ...]:
+    """Flags of a small CLIP with random weights."""
+    folder = tmp_path_factory.mktemp("clip")
+    write_clip(folder)
+    return (
+        "--encoder-model",
+        CLIP,
+        "--encoder-pretrained",
+        folder / "tiny.pt",
+        "--max-views",
+        "2",
+        "--refine",
+        "False",
+    )
+
+
+def test_clip_by_patches_and_questions_without_a_network(trained, clip, tmp_path, monkeypatch, capsys):
+    flags = ("--load-config", trained, *clip, "--output-dir", tmp_path, "--timestamp", "t")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    config = tmp_path / "room" / "normlift" / "t" / "config.yml"
+    manifest = load_field(load_run(config)).manifest
+    assert manifest["features"]["kind"] == "patches"
+    assert manifest["encoder"]["text_template"] == "{}"
+    ask = ("--load-config", config, "--text", "table", "--json")
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
+    monkeypatch.setattr("normlift_ns.encoders.open_clip.load_clip", None)
+    assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
+    plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
+    assert again == plain
+    assert ensemble["peak"] != plain["peak"]
+
+
+def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
+    """All levels are found at once, so that another one asks SAM and the rasterizer nothing."""
+    write_sam(tmp_path / "sam.pth", seed=1, gain=6)
+    rules = MaskRules(points_per_side=4, predicted_iou=0.5, stability=0.3)
+    monkeypatch.setattr("normlift_ns.encoders.build.SamMasks", functools.partial(SamMasks, rules=rules))
+    flags = ("--load-config", trained, *clip, "--sam-model", tmp_path / "sam.pth", "--output-dir", tmp_path)
+    shares = []
+    for level in ("l", "s"):
+        more = () if level == "l" else ("--level", level)
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, *more, "--timestamp", level) == 0
+        field = load_field(load_run(tmp_path / "room" / "normlift" / level / "config.yml"))
+        assert field.manifest["features"]["regions"]["kind"] == "sam"
+        assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
+        shares.append(field.manifest["statistics"]["zero_evidence_share"])
+        monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)
+        monkeypatch.setattr("normlift_ns.encoders.sam.SamNetwork", None)
+    assert shares[0] != shares[1] and max(shares) < 1
 
 
 def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):

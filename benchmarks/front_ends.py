@@ -1,0 +1,219 @@
+"""What seeing the images costs: SAM's network, the rules on its masks, CLIP on their crops, CLIP's patches.
+
+All networks have random weights. Masks are injected: cells of a power diagram, whose areas spread as those of objects
+do, each grown over its neighbours; for the suppression three in ten are replaced by near copies of others.
+
+    python -m benchmarks.front_ends            SAM ViT-H and CLIP ViT-B-16, images of 988 x 731
+    python -m benchmarks.front_ends --quick    small networks and images, which runs anywhere
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import open_clip
+import torch
+import transformers
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from benchmarks.report import RESULTS, Report
+from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.encoders.sam import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
+from normlift_ns.encoders.sam_network import SamNetwork
+
+_REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large everything is."""
+
+    height: int = 731
+    width: int = 988
+    masks: tuple[int, ...] = (100, 300, 1000)
+    points: int = 32
+    patches: int = 1024
+    clip: str = "ViT-B-16"
+    vision: tuple[int, int, int, int] = (1280, 32, 16, 1024)
+    """Width, layers, heads and input side of SAM's image encoder."""
+
+
+SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128))
+SMALL_CLIP = {
+    "embed_dim": 24,
+    "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
+    "text_cfg": {"context_length": 77, "vocab_size": 49408, "width": 32, "heads": 2, "layers": 2},
+}
+
+
+def seconds(function: Callable[[], object], device: str) -> float:
+    """Best of some runs, after one that does not count."""
+    times = []
+    for _ in range(1 + _REPEATS):
+        start = time.perf_counter()
+        function()
+        if device.startswith("cuda"):
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return min(times[1:])
+
+
+def random_sam(size: Size, device: str) -> Any:
+    width, layers, heads, side = size.vision
+    vision = transformers.SamVisionConfig(
+        hidden_size=width,
+        num_hidden_layers=layers,
+        num_attention_heads=heads,
+        image_size=side,
+        mlp_dim=4 * width,
+        global_attn_indexes=[(i + 1) * layers // 4 - 1 for i in range(4)] if layers > 4 else [layers - 1],
+        window_size=min(14, side // 32),
+        initializer_range=0.02,
+    )
+    prompt = transformers.SamPromptEncoderConfig(image_size=side)
+    with torch.device(device):
+        return transformers.SamModel(transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt)).eval()
+
+
+def random_clip(size: Size, folder: Path, device: str) -> OpenClipEncoder:
+    if size.clip == SMALL.clip:
+        (folder / f"{size.clip}.json").write_text(json.dumps(SMALL_CLIP))
+        open_clip.add_model_config(folder / f"{size.clip}.json")
+    torch.save(open_clip.create_model(size.clip).state_dict(), folder / "clip.pt")
+    return OpenClipEncoder(size.clip, str(folder / "clip.pt"), device=device)
+
+
+def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> Tensor:
+    """[count, H, W] masks that cover the image; with ten or more, half of the pixels lie in two or more of them."""
+    area = torch.exp(1.5 * torch.randn(count, generator=g))
+    radius = (area / area.sum() * size.height * size.width / torch.pi).sqrt().to(device)
+    centre = (torch.rand(count, 2, generator=g) * torch.tensor([size.height, size.width])).to(device)
+    x = torch.arange(size.width, device=device)
+    rows = []
+    for y in torch.arange(size.height, device=device):
+        power = (y - centre[:, :1]) ** 2 + (x - centre[:, 1:]) ** 2 - radius[:, None] ** 2
+        rows.append(power - power.amin(dim=0) < (0.6 * radius[:, None]) ** 2)
+    masks = torch.stack(rows, dim=1)
+    for i, (row, column) in enumerate(centre.long().tolist()):
+        masks[i, row, column] = True
+    return masks
+
+
+def with_copies(masks: Tensor, g: torch.Generator) -> Tensor:
+    """The masks, three in ten of them replaced by others, moved by a pixel or two."""
+    masks = masks.clone()
+    for i in torch.randperm(len(masks), generator=g)[: len(masks) * 3 // 10].tolist():
+        other, dy, dx = torch.randint(0, len(masks), (3,), generator=g).tolist()
+        masks[i] = masks[other].roll((dy % 3, dx % 3), (0, 1))
+    return masks
+
+
+def disagreements(masks: Tensor, scores: Tensor) -> float:
+    """Share of masks on which the suppression and the same rules, pair by pair in float64, disagree."""
+    flat = masks.flatten(1).double()
+    both, area = (flat @ flat.T).tolist(), flat.sum(dim=1).tolist()
+    rules, values = Suppression(), scores.tolist()
+    order = sorted(range(len(values)), key=lambda i: -values[i])
+    keep = [value > rules.score for value in values]
+    for a, i in enumerate(order):
+        for j in order[a + 1 :]:
+            inter = both[i][j]
+            share_i, share_j = inter / area[i], inter / area[j]
+            keep[j] &= inter / (area[i] + area[j] - inter) <= rules.iou
+            keep[j] &= not (share_i < rules.outer and share_j >= rules.inner)
+            keep[i] &= not (share_j < rules.outer and share_i >= rules.inner)
+    return float((mask_nms(masks, scores).cpu() != torch.tensor(keep)).float().mean())
+
+
+class Injected(SamNetwork):
+    """The network, whose answers are then replaced by blobs of three sizes around the points."""
+
+    side = 1024
+
+    def decode(self, embedding: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        logits, _ = super().decode(embedding, points)
+        p = points.to(logits.device)[:, None, None, None, :] / self.side
+        line = (torch.arange(logits.shape[-1], device=logits.device) + 0.5) / logits.shape[-1]
+        y, x = torch.meshgrid(line, line, indexing="ij")
+        radius = torch.tensor([0.04, 0.08, 0.16], device=logits.device)[:, None, None]
+        radius = radius * (1 + 0.5 * torch.sin(9 * p[..., 0] + 5 * p[..., 1]))
+        waves = torch.sin(90 * x + 17 * p[..., 0]) * torch.sin(70 * y + 23 * p[..., 1])
+        away = ((x - p[..., 0]) ** 2 + (y - p[..., 1]) ** 2).sqrt()
+        phase = 130 * p[:, 0, 0, :, 0] + 290 * p[:, 0, 0, :, 1] + torch.arange(3, device=p.device)
+        return 600 * (radius - away) + 12 * waves, 0.8 + 0.2 * torch.sin(phase)
+
+
+def main(quick: bool, output: Path, device: str) -> None:
+    size = SMALL if quick else Size()
+    report, g = Report("front_ends"), torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (size.height, size.width, 3), generator=g, dtype=torch.uint8)
+    Injected.side = size.vision[3]
+    network = Injected(random_sam(size, device), device)
+
+    crops = crop_boxes(size.height, size.width, MaskRules().crop_overlap)
+    pixels = network.pixels([image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]).to(device)
+    embeddings, points = network.embed(pixels), point_grid(size.points).float() * size.vision[3]
+
+    def answer() -> None:
+        for embedding in embeddings:
+            for batch in points.split(256):
+                SamNetwork.decode(network, embedding, batch)
+
+    encoder_s, decoder_s = seconds(lambda: network.embed(pixels), device), seconds(answer, device)
+    sam_s = encoder_s + decoder_s
+    report.add("sam_encoder_s", encoder_s, f"s/image, {len(crops)} crops")
+    report.add("sam_decoder_s", decoder_s, f"s/image, {len(crops) * len(points)} prompts")
+    report.add("sam_network_rate", 1 / sam_s, "images/s, network alone")
+    sam = SamMasks("nobody/nothing", rules=MaskRules(points_per_side=size.points), device=device)
+    vars(sam)["network"] = network
+    found = sam.masks(image)
+    labels_s = seconds(lambda: sam.labels(image, ""), device)
+    report.add("sam_labels_s", labels_s, "s/image, four levels of injected masks, rules included")
+    for level in LEVELS:
+        report.add(f"sam_masks_{level}", len(found[level]), "masks")
+    report.add("sam_rules_share", (labels_s - sam_s) / sam_s, "of the network's time")
+
+    with tempfile.TemporaryDirectory() as folder:
+        encoder = random_clip(size, Path(folder), device)
+        exact = replace(encoder, device="cpu")
+        _ = encoder.network, exact.network
+    for count in size.masks:
+        masks = injected_masks(count, size, g, device)
+        copies, scores = with_copies(masks, g), (0.6 + 0.4 * torch.rand(count, generator=g)).to(device)
+        nms_s = seconds(lambda copies=copies, scores=scores: mask_nms(copies, scores), device)
+        boxes = boxes_of(copies)
+        clean_s = seconds(lambda copies=copies, boxes=boxes: clean_masks(copies, boxes, 100), device)
+        labels = stack_masks(masks)
+        encode_s = seconds(lambda labels=labels: encoder.encode(image, labels), device)
+        few = labels.where(labels < 8, -1)
+        off = (1 - (encoder.encode(image, few) * exact.encode(image, few.cpu())).sum(dim=1)).abs().max()
+        report.add(f"nms_{count}_s", nms_s, "s/level", disagreements(copies, scores))
+        report.add(f"clean_{count}_s", clean_s, "s/level")
+        report.add(f"encode_{count}_s", encode_s, f"s/level, {len(labels)} deep", off)
+        report.add(f"share_{count}", (nms_s + encode_s) / sam_s, "NMS + encoding over SAM's network, one level")
+    patches = PatchFeatures(encoder, size.patches)
+    near = PatchFeatures(exact, size.patches).features(image, "")
+    off = (1 - (normalize(patches.features(image, ""), dim=1) * near).sum(dim=1)).abs().max()
+    report.add("patches_s", seconds(lambda: patches.features(image, ""), device), "s/image", off)
+    if device == "cuda":
+        report.add("gpu_peak_gib", torch.cuda.max_memory_allocated() / 2**30, "GiB")
+    report.write(output)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small networks and images")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    arguments = parser.parse_args()
+    main(arguments.quick, arguments.output, arguments.device)

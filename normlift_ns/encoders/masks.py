@@ -1,0 +1,166 @@
+"""Rules on binary masks: boxes, small regions, LangSplat's suppression, and label maps of masks that overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int32, Int64
+from torch import Tensor
+
+_CHUNK = 2**26
+"""Elements of the largest temporary array."""
+_FORCED = 3
+"""Masks that stay, best first, where none is scored well enough."""
+
+
+@dataclass(frozen=True)
+class Suppression:
+    """LangSplat's suppression of masks by masks; the defaults are its settings."""
+
+    iou: float = 0.8
+    """A mask goes if its IoU with one of a higher score is above this."""
+    score: float = 0.7
+    """A mask goes if its score is not above this; the best three stay if that would be all of them."""
+    outer: float = 0.5
+    """One mask lies inside another if it covers less than this share of it, ..."""
+    inner: float = 0.85
+    """... and at least this share of itself lies there. Such a mask goes, whatever its score."""
+
+
+def mask_nms(
+    masks: Bool[Tensor, "m h w"], scores: Float[Tensor, " m"], rules: Suppression | None = None
+) -> Bool[Tensor, " m"]:
+    """Which masks stay: those scored well enough that neither repeat a better mask nor lie inside a larger one.
+
+    All masks are compared with all, also with those that go. Intersections are counted exactly and their ratios
+    compared in float64. Equal scores: the earlier mask is the better one.
+
+    LangSplat also asks for 1 - (inter/area_i)(inter/area_j) > 0.5 of a mask inside another, which every pair fulfils
+    that passes the two tests of shares.
+
+    Args:
+        scores: stability times predicted IoU.
+        rules: LangSplat's by default.
+    """
+    rules = Suppression() if rules is None else rules
+    if len(masks) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=masks.device)
+    order = torch.sort(scores, descending=True, stable=True).indices
+    both = _intersections(masks)[order][:, order]
+    area = both.diagonal()
+    iou = both / (area[:, None] + area - both)
+    repeats = (iou.triu(diagonal=1) > rules.iou).any(dim=0)
+    inside = ((both / area[:, None] < rules.outer) & (both / area >= rules.inner)).any(dim=0)
+    confident = scores[order] > rules.score
+    if not bool(confident.any()):
+        confident[:_FORCED] = True
+    keep = torch.empty_like(confident)
+    keep[order] = confident & ~repeats & ~inside
+    return keep
+
+
+def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
+    """Masks as label maps that lie on one another: where masks overlap the later one is on top; -1 beneath the last.
+
+    The depth is the largest number of masks that share a pixel, at least 1.
+    """
+    flat = masks.flatten(1)
+    depth = max(1, int(flat.sum(dim=0).max()))
+    labels = torch.full((depth, flat.shape[1]), -1, dtype=torch.int32, device=masks.device)
+    for columns in _column_chunks(flat):
+        part = flat[:, columns].flip(0)
+        pixel, upward = part.T.nonzero(as_tuple=True)  # pixel by pixel, in each the last mask first
+        sharing = part.sum(dim=0)
+        above = torch.arange(len(pixel), device=masks.device) - (sharing.cumsum(0) - sharing)[pixel]
+        labels[above, columns.start + pixel] = (len(masks) - 1 - upward).int()
+    return labels.reshape(depth, *masks.shape[1:])
+
+
+def boxes_of(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
+    """First and last column and row of each mask, as (x0, y0, x1, y1), both ends inside; zeros for an empty mask."""
+    ends = []
+    for line in (masks.any(dim=1), masks.any(dim=2)):
+        index = torch.arange(line.shape[1], device=masks.device)
+        ends.append((torch.where(line, index, line.shape[1]).amin(dim=1), torch.where(line, index, -1).amax(dim=1)))
+    (x0, x1), (y0, y1) = ends
+    return torch.stack([x0, y0, x1, y1], dim=1) * (x1 >= 0)[:, None]
+
+
+def clean_masks(
+    masks: Bool[Tensor, "m h w"], boxes: Int64[Tensor, "m 4"], least: int
+) -> tuple[Bool[Tensor, "m h w"], Bool[Tensor, " m"]]:
+    """Fills holes and drops pieces of fewer than `least` pixels, 8-connected; the largest piece stays in any case.
+
+    Args:
+        boxes: as `boxes_of` returns them.
+    Returns:
+        the masks, and which of them had such holes or pieces.
+    """
+    size = masks.shape[1:]
+    spans = [_around(box, size) for box in boxes.tolist()]
+    parts = (masks[i, y, x].cpu().numpy() for i, (y, x) in enumerate(spans))
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(lambda part, span: _clean(part, span, size, least), parts, spans))
+    cleaned = masks.clone()
+    for i, mask in enumerate(found):
+        if mask is not None:
+            cleaned[i] = torch.from_numpy(mask).to(masks.device)
+    return cleaned, torch.tensor([mask is not None for mask in found], dtype=torch.bool, device=masks.device)
+
+
+def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
+    """Pixels that masks share, counted exactly: float32 sums of ones are exact below 2^24 pixels."""
+    flat = masks.flatten(1)
+    both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
+    for columns in _column_chunks(flat):
+        part = flat[:, columns].float()
+        both += part @ part.T
+    return both
+
+
+def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
+    step = min(2**24, max(1, _CHUNK // max(1, len(flat))))
+    return (slice(start, start + step) for start in range(0, flat.shape[1], step))
+
+
+def _around(box: list[int], size: torch.Size) -> tuple[slice, slice]:
+    """Rows and columns of a box and of one pixel around it, as far as the image goes."""
+    x0, y0, x1, y1 = box
+    return slice(max(y0 - 1, 0), min(y1 + 2, size[0])), slice(max(x0 - 1, 0), min(x1 + 2, size[1]))
+
+
+def _clean(part: np.ndarray, span: tuple[slice, slice], size: torch.Size, least: int) -> np.ndarray | None:
+    """`clean_masks` of one mask, cut out with a pixel around it; None if nothing is small.
+
+    The outermost line stands for all that lies beyond it, none of which is in the mask, and is weighted accordingly.
+    """
+    weight = np.ones(part.shape)
+    for axis, line in enumerate(span):
+        along = np.ones(part.shape[axis])
+        along[0] += line.start
+        along[-1] += size[axis] - line.stop
+        weight *= along.reshape(-1, 1) if axis == 0 else along
+    holes, areas = _components(~part, weight)
+    small = areas < least
+    small[0] = False
+    filled = part | small[holes]
+    pieces, areas = _components(filled, weight)
+    stays = areas >= least
+    stays[0] = False
+    if not small.any() and stays[1:].all():
+        return None
+    if len(areas) > 1 and not stays.any():
+        stays[1 + areas[1:].argmax()] = True
+    rows, columns = (np.arange(n).clip(line.start, line.stop - 1) - line.start for n, line in zip(size, span))
+    return stays[pieces][rows][:, columns]
+
+
+def _components(mask: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """8-connected components, numbered from 1, 0 outside of the mask, and the sum of weights of each number."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    return labels, np.bincount(labels.ravel(), weights=weight.ravel(), minlength=count)

@@ -1,0 +1,179 @@
+"""Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats, flood fill."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
+
+
+def nms_by_hand(masks: list[set], scores: list[float], rules: Suppression) -> list[bool]:
+    """LangSplat's suppression, pair by pair, with its inner score."""
+    count = len(masks)
+    order = sorted(range(count), key=lambda i: -scores[i])  # stable
+    repeated, inner = [0.0] * count, [0.0] * count
+    for a in range(count):
+        for b in range(a + 1, count):
+            i, j = order[a], order[b]
+            both = len(masks[i] & masks[j])
+            repeated[j] = max(repeated[j], both / len(masks[i] | masks[j]))
+            share_i, share_j = both / len(masks[i]), both / len(masks[j])
+            if share_i < rules.outer and share_j >= rules.inner:
+                inner[j] = max(inner[j], 1 - share_i * share_j)
+            if share_i >= rules.inner and share_j < rules.outer:
+                inner[i] = max(inner[i], 1 - share_i * share_j)
+    confident = [score > rules.score for score in scores]
+    if not any(confident):
+        for i in order[:3]:
+            confident[i] = True
+    return [confident[i] and repeated[i] <= rules.iou and inner[i] <= 0.5 for i in range(count)]
+
+
+def pixels(mask: np.ndarray) -> set:
+    return set(map(tuple, np.argwhere(mask).tolist()))
+
+
+@st.composite
+def boxes_with_noise(draw) -> np.ndarray:
+    """Rectangles, nested and repeated more often than by chance, some with holes."""
+    count, height, width = draw(st.integers(0, 9)), draw(st.integers(1, 9)), draw(st.integers(1, 9))
+    masks = np.zeros((count, height, width), dtype=bool)
+    for mask in masks:
+        top, left = draw(st.integers(0, height - 1)), draw(st.integers(0, width - 1))
+        bottom, right = draw(st.integers(top, height - 1)), draw(st.integers(left, width - 1))
+        mask[top : bottom + 1, left : right + 1] = True
+        if draw(st.booleans()):
+            mask[~draw(arrays(bool, (height, width)))] = False
+        mask[top, left] = True
+    return masks
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    masks=boxes_with_noise(),
+    data=st.data(),
+    rules=st.sampled_from([Suppression(), Suppression(iou=0.5, score=0.3, outer=0.4, inner=0.6)]),
+)
+def test_suppression_is_that_of_the_protocol(masks, data, rules):
+    levels = st.sampled_from([0.0, 0.25, 0.3, 0.5, 0.7, 0.75, 0.8, 1.0])  # ties, and the threshold itself
+    scores = data.draw(st.lists(levels, min_size=len(masks), max_size=len(masks)))
+    found = mask_nms(torch.from_numpy(masks), torch.tensor(scores, dtype=torch.float64), rules)
+    assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores, rules)
+
+
+def test_suppression_of_overlaps_as_large_as_those_of_photographs():
+    """Many masks in chunks of pixels, with areas from specks to half of the image."""
+    g = np.random.default_rng(0)
+    y, x = np.mgrid[:120, :160]
+    masks = []
+    for _ in range(60):
+        cy, cx, r = g.uniform(0, 120), g.uniform(0, 160), np.exp(g.uniform(0.5, 4.2))
+        masks.append((y - cy) ** 2 + (x - cx) ** 2 < r**2)
+        masks.append((y - cy - g.normal()) ** 2 + (x - cx) ** 2 < (r * g.uniform(0.9, 1.1)) ** 2)
+    masks = np.array([mask for mask in masks if mask.any()])
+    scores = g.uniform(0.6, 1, len(masks))
+    found = mask_nms(torch.from_numpy(masks), torch.from_numpy(scores))
+    assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores.tolist(), Suppression())
+    assert 5 < int(found.sum()) < len(masks) // 2
+
+
+def test_the_best_three_stay_where_none_is_good():
+    masks = torch.eye(5, dtype=torch.bool)[:, None]
+    assert mask_nms(masks, torch.tensor([0.1, 0.5, 0.3, 0.7, 0.2])).tolist() == [False, True, True, True, False]
+    assert mask_nms(masks[:2], torch.tensor([0.1, 0.5])).tolist() == [True, True]
+
+
+def test_a_small_mask_inside_a_large_one_goes_whatever_its_score():
+    large = torch.ones(1, 10, 10, dtype=torch.bool)
+    small = torch.zeros(1, 10, 10, dtype=torch.bool)
+    small[0, 2:5, 2:5] = True
+    for scores in ([0.8, 0.9], [0.9, 0.8]):
+        assert mask_nms(torch.cat([large, small]), torch.tensor(scores)).tolist() == [True, False]
+
+
+@settings(max_examples=100, deadline=None)
+@given(masks=boxes_with_noise())
+def test_later_masks_lie_on_top_and_none_is_lost(masks):
+    labels = stack_masks(torch.from_numpy(masks)).numpy()
+    assert labels.dtype == np.int32
+    assert len(labels) == max(1, masks.sum(axis=0).max(initial=0))
+    by_hand = np.full(masks.shape[1:], -1)
+    for i, mask in enumerate(masks):
+        by_hand[mask] = i
+        assert ((labels == i).any(axis=0) == mask).all()
+        assert ((labels == i).sum(axis=0) <= 1).all()
+    assert (labels[0] == by_hand).all()
+    assert ((labels[:-1] > labels[1:]) | (labels[1:] == -1)).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(masks=boxes_with_noise(), empty=st.booleans())
+def test_boxes(masks, empty):
+    masks = np.concatenate([masks, np.zeros((1, *masks.shape[1:]), dtype=bool)]) if empty else masks
+    for mask, box in zip(masks, boxes_of(torch.from_numpy(masks)).tolist(), strict=True):
+        y, x = np.nonzero(mask)
+        assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
+
+
+def components_by_hand(mask: np.ndarray) -> list[set]:
+    """8-connected components by flood fill, in the order of their first pixels."""
+    left, found = pixels(mask), []
+    for start in sorted(left):
+        if start not in left:
+            continue
+        left.remove(start)
+        piece, front = {start}, [start]
+        while front:
+            y, x = front.pop()
+            near = {(y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)} & left
+            left -= near
+            piece |= near
+            front.extend(near)
+        found.append(piece)
+    return found
+
+
+def clean_by_hand(mask: np.ndarray, least: int) -> tuple[list[np.ndarray], bool]:
+    """All right answers: several where the largest of small pieces has equals."""
+    mask, changed = mask.copy(), False
+    for hole in components_by_hand(~mask):
+        if len(hole) < least:
+            mask[tuple(np.array(sorted(hole)).T)] = True
+            changed = True
+    pieces = components_by_hand(mask)
+    stay = [piece for piece in pieces if len(piece) >= least]
+    largest = max(map(len, pieces))
+    answers = [set().union(*stay)] if len(stay) > 0 else [piece for piece in pieces if len(piece) == largest]
+    results = []
+    for answer in answers:
+        results.append(np.zeros_like(mask))
+        results[-1][tuple(np.array(sorted(answer)).T)] = True
+    return results, changed or len(stay) < len(pieces)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    mask=arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))),
+    margin=st.tuples(*[st.integers(0, 3)] * 4),
+    least=st.integers(1, 12),
+)
+def test_small_regions(mask, margin, least):
+    mask = np.pad(mask, (margin[:2], margin[2:]))
+    mask[mask.shape[0] // 2, mask.shape[1] // 2] = True
+    masks = torch.from_numpy(mask)[None]
+    found, changed = clean_masks(masks, boxes_of(masks), least)
+    answers, different = clean_by_hand(mask, least)
+    assert any(np.array_equal(found[0].numpy(), answer) for answer in answers)
+    assert changed.tolist() == [different]
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_no_masks_and_whole_images(count):
+    masks = torch.ones(count, 4, 5, dtype=torch.bool)
+    cleaned, changed = clean_masks(masks, boxes_of(masks), 10)
+    assert torch.equal(cleaned, masks) and changed.tolist() == [False] * count
+    assert mask_nms(masks, torch.ones(count)).tolist() == [True, False, False][:count]
+    assert stack_masks(masks).shape == (max(1, count), 4, 5)

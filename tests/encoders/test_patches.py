@@ -1,0 +1,116 @@
+"""Dense CLIP features of a small random model, loaded from disk by the real code."""
+
+import json
+from dataclasses import replace
+
+import open_clip
+import pytest
+import torch
+
+from benchmarks.captures import SHARED
+from normlift_ns.encoders.images import read_image
+from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.patches import PatchFeatures, dense_tokens, patch_grid
+from tests.captures import needs_shared
+from tests.encoders.tiny import CLIP, write_clip
+
+IMAGE = torch.randint(0, 256, (48, 80, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory) -> OpenClipEncoder:
+    folder = tmp_path_factory.mktemp("weights")
+    write_clip(folder)
+    return OpenClipEncoder(CLIP, str(folder / "tiny.pt"))
+
+
+def value_path(model, pixels: torch.Tensor) -> torch.Tensor:
+    """The last layer with an attention that looks nowhere else, without its residual and its MLP, by modules of
+    open_clip and torch."""
+    last, before = model.visual.transformer.resblocks[-1], []
+    hook = last.register_forward_pre_hook(lambda module, inputs: before.append(inputs[0]))
+    model.encode_image(pixels)
+    hook.remove()
+    tokens = last.ln_1(before[0])
+    nowhere_else = torch.full((tokens.shape[1],) * 2, -torch.inf).fill_diagonal_(0)
+    mixed = last.attn(tokens, tokens, tokens, need_weights=False, attn_mask=nowhere_else)[0]
+    return (model.visual.ln_post(mixed) @ model.visual.proj)[:, 1:]
+
+
+@pytest.mark.parametrize("size", [(32, 32), (48, 80), (24, 16)])
+@torch.no_grad()
+def test_tokens_are_those_of_the_value_path(encoder, size):
+    """At the size of training, and at others against a model that open_clip makes for that size."""
+    model = open_clip.create_model(CLIP, force_image_size=size)
+    open_clip.load_checkpoint(model, encoder.pretrained)
+    pixels = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(1))
+    expected = value_path(model.eval(), pixels)
+    torch.testing.assert_close(dense_tokens(encoder.network.model.visual, pixels), expected, rtol=0, atol=1e-5)
+
+
+def test_features_are_the_tokens_of_the_scaled_image(encoder):
+    view = PatchFeatures(encoder, 15).view(IMAGE, "a.jpg")
+    assert patch_grid(48, 80, 15) == (3, 5)
+    network = encoder.network
+    pixels = torch.nn.functional.interpolate(
+        IMAGE.permute(2, 0, 1)[None].float(), (24, 40), mode="bicubic", antialias=True
+    ).clamp(0, 255)
+    tokens = dense_tokens(network.model.visual, (pixels / 255 - network.mean) / network.std)[0]
+    torch.testing.assert_close(view.features, torch.nn.functional.normalize(tokens, dim=1), rtol=0, atol=1e-5)
+    y, x = torch.meshgrid(torch.arange(48) // 16, torch.arange(80) // 16, indexing="ij")
+    assert torch.equal(view.labels, (5 * y + x).int())
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "count"), [(960, 540, 1024), (31, 77, 50), (5, 9, 1024), (30, 90, 7), (9, 9, 1)]
+)
+def test_patches_keep_the_shape_of_the_image(encoder, height, width, count):
+    rows, columns = patch_grid(height, width, count)
+    assert rows <= height and columns <= width
+    assert rows * columns <= 1.3 * count + 1
+    if min(rows, columns) > 3:
+        assert rows / columns == pytest.approx(height / width, rel=0.15)
+    labels = PatchFeatures(encoder, count).labels(torch.zeros(height, width, 3, dtype=torch.uint8))
+    assert labels.shape == (height, width)
+    sizes = torch.bincount(labels.flatten())
+    assert len(sizes) == rows * columns
+    assert int(sizes.min()) >= (height // rows) * (width // columns)
+
+
+def test_a_source_like_any_other(encoder):
+    source = PatchFeatures(encoder, 15)
+    assert source.available(["b.jpg", "a.jpg"]) == ["b.jpg", "a.jpg"]
+    assert torch.equal(source.text(["red"]), encoder.text(["red"]))
+    assert json.loads(json.dumps(source.identity)) == source.identity
+    assert source.identity != PatchFeatures(encoder, 16).identity
+    assert source.identity != PatchFeatures(replace(encoder, fill="white"), 15).identity
+    again = PatchFeatures(replace(encoder), 15).view(IMAGE, "a.jpg")
+    assert torch.equal(again.features, source.view(IMAGE, "a.jpg").features)
+    with pytest.raises(ValueError, match=r"image a\.jpg must be a uint8 tensor"):
+        source.view(IMAGE.float(), "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("model", "reason"),
+    [
+        ("RN50", "its image encoder is a convolutional network"),
+        ("convnext_base", "its image encoder is timm's"),
+        ("coca_ViT-B-32", "it pools by attention"),
+    ],
+)
+def test_models_without_a_value_path_are_refused(encoder, model, reason):
+    with pytest.raises(ValueError, match=f"needs a vision transformer of open_clip; {model} is none: {reason}"):
+        PatchFeatures(replace(encoder, model=model))
+
+
+def test_no_patches(encoder):
+    with pytest.raises(ValueError, match="regions per image must be at least 1, got 0"):
+        PatchFeatures(encoder, 0)
+
+
+@needs_shared
+def test_a_photograph(encoder):
+    image = read_image(SHARED / "captures" / "fox" / "images" / "0001.jpg")
+    view = PatchFeatures(encoder).view(image, "images/0001.jpg")
+    assert view.labels.shape == image.shape[:2] and len(view.features) == 43 * 24
+    assert len(view.features.unique(dim=0)) == 43 * 24

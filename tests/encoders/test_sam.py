@@ -1,0 +1,289 @@
+"""SAM's automatic masks: the real network with few random weights, against Meta's own implementation."""
+
+import json
+import sys
+import urllib.error
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+
+import huggingface_hub
+import numpy as np
+import pytest
+import torch
+import transformers
+from segment_anything import SamAutomaticMaskGenerator, SamPredictor, sam_model_registry
+
+from benchmarks.captures import SHARED
+from normlift_ns.encoders.images import read_image
+from normlift_ns.encoders.masks import Suppression
+from normlift_ns.encoders.sam import LEVELS, MaskRules, SamMasks, point_grid
+from normlift_ns.encoders.sam_network import SamNetwork
+from normlift_ns.encoders.sam_weights import load_sam, published_config, published_name
+from tests.captures import needs_shared
+from tests.encoders.test_masks import nms_by_hand, pixels
+from tests.encoders.tiny import SIDE, tiny_sam, write_sam
+
+EVERYTHING = Suppression(iou=1.0, score=-1.0, outer=0.0, inner=2.0)
+LOOSE = MaskRules(points_per_side=6, predicted_iou=0.5, stability=0.3, suppression=Suppression(score=0.1))
+
+
+def noise(height: int, width: int) -> torch.Tensor:
+    return torch.randint(0, 256, (height, width, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """Meta's file of a tiny SAM, a folder of the same weights as transformers writes it, and a file of one whose masks
+    depend on the point."""
+    folder = tmp_path_factory.mktemp("sam")
+    write_sam(folder / "sam_tiny.pth", seed=1)
+    write_sam(folder / "sam_eager.pth", seed=1, gain=6)
+    load_sam(str(folder / "sam_tiny.pth")).save_pretrained(folder / "tiny")
+    return folder
+
+
+@pytest.mark.parametrize("size", [(96, 54), (128, 128), (40, 200)])
+def test_the_network_is_that_of_meta(weights, size):
+    image, predictor = noise(*size), SamPredictor(tiny_sam(seed=1))
+    predictor.set_image(image.numpy())
+    network = SamNetwork.load(str(weights / "sam_tiny.pth"), "cpu")
+    (embedding,) = network.embed(network.pixels([image]))
+    torch.testing.assert_close(embedding, predictor.features, rtol=0, atol=1e-5)
+    points = point_grid(5) * torch.tensor([size[1], size[0]])
+    logits, ious = map(torch.cat, zip(*network.prompt(embedding, points, size)))
+    scaled = torch.from_numpy(predictor.transform.apply_coords(points.numpy(), size))[:, None]
+    large, expected_ious, expected = predictor.predict_torch(scaled, torch.ones(25, 1), return_logits=True)
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(logits, expected, rtol=0, atol=1e-5 * scale)
+    torch.testing.assert_close(ious, expected_ious, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        network.enlarge(logits.flatten(0, 1), size), large.flatten(0, 1), rtol=0, atol=1e-5 * scale
+    )
+
+
+def test_a_folder_and_a_file_of_the_same_weights_agree(weights):
+    file, folder = (load_sam(str(weights / name)).state_dict() for name in ("sam_tiny.pth", "tiny"))
+    assert set(file) == set(folder)
+    assert all(torch.equal(file[name], folder[name]) for name in file)
+    inside = load_sam(str(weights / "tiny" / "model.safetensors")).state_dict()
+    assert all(torch.equal(file[name], inside[name]) for name in file)
+
+
+@pytest.mark.parametrize("kind", ["vit_b", "vit_l", "vit_h"])
+def test_metas_files_fit(kind):
+    """Names and shapes of all parameters, without any weights."""
+    with torch.device("meta"):
+        state = sam_model_registry[kind]().state_dict()
+        expected = transformers.SamModel(published_config(state)).state_dict()
+    found = {published_name(name): value.shape for name, value in state.items()}
+    assert {name: value.shape for name, value in expected.items() if not name.startswith("shared_image")} == found
+
+
+def blobs(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """In place of the mask decoder: three sizes of blobs around points of the input, with ragged edges, holes and
+    specks, and scores that differ."""
+    p = points.double().round(decimals=3)[:, None, None, None, :] / SIDE
+    line = (torch.arange(32, dtype=torch.float64) + 0.5) / 32
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    radius = torch.tensor([0.08, 0.13, 0.2])[:, None, None] * (1 + 0.5 * torch.sin(9 * p[..., 0] + 5 * p[..., 1]))
+    waves = torch.sin(40 * x + 17 * p[..., 0]) * torch.sin(31 * y + 23 * p[..., 1])
+    distance = ((x - p[..., 0]) ** 2 + (y - p[..., 1]) ** 2).sqrt()
+    score = 0.75 + 0.25 * torch.sin(13 * p[:, 0, 0, :, 0] + 29 * p[:, 0, 0, :, 1] + torch.arange(3))
+    return (200 * (radius - distance) + 9 * waves).float(), score.float()
+
+
+@pytest.mark.parametrize("size", [(160, 120), (100, 180)])
+def test_the_masks_are_those_of_metas_generator(weights, monkeypatch, size):
+    """Same masks in the same order, level by level, for the same answers of the network; then LangSplat's rules."""
+    monkeypatch.setattr(SamNetwork, "decode", lambda self, embedding, points: blobs(points))
+    rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, edge=20, region_area=15)
+    image = noise(*size)
+    kept = SamMasks(str(weights / "tiny"), rules=replace(rules, suppression=EVERYTHING)).masks(image)
+    chosen = SamMasks(str(weights / "tiny"), rules=rules).masks(image)
+
+    generator = SamAutomaticMaskGenerator(
+        tiny_sam(seed=1),
+        points_per_side=5,
+        pred_iou_thresh=0.6,
+        stability_score_thresh=0.6,
+        box_nms_thresh=0.7,
+        crop_n_layers=1,
+        min_mask_region_area=15,
+    )
+    predictor = generator.predictor
+    for level, channels in zip(LEVELS, (slice(0, 3), slice(0, 1), slice(1, 2), slice(2, 3)), strict=True):
+
+        def predict(points, *_, channels=channels, **__):
+            logits, score = blobs(points[:, 0])
+            large = predictor.model.postprocess_masks(logits, predictor.input_size, predictor.original_size)
+            return large[:, channels], score[:, channels], None
+
+        monkeypatch.setattr(predictor, "predict_torch", predict)
+        expected = generator.generate(image.numpy())
+        assert len(expected) > 5
+        assert len(kept[level]) == len(expected)
+        for mask, one in zip(kept[level], expected):
+            assert np.array_equal(mask.numpy(), one["segmentation"])
+        scores = [float(np.float32(one["stability_score"]) * np.float32(one["predicted_iou"])) for one in expected]
+        stay = nms_by_hand([pixels(one["segmentation"]) for one in expected], scores, Suppression())
+        assert torch.equal(chosen[level], kept[level][torch.tensor(stay)])
+        assert 0 < sum(stay) < len(stay)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_a_gpu_finds_what_the_cpu_finds(weights, monkeypatch):
+    image, path = noise(160, 120), str(weights / "tiny")
+    networks = [SamNetwork.load(path, device) for device in ("cpu", "cuda")]
+    exact, half = (network.embed(network.pixels([image]))[0].cpu() for network in networks)
+    assert float((half - exact).norm() / exact.norm()) < 0.01
+    monkeypatch.setattr(SamNetwork, "decode", lambda self, _, points: tuple(x.to(self._device) for x in blobs(points)))
+    rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, region_area=15)
+    cpu, gpu = (SamMasks(path, device=device, rules=rules).masks(image) for device in ("cpu", "cuda"))
+    for level in LEVELS:
+        assert gpu[level].shape == cpu[level].shape
+        assert float((gpu[level].cpu() != cpu[level]).float().mean()) < 1e-4  # bilinear weights are rounded otherwise
+
+
+def test_label_maps_hold_all_levels_with_overlaps_beneath(weights, monkeypatch):
+    monkeypatch.setattr(SamNetwork, "decode", lambda self, embedding, points: blobs(points))
+    sam = SamMasks(str(weights / "tiny"), rules=MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6))
+    image = noise(130, 170)
+    labels, masks = sam.labels(image, "a.jpg"), sam.masks(image)
+    assert labels.dtype == torch.int32 and labels.shape[0] == 4 and labels.shape[2:] == (130, 170)
+    assert labels.shape[1] > 1
+    for level, maps in zip(masks.values(), labels):
+        for i, mask in enumerate(level):
+            assert torch.equal((maps == i).any(dim=0), mask)
+        assert int(maps.max()) == len(level) - 1
+    assert [replace(sam, level=level).chosen for level in LEVELS] == [(0,), (1,), (2,), (3,)]
+    assert SamMasks(str(weights / "tiny")).chosen == (3,)
+
+
+def test_no_mask_is_good_enough(weights):
+    labels = SamMasks(str(weights / "tiny"), rules=MaskRules(points_per_side=2, predicted_iou=9.0)).labels(
+        noise(30, 40), "a.jpg"
+    )
+    assert labels.shape == (4, 1, 30, 40) and bool((labels == -1).all())
+
+
+@needs_shared
+@pytest.mark.parametrize("photo", ["fox/images/0001.jpg", "tabletop/images/0003.jpg"])
+def test_masks_of_photographs(weights, photo):
+    """The whole way with a random network: something survives in each level, levels differ, runs repeat."""
+    image = read_image(SHARED / "captures" / photo)[::4, ::4].contiguous()
+    sam = SamMasks(str(weights / "sam_eager.pth"), rules=LOOSE)
+    masks = sam.masks(image)
+    assert list(masks) == list(LEVELS)
+    assert all(len(level) > 0 and level.shape[1:] == image.shape[:2] for level in masks.values())
+    first = [level[0] for level in masks.values()]
+    assert not torch.equal(first[1], first[2]) and not torch.equal(first[2], first[3])
+    again = SamMasks(str(weights / "sam_eager.pth"), rules=LOOSE).labels(image, photo)
+    assert torch.equal(again, sam.labels(image, photo))
+
+
+def test_a_checkpoint_counts_by_its_content(weights, tmp_path):
+    copy = tmp_path / "other.pth"
+    copy.write_bytes((weights / "sam_tiny.pth").read_bytes())
+    sam = SamMasks(str(weights / "sam_tiny.pth"))
+    assert SamMasks(str(copy)).identity == sam.identity
+    assert json.loads(json.dumps(sam.identity)) == sam.identity
+    assert replace(sam, level="s").identity == sam.identity  # all levels are found at once
+    assert replace(sam, rules=LOOSE).identity != sam.identity
+    copy.write_bytes(copy.read_bytes() + b"x")
+    assert SamMasks(str(copy)).identity != sam.identity
+    assert SamMasks("facebook/sam-vit-huge").identity["checkpoint"] == "facebook/sam-vit-huge"
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "error", "message"),
+    [
+        (
+            "/nowhere/sam_vit_h.pth",
+            FileNotFoundError,
+            r"SAM checkpoint /nowhere/sam_vit_h.pth does not exist.*--regions",
+        ),
+        ("sam_vit_h.pth", FileNotFoundError, "does not exist; check the path"),
+        ("vit_h", ValueError, "'vit_h' is neither a path nor a name of the hub such as facebook/sam-vit-huge"),
+    ],
+)
+def test_checkpoints_that_are_none(checkpoint, error, message):
+    with pytest.raises(error, match=message):
+        SamMasks(checkpoint)
+
+
+def test_unknown_levels(weights):
+    with pytest.raises(ValueError, match="SAM has the levels default, s, m, l; got 'xl': choose with --level"):
+        SamMasks(str(weights / "tiny"), level="xl")  # pyright: ignore[reportArgumentType]
+
+
+def test_without_transformers(monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ValueError, match=r'needs the package transformers .*pip install "normlift-ns\[sam\]".*patches'):
+        SamMasks()
+
+
+def damage(folder: Path, kind: str) -> Path:
+    config, state = folder / "config.json", folder / "model.safetensors"
+    if kind == "other network":
+        config.write_text(json.dumps({"model_type": "bert"}))
+    elif kind == "truncated":
+        state.write_bytes(state.read_bytes()[:1000])
+    elif kind == "no weights":
+        state.unlink()
+    elif kind == "no config":
+        config.unlink()
+    elif kind == "other sizes":
+        found = json.loads(config.read_text())
+        found["vision_config"]["num_hidden_layers"] = 3
+        config.write_text(json.dumps(found))
+    else:
+        torch.save({"image_encoder.pos_embed": torch.zeros(1, 8, 8, 32)}, folder / "bad.pth")
+        return folder / "bad.pth"
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("other network", "model type 'bert', expected 'sam'"),
+        ("truncated", "damaged or not of SAM"),
+        ("no weights", r"the folder has no model\.safetensors"),
+        ("no config", r"config\.json"),
+        ("other sizes", "Missing key"),
+        ("other file", "image_encoder.patch_embed.proj.weight"),
+    ],
+)
+def test_damaged_checkpoints_are_named_with_a_remedy(weights, tmp_path, kind, message):
+    for file in (weights / "tiny").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    path = damage(tmp_path, kind)
+    with pytest.raises(ValueError, match=message) as info:
+        SamMasks(str(path)).masks(noise(30, 40))
+    assert str(path) in str(info.value) and "--regions patches" in str(info.value)
+    assert info.value.__suppress_context__ and "\n" not in str(info.value)
+
+
+def test_absent_weights_give_one_message(monkeypatch, tmp_path):
+    def refuse(*args, **kwargs):
+        raise urllib.error.URLError("Name or service not known")
+
+    monkeypatch.setattr(urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(FileNotFoundError) as info:
+        SamMasks().masks(noise(30, 40))
+    for part in ("facebook/sam-vit-huge", "Name or service not known", "--sam-model", "--regions patches"):
+        assert part in str(info.value)
+    assert "\n" not in str(info.value)
+
+
+def test_downloaded_weights_need_no_network(weights, monkeypatch, tmp_path):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    snapshot = tmp_path / "models--someone--tiny" / "snapshots" / "abc"
+    snapshot.mkdir(parents=True)
+    (tmp_path / "models--someone--tiny" / "refs").mkdir()
+    (tmp_path / "models--someone--tiny" / "refs" / "main").write_text("abc")
+    for file in (weights / "tiny").iterdir():
+        (snapshot / file.name).write_bytes(file.read_bytes())
+    state, expected = (load_sam(name).state_dict() for name in ("someone/tiny", str(weights / "tiny")))
+    assert all(torch.equal(state[name], expected[name]) for name in expected)
