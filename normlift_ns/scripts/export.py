@@ -26,7 +26,7 @@ class NormLiftExport:
     """What to look for; by default the queries stored in the run, with the rule stored with them."""
     part: Literal["scene", "selection", "rest"] = "scene"
     """scene: all Gaussians. selection: what any of the texts selects. rest: the scene without that."""
-    ask: AskOptions = field(default_factory=AskOptions)
+    rule: AskOptions = field(default_factory=AskOptions)
     output_filename: str = "splat.ply"
     """Name of the PLY file; the rows it has of the run go to <name>_rows.npy, the objects to <name>_objects.json."""
     reach: float = 4.0
@@ -60,10 +60,10 @@ class NormLiftExport:
         from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data)
-        semantics = with_texts(load_field(run), vectors=self.ask.text_vectors, template=self.ask.text_template)
+        semantics = with_texts(load_field(run), vectors=self.rule.text_vectors, template=self.rule.text_template)
         if len(self.text) > 0:
             texts = encoder_of(semantics, device, run.location.run_dir.parent / ".cache" / "texts")
-            question = pose(semantics, texts, self.text, **self.ask.keywords())
+            question = pose(semantics, texts, self.text, **self.rule.keywords())
         else:
             question = load_question(run.location.run_dir / FIELD_FOLDER)
         if question is None and self.part != "scene":
@@ -82,13 +82,16 @@ class NormLiftExport:
         )
         CONSOLE.print(f"{len(rows):,} of {len(run.scene):,} Gaussians in {target}", highlight=False)
         beside["objects.json"].unlink(missing_ok=True)
-        if answer is not None:
-            rule = answer.question
+        if answer is not None and question is not None:
             tables: list[dict[str, Any]] = [
                 {"text": text, **object_table(semantics, run.scene, chosen, reach=self.reach, min_size=self.min_size)}
                 for text, chosen in zip(answer.texts, answer.selected.T)
             ]
-            facts = {"relevancy": rule.form, "threshold": rule.threshold, "min_reliability": rule.min_reliability}
+            facts = {
+                "relevancy": question.form,
+                "threshold": question.threshold,
+                "min_reliability": question.min_reliability,
+            }
             with atomic_path(beside["objects.json"]) as temporary:
                 temporary.write_text(json.dumps({"queries": tables, **facts}, indent=2) + "\n")
             CONSOLE.print(_table(tables))

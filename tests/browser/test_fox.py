@@ -30,7 +30,7 @@ def test_a_person_finds_the_fox(fox_run: Path, tmp_path: Path, pictures: Path) -
         assert "Nothing is asked." in tab.status()
 
         tab.choose("Output type", "overlay")
-        assert coloured(tab.picture()).mean() < 0.001
+        tab.until(lambda: coloured(tab.picture()).mean() < 0.001, "grey, as nothing is asked", timeout=60)
         tab.type("Prompts", "orange; crimson")
         tab.press("Query")
         tab.says("crimson")

@@ -281,7 +281,7 @@ def test_selection_follows_threshold_and_reliability(lifted):
     assert (field.scalars.reliability[sure] >= 0.8).all()
     assert 0 < int(sure.sum()) < int(loose.sum())
     lead = ask(field, encoder, ["red"], negatives=["orange", "brown"], form="margin")
-    assert lead.threshold == 0.02
+    assert lead.question.threshold == 0.02
     assert (lead.relevancy[lead.selected] > 0.02).all()
 
 
