@@ -28,7 +28,7 @@ ALLOWED = {
     },
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},
     "plugin": BASE
-    | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib"}
+    | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib", "plyfile"}
     | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin")},
 }
 

@@ -10,6 +10,7 @@ from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.plugin.lifting import LiftOptions
 from normlift_ns.scripts import lift
+from normlift_ns.scripts.query import NormLiftQuery
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -33,8 +34,11 @@ def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
     assert "sky blue" in shown
 
 
-def test_options_of_the_readme_exist():
-    table = README.split("## Options of ns-normlift")[1].split("## Limits")[0]
-    named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", table)} - {"help"}
-    known = {f.name for cls in (lift.NormLift, LiftOptions, RefineConfig, SourceOptions) for f in fields(cls)}
-    assert named <= known
+FRONT_ENDS = (ROOT / "docs" / "front_ends.md").read_text()
+
+
+@pytest.mark.parametrize("text", [README.split("## Options of ns-normlift")[1].split("## Limits")[0], FRONT_ENDS])
+def test_options_that_are_shown_exist(text):
+    named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", text)} - {"help"}
+    commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, NormLiftQuery)
+    assert named <= {f.name for cls in commands for f in fields(cls)}

@@ -43,6 +43,11 @@ class SemanticField:
     def __len__(self) -> int:
         return self.source.numel()
 
+    def to(self, device: torch.device | str) -> SemanticField:
+        """A copy on another device."""
+        scalars = Scalars(**{f.name: getattr(self.scalars, f.name).to(device) for f in fields(Scalars)})
+        return SemanticField(scalars, self.source.to(device), self.store.to(device), self.manifest)
+
     @property
     def dimension(self) -> int:
         """D, length of the feature vectors."""

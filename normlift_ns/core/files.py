@@ -19,3 +19,21 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def file_name(text: str) -> str:
+    """A text as part of a file name: letters and digits stay, 40 characters at most.
+
+    >>> file_name("../tea pot")
+    '___tea_pot'
+    """
+    return "".join(c if c.isalnum() else "_" for c in text[:40])
+
+
+def free_path(path: Path) -> Path:
+    """The path, or the first of path_2, path_3, … that does not exist yet."""
+    number, found = 1, path
+    while found.exists():
+        number += 1
+        found = path.with_name(f"{path.stem}_{number}{path.suffix}")
+    return found

@@ -38,6 +38,10 @@ class EvidenceForm:
     evidence: Evidence
     features: Float[Tensor, "s d"]
 
+    def to(self, device: torch.device | str) -> EvidenceForm:
+        """A copy on another device."""
+        return EvidenceForm(self.evidence.to(device), self.features.to(device))
+
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
         """Cosines to unit vectors, 0 without evidence: E (F t) / (W_j ||f_j||), in float64."""
         table = self.features.double() @ vectors.double().T
@@ -58,6 +62,10 @@ class DirectionForm:
 
     coordinates: Float16[Tensor, "m r"]
     basis: Float[Tensor, "r d"] | None
+
+    def to(self, device: torch.device | str) -> DirectionForm:
+        """A copy on another device."""
+        return DirectionForm(self.coordinates.to(device), None if self.basis is None else self.basis.to(device))
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
         """Cosines to unit vectors, 0 without evidence."""

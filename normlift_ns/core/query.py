@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 RelevancyForm = Literal["cosine", "lerf", "margin"]
@@ -51,3 +51,15 @@ def relevancy(
     # A softmax over two is a sigmoid of the difference; it falls as the negative rises, so the minimum is at the
     # largest negative.
     return positive - rival if form == "margin" else torch.sigmoid(temperature * (positive - rival))
+
+
+def strongest(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
+    """Index of the selected prompt of largest relevancy, the first of equals; -1 where none is selected.
+
+    >>> strongest(torch.tensor([[0.3, 0.9], [0.1, 0.2]]), torch.tensor([[True, True], [False, False]]))
+    tensor([ 1, -1], dtype=torch.int32)
+    """
+    if relevancy.shape[1] == 0:
+        return torch.full((len(relevancy),), -1, dtype=torch.int32, device=relevancy.device)
+    best = relevancy.where(selected, -torch.inf).argmax(dim=1)
+    return best.where(selected.any(dim=1), -1).int()

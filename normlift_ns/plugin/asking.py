@@ -19,8 +19,9 @@ from normlift_ns.core.query import CANONICAL_NEGATIVES, RelevancyForm
 from normlift_ns.encoders.build import SourceOptions, make_texts
 from normlift_ns.encoders.cache import CachedTexts
 from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.source import TextEncoder
+from normlift_ns.encoders.source import FeatureSource, TextEncoder
 from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.plugin.queries import Question
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
@@ -33,15 +34,17 @@ _CENTRAL = (0.05, 0.95)
 class Answer:
     """What a field answers to Q texts."""
 
-    texts: tuple[str, ...]
-    negatives: tuple[str, ...]
-    form: RelevancyForm
-    threshold: float
+    question: Question
     relevancy: Float[Tensor, "n q"]
     valid: Bool[Tensor, " n"]
     """Gaussians that have a direction."""
     selected: Bool[Tensor, "n q"]
     """Valid, above the threshold and reliable enough."""
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The Q texts."""
+        return self.question.texts
 
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
@@ -84,14 +87,17 @@ def _options(field: SemanticField) -> SourceOptions:
 
 def default_negatives(field: SemanticField) -> tuple[str, ...]:
     """LERF's negatives where the encoder knows them: the colour encoder does not, a file of text vectors may."""
-    options = _options(field)
-    known = CANONICAL_NEGATIVES if options.text_vectors is None else TextVectors(options.text_vectors).names
-    return CANONICAL_NEGATIVES if options.encoder == "open_clip" and set(CANONICAL_NEGATIVES) <= set(known) else ()
+    stored = field.manifest.get("encoder")
+    if not isinstance(stored, Mapping) or stored.get("encoder") != "open_clip":
+        return ()
+    vectors = stored.get("text_vectors")
+    known = CANONICAL_NEGATIVES if vectors is None else TextVectors(Path(vectors)).names
+    return CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(known) else ()
 
 
-def ask(
+def pose(
     field: SemanticField,
-    encoder: TextEncoder,
+    encoder: TextEncoder | FeatureSource,
     texts: Sequence[str],
     *,
     negatives: Sequence[str] | None = None,
@@ -99,8 +105,8 @@ def ask(
     threshold: float | None = None,
     min_reliability: float = 0.0,
     refined: bool = True,
-) -> Answer:
-    """Relevancy and selection of every Gaussian for each text.
+) -> Question:
+    """Texts as a question to a field.
 
     Args:
         negatives: what the texts are compared with; None: `default_negatives`.
@@ -109,18 +115,45 @@ def ask(
         min_reliability: least R of a selected Gaussian, in 0..1.
         refined: ask the refined directions.
     Raises:
-        ValueError: a text that is empty or that the encoder does not understand; a form without its negatives.
+        ValueError: a text that is empty or that the encoder does not understand.
     """
     negatives = tuple(default_negatives(field) if negatives is None else negatives)
     if form == "auto":
         form = "cosine" if len(negatives) == 0 else "lerf"
-    threshold = THRESHOLDS[form] if threshold is None else threshold
-    vectors = encoder.text(texts)
-    negative_vectors = None if len(negatives) == 0 or form == "cosine" else encoder.text(negatives)
-    relevancy = field.relevancy(vectors, negative_vectors, form=form, refined=refined)
-    valid = field.valid(refined=refined)
-    selected = (relevancy > threshold) & (valid & (field.scalars.reliability >= min_reliability))[:, None]
-    return Answer(tuple(texts), negatives, form, threshold, relevancy, valid, selected)
+    return Question(
+        texts=tuple(texts),
+        vectors=encoder.text(texts),
+        negatives=negatives,
+        negative_vectors=encoder.text(negatives) if len(negatives) > 0 else None,
+        form=form,
+        threshold=THRESHOLDS[form] if threshold is None else threshold,
+        min_reliability=min_reliability,
+        refined=refined,
+    )
+
+
+def respond(field: SemanticField, question: Question) -> Answer:
+    """Relevancy and selection of every Gaussian for each text.
+
+    Raises:
+        ValueError: vectors of another length than the field's, a form without its negatives.
+    """
+    negatives = None if question.form == "cosine" else question.negative_vectors
+    relevancy = field.relevancy(question.vectors, negatives, form=question.form, refined=question.refined)
+    found = Answer(question, relevancy, field.valid(refined=question.refined), relevancy.new_empty(0, 0).bool())
+    return judge(field, found, question.threshold, question.min_reliability)
+
+
+def judge(field: SemanticField, answer: Answer, threshold: float, min_reliability: float) -> Answer:
+    """The same relevancies with another selection."""
+    sure = answer.valid & (field.scalars.reliability >= min_reliability)
+    question = replace(answer.question, threshold=threshold, min_reliability=min_reliability)
+    return replace(answer, question=question, selected=(answer.relevancy > threshold) & sure[:, None])
+
+
+def ask(field: SemanticField, encoder: TextEncoder, texts: Sequence[str], **options: Any) -> Answer:
+    """Relevancy and selection of every Gaussian for each text; arguments and errors as in `pose` and `respond`."""
+    return respond(field, pose(field, encoder, texts, **options))
 
 
 def summarize(answer: Answer, field: SemanticField, scene: GaussianScene) -> list[dict[str, Any]]:

@@ -67,7 +67,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             "torch.save writes. Copy it again, or give another checkpoint with --load-step."
         )
     try:
-        with torch.serialization.safe_globals(_numpy_numbers()):
+        with torch.serialization.safe_globals(numpy_numbers()):
             loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
@@ -103,7 +103,7 @@ def _model_state(pipeline: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:
             yield rest, value.clone()
 
 
-def _numpy_numbers() -> list[Any]:
+def numpy_numbers() -> list[Any]:
     """What unpickling numpy's scalars needs: learning rates in the state of nerfstudio's schedulers are such."""
     rebuild: Any = np.float64(0).__reduce__()[0]
     modules = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2

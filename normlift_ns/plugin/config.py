@@ -18,7 +18,7 @@ from normlift_ns.plugin.model import NormLiftModelConfig
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
-SUPPORTED_METHODS = ("splatfacto", "splatfacto-big", "normlift")
+SUPPORTED_METHODS = ("splatfacto", "splatfacto-big", "normlift", "normlift-lerf-ovs", "normlift-scannet")
 _TRUSTED_PACKAGES = ("nerfstudio", "normlift_ns", "torch.optim")
 _OBJECT_TAG = "tag:yaml.org,2002:python/object"
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from gsplat.rendering import rasterization
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
@@ -18,9 +18,13 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.picking import ray_weights
 from normlift_ns.plugin.appearance import shading_degree, view_colors
+from normlift_ns.plugin.asking import respond
+from normlift_ns.plugin.display import Display, draw
 from normlift_ns.plugin.lpips import LazyLpips
-from normlift_ns.plugin.queries import QueryVectors, load_queries
+from normlift_ns.plugin.panel import Panel
+from normlift_ns.plugin.queries import Question, load_question
 from normlift_ns.plugin.views import to_camera
 from normlift_ns.raster.rasterize import render
 
@@ -32,23 +36,12 @@ class NormLiftModelConfig(SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: NormLiftModel)
     semantics: Path | None = None
     """Folder of the semantic field (the normlift/ folder of a lifted run); none: plain splatfacto."""
-    queries: tuple[str, ...] = ()
-    """Texts whose relevancy is rendered as relevancy_0, relevancy_1, ...; their vectors lie in the field's folder."""
 
     @staticmethod
-    def upgrade(
-        config: SplatfactoModelConfig, *, semantics: Path | None = None, queries: tuple[str, ...] = ()
-    ) -> NormLiftModelConfig:
+    def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
         """The same model with a field: every field of the config is taken over."""
         values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
-        return NormLiftModelConfig(**values, semantics=semantics, queries=queries)
-
-
-class Published(NamedTuple):
-    """What is rendered besides the colours. Never changed, only replaced: the viewer renders in other threads."""
-
-    names: tuple[str, ...] = ()
-    values: Float[Tensor, "n c"] | None = None
+        return NormLiftModelConfig(**values, semantics=semantics)
 
 
 class NormLiftModel(SplatfactoModel):
@@ -60,17 +53,23 @@ class NormLiftModel(SplatfactoModel):
     config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
 
     def populate_modules(self) -> None:
-        """As splatfacto's, without what it needs CUDA or a download for."""
+        """As splatfacto's, without what it needs CUDA or a download for; with the panel of the viewer."""
         if not torch.cuda.is_available():
             self.seed_points = None  # splatfacto moves them to CUDA; a checkpoint brings its own Gaussians
         with _lazy_lpips():
             super().populate_modules()
         self._field: SemanticField | None = None
-        self._published = Published()
+        self._display: Display | None = None
+        self.normlift = Panel(self)
+
+    @property
+    def on_cpu(self) -> bool:
+        """True where normlift_ns renders; stock splatfacto needs CUDA."""
+        return self.device.type == "cpu"
 
     @property
     def field(self) -> SemanticField | None:
-        """The attached field, on the CPU."""
+        """The attached field, on the model's device."""
         return self._field
 
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
@@ -82,52 +81,59 @@ class NormLiftModel(SplatfactoModel):
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
             semantic_field = SemanticField.load(self.config.semantics, self.means)
-            self.attach(semantic_field, load_queries(self.config.semantics, self.config.queries))
+            self.attach(semantic_field, load_question(self.config.semantics))
+        if self.on_cpu:
+            compile_renderer()
 
-    def attach(self, semantic_field: SemanticField, queries: QueryVectors | None = None) -> None:
-        """Renders the reliability of a field, and the relevancy of queries, from now on."""
-        values = {"reliability": semantic_field.scalars.reliability}
-        if queries is not None:
-            relevancy = semantic_field.relevancy(
-                queries.vectors, queries.negatives, form="cosine" if queries.negatives is None else "lerf"
-            )
-            values |= {f"relevancy_{i}": relevancy[:, i] for i in range(relevancy.shape[1])}
-        self._field = semantic_field
-        self.publish(values)
+    def attach(self, semantic_field: SemanticField, question: Question | None = None) -> None:
+        """Renders a field and the answer to a question from now on, and lets the panel ask it."""
+        self._field = semantic_field.to(self.device)
+        self.normlift.open(None if question is None else respond(self._field, question))
 
-    def publish(self, values: Mapping[str, Float[Tensor, " n"]]) -> None:
-        """Replaces the scalars of the Gaussians that are rendered as outputs of these names.
+    def detach(self) -> None:
+        """Forgets the field, because the Gaussians are about to change."""
+        self.config.semantics = self._field = self._display = None
 
-        An output is sum_j A_ij value_j, [H, W, 1]: 0 where nothing is. Safe to call while another thread renders.
-
-        Raises:
-            ValueError: values of another length.
-        """
-        for name, value in values.items():
-            if tuple(value.shape) != (self.num_points,):
-                raise ValueError(f"{name} must be [{self.num_points}], one per Gaussian, got {tuple(value.shape)}")
-        columns = [value.to(self.device, torch.float32) for value in values.values()]
-        self._published = Published(tuple(values), torch.stack(columns, dim=1) if columns else None)
+    def show(self, display: Display | None) -> None:
+        """Replaces what is drawn besides the colours. Safe to call while another thread renders."""
+        self._display = display
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Stock outputs (rgb, depth, accumulation, background), and one [H, W, 1] for everything published.
+        """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
 
         Args:
             camera: one camera.
             obb_box: Gaussians outside are not drawn.
         """
-        names, values = self._published
-        values = self.means.new_zeros(self.num_points, 0) if values is None else values.to(self.device)
-        self.set_crop(obb_box)
-        rows = None if obb_box is None else obb_box.within(self.means).reshape(-1)
+        display = self._display
+        rows = self.rows_in(obb_box, display)
         view = _opencv(camera.to(self.device))
-        if self.device.type == "cpu":
+        values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
+        if self.on_cpu:
             outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
-            outputs = super().get_outputs_for_camera(camera, obb_box)
+            outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
+            outputs["background"] = outputs["background"].expand(view.height, view.width, 3)  # [3] where all is cropped
             scalars = self._scalars_by_gsplat(view, values, rows)
-        return {**outputs, **{name: scalars[:, :, i : i + 1] for i, name in enumerate(names)}}
+        self.set_crop(obb_box)
+        if display is None:
+            return outputs
+        return {**outputs, **draw(display, outputs["rgb"], scalars, outputs["accumulation"][:, :, 0])}
+
+    def rows_in(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
+        """The Gaussians that are drawn: inside the box, and not hidden; None: all."""
+        drawn = None if display is None else display.drawn
+        if obb_box is None:
+            return drawn
+        inside = obb_box.within(self.means.detach()).reshape(-1)
+        return inside if drawn is None else inside & drawn
+
+    def in_sight(self, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
+        """`ray_weights` of the Gaussians that were drawn last."""
+        rows = self.rows_in(self.crop_box, self._display)
+        weights = ray_weights(self._scene(rows), origin, direction)
+        return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:
         parts = (self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
@@ -182,6 +188,24 @@ class NormLiftModel(SplatfactoModel):
         if not self.lpips.available:
             metrics = {name: value for name, value in metrics.items() if "lpips" not in name}
         return metrics, images
+
+
+class _Rows(NamedTuple):
+    """Some Gaussians, where splatfacto expects a box that tells which points are within."""
+
+    mask: Bool[Tensor, " n"]
+
+    def within(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        return self.mask
+
+
+def compile_renderer() -> None:
+    """Compiles the CPU rasterizer now: the viewer renders under a tracer, which would slow the compiler down."""
+    scene = GaussianScene(torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1))
+    pose = torch.eye(4)
+    pose[2, 3] = 3
+    K = torch.tensor([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]])
+    render(scene, Camera(K, pose, 4, 4), torch.ones(1, 4))
 
 
 def _opencv(camera: Cameras) -> Camera:

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from normlift_ns.core.files import file_name
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.plugin.adapters import SourceRun
 from normlift_ns.plugin.asking import Answer, pixel_relevancy
@@ -32,7 +33,7 @@ def save_overlays(run: SourceRun, answer: Answer, cameras: dict[str, Camera], fo
         relevancy = pixel_relevancy(values, alpha)
         image = run.render(camera)
         for q, text in enumerate(answer.texts):
-            paths.append(folder / f"{name}_{q}_{_file_name(text)}.png")
+            paths.append(folder / f"{name}_{q}_{file_name(text)}.png")
             save_overlay(paths[-1], image, relevancy[:, :, q], text, answer)
     return paths
 
@@ -42,8 +43,9 @@ def save_overlay(
 ) -> None:
     """A heat map over the image in grey, the more opaque the more relevant, with the text and a colour scale."""
     height, width = relevancy.shape
-    low = {"cosine": 0.0, "lerf": 0.0, "margin": -0.1}[answer.form]
-    high = max(float(relevancy.max()), answer.threshold + 0.05)
+    rule = answer.question
+    low = {"cosine": 0.0, "lerf": 0.0, "margin": -0.1}[rule.form]
+    high = max(float(relevancy.max()), rule.threshold + 0.05)
     figure = Figure(figsize=(_INCHES * 1.15, _INCHES * height / width + 0.5), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -53,15 +55,11 @@ def save_overlay(
     heat = axes.imshow(relevancy.numpy(), cmap="inferno", vmin=low, vmax=high, alpha=opacity.numpy())
     scale = figure.colorbar(heat, ax=axes, fraction=0.05)
     scale.solids.set_alpha(1.0)  # pyright: ignore[reportOptionalMemberAccess]
-    scale.ax.axhline(answer.threshold, color="white", linewidth=1.5)
-    scale.set_label(f"relevancy ({answer.form}); selected above {answer.threshold:g}")
+    scale.ax.axhline(rule.threshold, color="white", linewidth=1.5)
+    scale.set_label(f"relevancy ({rule.form}); selected above {rule.threshold:g}")
     axes.set_title(text if len(text) < 60 else text[:57] + "…")
     axes.set_axis_off()
     figure.savefig(path)
-
-
-def _file_name(text: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in text)[:40]
 
 
 def training_cameras(run: SourceRun, names: Sequence[str] = ()) -> dict[str, Camera]:

@@ -1,57 +1,89 @@
-"""Text vectors that are stored with a run, so that stock nerfstudio can render relevancies without a text encoder."""
+"""Questions: texts as vectors with the rule that judges by them, and how a run stores one.
+
+A run with a stored question is rendered by stock nerfstudio without a text encoder.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import get_args
 
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from normlift_ns.core.files import atomic_path
+from normlift_ns.core.query import RelevancyForm
 
-_FILE = "queries.safetensors"
+QUERIES_FILE = "queries.safetensors"
+"""In the folder of the field: vectors, and everything else as JSON in the file's metadata."""
+_KEY = "question"
 
 
-class QueryVectors(NamedTuple):
-    """Vectors of texts, from the encoder that made the field."""
+@dataclass(frozen=True)
+class Question:
+    """Q texts as the encoder of a field sees them, and what is selected by them."""
 
+    texts: tuple[str, ...]
     vectors: Float[Tensor, "q d"]
-    negatives: Float[Tensor, "b d"] | None = None
-    """With negatives, relevancy is LERF's (0.5: a draw); without, the cosine."""
+    """One per text, of any length > 0."""
+    negatives: tuple[str, ...] = ()
+    """What the texts are compared with, where the form compares."""
+    negative_vectors: Float[Tensor, "b d"] | None = None
+    form: RelevancyForm = "cosine"
+    threshold: float = 0.5
+    """Relevancy above which a Gaussian is selected."""
+    min_reliability: float = 0.0
+    """Least R of a selected Gaussian, in 0..1."""
+    refined: bool = True
+    """Ask the refined directions."""
 
 
-def save_queries(folder: Path, queries: QueryVectors) -> None:
-    """Writes queries.safetensors beside the field."""
-    tensors = {name: value.contiguous().cpu() for name, value in queries._asdict().items() if value is not None}
-    with atomic_path(folder / _FILE) as temporary:
-        save_file(tensors, temporary)
+def save_question(folder: Path, question: Question) -> Path:
+    """Writes queries.safetensors beside the field, in place of an earlier one; returns its path."""
+    rule = {"form": question.form, "threshold": question.threshold, "min_reliability": question.min_reliability}
+    facts = {"texts": question.texts, "negatives": question.negatives, "refined": question.refined, **rule}
+    tensors = {"vectors": question.vectors, "negative_vectors": question.negative_vectors}
+    with atomic_path(folder / QUERIES_FILE) as temporary:
+        save_file(
+            {name: value.contiguous().cpu() for name, value in tensors.items() if value is not None},
+            temporary,
+            metadata={_KEY: json.dumps(facts)},
+        )
+    return folder / QUERIES_FILE
 
 
-def load_queries(folder: Path, texts: Sequence[str]) -> QueryVectors | None:
-    """The vectors of the texts that the config names; None if it names none.
+def load_question(folder: Path) -> Question | None:
+    """The question stored in the folder of a field; None if there is none.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, a damaged one, or vectors of other texts.
+        ValueError: a damaged file.
     """
-    if len(texts) == 0:
-        return None
-    path = folder / _FILE
+    path = folder / QUERIES_FILE
     if not path.exists():
-        raise FileNotFoundError(
-            f"{path} is missing, which holds the vectors of {list(texts)}; lift again with: ns-normlift"
-        )
+        return None
     try:
-        tensors = load_file(path)
-        queries = QueryVectors(tensors["vectors"], tensors.get("negatives"))
-    except (SafetensorError, KeyError) as error:
-        raise ValueError(f"{path} is damaged ({error}); lift again with: ns-normlift --load-config ...") from error
-    if len(queries.vectors) != len(texts):
-        raise ValueError(
-            f"{path} has {len(queries.vectors)} vectors, the config names {len(texts)} queries {list(texts)}; "
-            "lift again with: ns-normlift --load-config ..."
+        with safe_open(path, framework="pt") as file:
+            facts = json.loads((file.metadata() or {})[_KEY])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+        question = Question(
+            texts=tuple(map(str, facts["texts"])),
+            vectors=tensors["vectors"],
+            negatives=tuple(map(str, facts["negatives"])),
+            negative_vectors=tensors.get("negative_vectors"),
+            form=facts["form"],
+            threshold=float(facts["threshold"]),
+            min_reliability=float(facts["min_reliability"]),
+            refined=bool(facts["refined"]),
         )
-    return queries
+        if len(question.vectors) != len(question.texts) or question.form not in get_args(RelevancyForm):
+            raise ValueError(f"{len(question.vectors)} vectors of {len(question.texts)} texts, form {question.form!r}")
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} is damaged ({type(error).__name__}: {error}). Delete it, or store the queries again with: "
+            "ns-normlift-query --load-config ... --text ... --save True"
+        ) from error
+    return question

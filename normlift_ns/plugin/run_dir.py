@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from copy import deepcopy
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -20,7 +21,7 @@ from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.plugin.adapters import SourceRun
 from normlift_ns.plugin.config import FIELD_FOLDER, set_data, skip_seed_points
 from normlift_ns.plugin.model import NormLiftModelConfig
-from normlift_ns.plugin.queries import QueryVectors, save_queries
+from normlift_ns.plugin.queries import Question, save_question
 
 _MODEL_FOLDER = "nerfstudio_models"
 
@@ -41,8 +42,7 @@ def write_run(
     source: SourceRun,
     field: SemanticField,
     *,
-    queries: tuple[str, ...] = (),
-    query_vectors: QueryVectors | None = None,
+    question: Question | None = None,
     output_dir: Path | None = None,
     timestamp: str | None = None,
     overwrite: bool = False,
@@ -54,13 +54,12 @@ def write_run(
     relative, so stock ns-* commands run from where the source run was trained, ours from anywhere.
 
     Args:
-        queries: texts to render as relevancy_0, relevancy_1, ...
-        query_vectors: one vector per text.
+        question: what to draw as relevancy_0, relevancy_1, …
         output_dir, timestamp: as `run_directory`.
         overwrite: replace a directory of that name.
     Raises:
         FileExistsError: the directory exists and `overwrite` is False.
-        ValueError: a field of other Gaussians, or queries without their vectors.
+        ValueError: a field of other Gaussians.
         OSError: it cannot be written, for instance because the disk is full; nothing is left then.
     """
     run_dir = run_directory(source, output_dir=output_dir, timestamp=timestamp)
@@ -71,12 +70,10 @@ def write_run(
             f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.scene)} of "
             f"{source.checkpoint.path}; lift that checkpoint again."
         )
-    if len(queries) != (0 if query_vectors is None else len(query_vectors.vectors)):
-        raise ValueError(f"query_vectors must hold one vector for each of the {len(queries)} queries {list(queries)}")
-    config = _lifted_config(source, run_dir, queries)
+    config = _lifted_config(source, run_dir)
     with _complete_directory(run_dir) as folder:
         try:
-            _write_tensors(folder, source, field, query_vectors)
+            _write_tensors(folder, source, field, question)
         except (RuntimeError, SafetensorError) as error:  # what torch and safetensors make of a full disk
             raise OSError(f"{run_dir} cannot be written: {error}") from error
         transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
@@ -101,7 +98,7 @@ def load_field(run: SourceRun) -> SemanticField:
     return SemanticField.load(folder, run.scene.means, checkpoint=run.checkpoint.path)
 
 
-def _lifted_config(source: SourceRun, run_dir: Path, queries: tuple[str, ...]) -> TrainerConfig:
+def _lifted_config(source: SourceRun, run_dir: Path) -> TrainerConfig:
     config, location = deepcopy(source.config), source.location
     config.method_name = "normlift"
     config.output_dir = location.portable(run_dir.parents[2])
@@ -109,18 +106,20 @@ def _lifted_config(source: SourceRun, run_dir: Path, queries: tuple[str, ...]) -
     config.relative_model_dir = Path(_MODEL_FOLDER)
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
     config.pipeline.model = NormLiftModelConfig.upgrade(
-        source.model_config, semantics=location.portable(run_dir / FIELD_FOLDER), queries=queries
+        source.model_config, semantics=location.portable(run_dir / FIELD_FOLDER)
     )
     if location.moved_data or config.output_dir.is_absolute():
         set_data(config, location.data)  # a relative one would not be found
     skip_seed_points(config)
+    datamanager: Any = config.pipeline.datamanager
+    datamanager.cache_images = "gpu"  # that is, on the pipeline's device; "cpu" pins memory, which needs CUDA
     return config
 
 
-def _write_tensors(folder: Path, source: SourceRun, field: SemanticField, query_vectors: QueryVectors | None) -> None:
+def _write_tensors(folder: Path, source: SourceRun, field: SemanticField, question: Question | None) -> None:
     field.save(folder / FIELD_FOLDER)
-    if query_vectors is not None:
-        save_queries(folder / FIELD_FOLDER, query_vectors)
+    if question is not None:
+        save_question(folder / FIELD_FOLDER, question)
     (folder / _MODEL_FOLDER).mkdir()
     pipeline = {f"_model.{name}": tensor for name, tensor in source.checkpoint.model.items()}
     torch.save({"step": source.step, "pipeline": pipeline}, folder / _MODEL_FOLDER / f"step-{source.step:09d}.ckpt")

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from normlift_ns.encoders.build import SourceOptions, make_source
-from normlift_ns.plugin.asking import default_negatives, encoder_settings
+from normlift_ns.plugin.asking import encoder_settings, pose
 from normlift_ns.plugin.lifting import Export, LiftOptions, LiftResult, Report, lift_run
 from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
 
@@ -52,10 +52,9 @@ class NormLift:
         start = time.perf_counter()
         device = choose_device(self.device)
         source = make_source(self.source, device)
-        texts = None if len(self.queries) == 0 else source.text(self.queries)
+        texts = source.text(self.queries) if len(self.queries) > 0 else None
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s; mistakes show before)
-        from normlift_ns.plugin.queries import QueryVectors  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import run_directory, write_run  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data, load_step=self.load_step)
@@ -81,15 +80,11 @@ class NormLift:
                 "the model that made the features with --encoder-model and --encoder-pretrained, or give "
                 "--text-vectors"
             )
-        vectors = None
-        if texts is not None:
-            negatives = default_negatives(result.field)
-            vectors = QueryVectors(texts, source.text(negatives) if len(negatives) > 0 else None)
+        question = None if texts is None else pose(result.field, source, self.queries)
         written = write_run(
             run,
             result.field,
-            queries=self.queries,
-            query_vectors=vectors,
+            question=question,
             output_dir=self.output_dir,
             timestamp=target.name,
             overwrite=self.overwrite,
@@ -101,7 +96,12 @@ class NormLift:
 @contextmanager
 def progress_bars() -> Iterator[Report]:
     """One bar per stage, with the time left."""
-    names = {"features": "2D features", "neighbors": "neighbours", "store": "choosing the form"}
+    names = {
+        "features": "2D features",
+        "lift": "lift, reliability",
+        "neighbors": "neighbours",
+        "store": "choosing the form",
+    }
     columns = (TextColumn("{task.description:>17}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=CONSOLE) as progress:
         tasks: dict[str, TaskID] = {}

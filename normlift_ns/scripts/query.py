@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from normlift_ns.core.files import atomic_path
-from normlift_ns.core.query import RelevancyForm
-from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
+from normlift_ns.scripts.shared import CONSOLE, AskOptions, choose_device, run_command
 
 
 @dataclass
@@ -23,16 +22,9 @@ class NormLiftQuery:
     """Path to config YAML file of the lifted run."""
     text: tuple[str, ...]
     """What to look for, one or several texts."""
-    negatives: tuple[str, ...] | None = None
-    """What to compare with; by default LERF's words for open_clip, none for colour."""
-    relevancy: RelevancyForm | Literal["auto"] = "auto"
-    """cosine; lerf: against each negative; margin: above the best negative. auto: lerf with negatives, else cosine."""
-    threshold: float | None = None
-    """Relevancy above which a Gaussian is selected; by default 0.5 (cosine), 0.5 (lerf) or 0.02 (margin)."""
-    min_reliability: float = 0.0
-    """Least reliability of a selected Gaussian, in 0..1."""
-    refined: bool = True
-    """Ask the refined directions."""
+    rule: AskOptions = field(default_factory=AskOptions)
+    save: bool = False
+    """Store the question in the run, in place of an earlier one: ns-render and ns-viewer then draw its answer."""
     json: Path | None = None
     """Write the table to this file."""
     output_path: Path | None = None
@@ -41,11 +33,6 @@ class NormLiftQuery:
     """Write pictures of the relevancy into this folder."""
     render_views: tuple[str, ...] = ()
     """Training images from whose cameras to render, such as 0001 0042; by default three of them, evenly spread."""
-    text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
-    text_template: str | None = None
-    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}"; ensemble: the mean of
-    seven. By default as the run was lifted."""
     data: Path | None = None
     """Where the dataset is now, if it was moved."""
     device: str = "auto"
@@ -57,37 +44,35 @@ class NormLiftQuery:
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
         from normlift_ns.plugin.asking import ask, encoder_of, summarize, with_texts  # noqa: PLC0415
+        from normlift_ns.plugin.config import FIELD_FOLDER  # noqa: PLC0415
         from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
+        from normlift_ns.plugin.queries import save_question  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
 
         run = load_run(self.load_config, data=self.data)
         cameras = training_cameras(run, self.render_views)
-        field = with_texts(load_field(run), vectors=self.text_vectors, template=self.text_template)
-        texts = run.location.run_dir.parent / ".cache" / "texts"
-        answer = ask(
-            field,
-            encoder_of(field, device, texts),
-            self.text,
-            negatives=self.negatives,
-            form=self.relevancy,
-            threshold=self.threshold,
-            min_reliability=self.min_reliability,
-            refined=self.refined,
-        )
-        rows = summarize(answer, field, run.scene)
-        CONSOLE.print(_table(rows, f"{answer.form} > {answer.threshold:g}"))
+        semantics = with_texts(load_field(run), vectors=self.rule.text_vectors, template=self.rule.text_template)
+        texts = encoder_of(semantics, device, run.location.run_dir.parent / ".cache" / "texts")
+        answer = ask(semantics, texts, self.text, **self.rule.keywords())
+        rows, rule = summarize(answer, semantics, run.scene), answer.question
+        CONSOLE.print(_table(rows, f"{rule.form} > {rule.threshold:g}"))
         if self.json is not None:
-            facts = {"relevancy": answer.form, "threshold": answer.threshold, "negatives": list(answer.negatives)}
+            facts = {"relevancy": rule.form, "threshold": rule.threshold, "negatives": list(rule.negatives)}
             with atomic_path(self.json) as temporary:
                 temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
         if self.output_path is not None:
-            tensors = {"relevancy": answer.relevancy, "reliability": field.scalars.reliability, "valid": answer.valid}
+            tensors = {
+                "relevancy": answer.relevancy,
+                "reliability": semantics.scalars.reliability,
+                "valid": answer.valid,
+            }
             arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
             with atomic_path(self.output_path) as temporary, temporary.open("wb") as file:
                 np.savez(file, names=np.array(self.text), **arrays)
         if self.render_dir is not None:
             save_overlays(run, answer, cameras, self.render_dir)
-        written = [path for path in (self.json, self.output_path, self.render_dir) if path is not None]
+        stored = save_question(run.location.run_dir / FIELD_FOLDER, rule) if self.save else None
+        written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
         if len(written) > 0:
             CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)
         return rows

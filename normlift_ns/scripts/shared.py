@@ -3,13 +3,43 @@
 from __future__ import annotations
 
 import sys
-from typing import Protocol
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
 
 import torch
 import tyro
 from rich.console import Console
 
+from normlift_ns.core.query import RelevancyForm
+
 CONSOLE = Console(width=120)
+
+
+@dataclass(frozen=True)
+class AskOptions:
+    """How texts are judged."""
+
+    negatives: tuple[str, ...] | None = None
+    """What to compare with; by default LERF's words for open_clip, none for colour."""
+    relevancy: RelevancyForm | Literal["auto"] = "auto"
+    """cosine; lerf: against each negative; margin: above the best negative. auto: lerf with negatives, else cosine."""
+    threshold: float | None = None
+    """Relevancy above which a Gaussian is selected; by default 0.5 (cosine), 0.5 (lerf) or 0.02 (margin)."""
+    min_reliability: float = 0.0
+    """Least reliability of a selected Gaussian, in 0..1."""
+    refined: bool = True
+    """Ask the refined directions."""
+    text_vectors: Path | None = None
+    """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
+    text_template: str | None = None
+    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}"; ensemble: the mean of
+    seven. By default as the run was lifted."""
+
+    def keywords(self) -> dict[str, Any]:
+        """As `plugin.asking.pose` takes them."""
+        rule = {"threshold": self.threshold, "min_reliability": self.min_reliability, "refined": self.refined}
+        return {"negatives": self.negatives, "form": self.relevancy, **rule}
 
 
 class Command(Protocol):

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from normlift_ns import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
+from normlift_ns.core.query import strongest
 from tests.scenes import generator
 
 POSITIVE = torch.rand(50, 3, generator=generator(0), dtype=torch.float64) * 2 - 1
@@ -43,3 +44,11 @@ def test_unknown_form():
 def test_published_word_lists():
     assert BACKGROUND_WORDS[4:] == CANONICAL_NEGATIVES
     assert len(BACKGROUND_WORDS) == 8
+
+
+def test_strongest_is_the_selected_prompt_of_largest_relevancy():
+    selected = torch.rand(50, 3, generator=generator(2)) < 0.6
+    for row, chosen, found in zip(POSITIVE, selected, strongest(POSITIVE, selected).tolist()):
+        among = [q for q in range(3) if chosen[q]]
+        assert found == (max(among, key=lambda q: float(row[q])) if among else -1)
+    assert strongest(POSITIVE[:, :0], selected[:, :0]).tolist() == [-1] * 50

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
@@ -11,7 +11,10 @@ from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins import registry
 
+from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
+from normlift_ns.method_configs.scannet import scannet_method
+from normlift_ns.plugin.config import SUPPORTED_METHODS
 from normlift_ns.plugin.model import NormLiftModelConfig
 
 if sys.version_info >= (3, 11):
@@ -29,8 +32,12 @@ def test_nerfstudio_discovers_the_method_by_its_entry_point(monkeypatch: pytest.
     monkeypatch.setattr(registry, "entry_points", lambda group: points.select(group=group))
     monkeypatch.delenv("NERFSTUDIO_METHOD_CONFIGS", raising=False)
     methods, descriptions = registry.discover_methods()
-    assert methods == {"normlift": normlift_method.config}
-    assert descriptions == {"normlift": normlift_method.description}
+    ours = (normlift_method, lerf_ovs_method, scannet_method)
+    assert methods == {method.config.method_name: method.config for method in ours}
+    assert descriptions == {method.config.method_name: method.description for method in ours}
+    assert list(methods) == [*declared]
+    assert set(methods) <= set(SUPPORTED_METHODS)
+    assert all(method.config.viewer.websocket_host == "127.0.0.1" for method in ours)
 
 
 def test_every_package_is_shipped() -> None:
@@ -45,7 +52,9 @@ def test_it_trains_as_splatfacto_does() -> None:
     ours, theirs = normlift_method.config, method_configs["splatfacto"]
     assert isinstance(theirs, TrainerConfig)
     different = {f.name for f in fields(TrainerConfig) if getattr(ours, f.name) != getattr(theirs, f.name)}
-    assert different == {"method_name", "pipeline"}
+    assert different == {"method_name", "pipeline", "viewer"}
+    assert replace(ours.viewer, websocket_host=theirs.viewer.websocket_host) == theirs.viewer
+    assert ours.viewer.websocket_host == "127.0.0.1"
     assert ours.pipeline.datamanager == theirs.pipeline.datamanager
     assert ours.pipeline.model == NormLiftModelConfig.upgrade(theirs.pipeline.model)  # type: ignore[arg-type]
 

@@ -12,15 +12,19 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns.plugin.adapters import load_run
+from normlift_ns.plugin.asking import respond
 from normlift_ns.plugin.config import rerooted
+from normlift_ns.plugin.display import make_display
 from normlift_ns.plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.plugin.queries import QueryVectors, load_queries, save_queries
+from normlift_ns.plugin.queries import Question
 from normlift_ns.plugin.run_dir import write_run
 from normlift_ns.raster.rasterize import render
 from tests.plugin.conftest import lifted_field
 from tests.plugin.stock_run import SmallLpips, StockRun, rasterization, splatfacto_on_cpu, train_splatfacto
 
-QUERIES = QueryVectors(torch.eye(8)[:2])
+QUESTION = Question(("left", "right"), torch.eye(8)[:2])
+STOCK = ["rgb", "depth", "accumulation", "background"]
+SEMANTIC = ["reliability", "n_eff", "selection", "segmentation", "overlay"]
 
 
 def _setup(config: Path):
@@ -33,10 +37,7 @@ def lifted(stock: StockRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """config.yml of a lifted run with two queries."""
     run = load_run(stock.config)
     out = tmp_path_factory.mktemp("lifted")
-    return (
-        write_run(run, lifted_field(run), queries=("left", "right"), query_vectors=QUERIES, output_dir=out)
-        / "config.yml"
-    )
+    return write_run(run, lifted_field(run), question=QUESTION, output_dir=out) / "config.yml"
 
 
 @pytest.fixture
@@ -90,12 +91,18 @@ def test_scalars_are_composited(pipeline, stock: StockRun) -> None:
     run = load_run(stock.config)
     field = lifted_field(run)
     outputs = _outputs(pipeline, 3)
-    assert list(outputs) == ["rgb", "depth", "accumulation", "background", "reliability", "relevancy_0", "relevancy_1"]
-    values = torch.cat([field.scalars.reliability[:, None], field.relevancy(QUERIES.vectors)], dim=1)
-    expected, _ = render(run.scene, run.train.cameras[3], values)
-    for i, name in enumerate(("reliability", "relevancy_0", "relevancy_1")):
+    assert list(outputs) == [*STOCK, "relevancy_0", "relevancy_1", *SEMANTIC]
+    answer = respond(field, QUESTION)
+    chosen = answer.selected.any(dim=1).float()
+    columns = {"relevancy_0": answer.relevancy[:, 0], "relevancy_1": answer.relevancy[:, 1], "selection": chosen}
+    columns |= {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
+    expected, _ = render(run.scene, run.train.cameras[3], torch.stack(list(columns.values()), dim=1))
+    for i, name in enumerate(columns):
         assert outputs[name].shape == (35, 47, 1)
         torch.testing.assert_close(outputs[name][..., 0], expected[..., i], atol=1e-6, rtol=1e-5)
+    for name in ("overlay", "segmentation"):
+        assert outputs[name].shape == (35, 47, 3)
+        assert 0 <= float(outputs[name].min()) <= float(outputs[name].max()) <= 1
     assert 0 < outputs["reliability"].max() <= 1
     left, right = outputs["relevancy_0"][:, :20].mean(), outputs["relevancy_0"][:, 27:].mean()
     assert left > right
@@ -126,47 +133,107 @@ def test_cuda_outputs_are_those_of_the_cpu(lifted: Path, registered: None) -> No
 
 
 def test_relevancy_of_stored_queries_uses_their_negatives(pipeline, stock: StockRun) -> None:
-    field = pipeline.model.field
-    negatives = torch.eye(8)[1:2]
-    pipeline.model.attach(field, QueryVectors(QUERIES.vectors[:1], negatives))
-    values = field.relevancy(QUERIES.vectors[:1], negatives, form="lerf")
+    field, negatives = pipeline.model.field, torch.eye(8)[1:2]
+    pipeline.model.attach(field, Question(("left",), torch.eye(8)[:1], ("right",), negatives, form="lerf"))
+    values = field.relevancy(torch.eye(8)[:1], negatives, form="lerf")
     run = load_run(stock.config)
     expected, _ = render(run.scene, run.train.cameras[0], values)
     torch.testing.assert_close(_outputs(pipeline)["relevancy_0"], expected, atol=1e-6, rtol=1e-5)
 
 
-def test_publishing_replaces_what_is_rendered(pipeline) -> None:
-    model = pipeline.model
-    ones = torch.ones(model.num_points)
-    model.publish({"selection": ones})
+def test_without_a_question_only_the_relevancies_are_missing(pipeline) -> None:
+    pipeline.model.attach(pipeline.model.field)
     outputs = _outputs(pipeline)
-    assert "reliability" not in outputs
-    torch.testing.assert_close(outputs["selection"], outputs["accumulation"], atol=1e-5, rtol=0)
-    model.publish({})
-    assert list(_outputs(pipeline)) == ["rgb", "depth", "accumulation", "background"]
-    with pytest.raises(ValueError, match=r"selection must be \[60\], one per Gaussian, got \(59,\)"):
-        model.publish({"selection": ones[1:]})
+    assert list(outputs) == [*STOCK, *SEMANTIC]
+    assert not outputs["selection"].any()
+    grey = outputs["rgb"].mean(dim=2, keepdim=True).expand_as(outputs["rgb"])
+    for name in ("overlay", "segmentation"):
+        torch.testing.assert_close(outputs[name], grey)
+    pipeline.model.show(None)
+    assert list(_outputs(pipeline)) == STOCK
 
 
-def test_a_crop_box_crops_the_scalars_too(pipeline) -> None:
+def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the model take the way of CUDA: stock splatfacto, and gsplat for the scalars."""
+    monkeypatch.setattr("normlift_ns.plugin.model.rasterization", rasterization)
+    monkeypatch.setattr(type(pipeline.model), "on_cpu", False)
+
+
+@pytest.mark.parametrize("part", ["without the selection", "the selection alone"])
+@pytest.mark.parametrize("on_cpu", [True, False])
+def test_hidden_gaussians_are_not_drawn_at_all(pipeline, stock: StockRun, monkeypatch, part, on_cpu) -> None:
     model = pipeline.model
-    everything = _outputs(pipeline)
-    middle = float(model.means[:, 2].median())
+    answer = respond(model.field, QUESTION)
+    drawn = answer.selected[:, 0] == (part == "the selection alone")
+    assert 5 < int(drawn.sum()) < 55
+    _, alpha = render(
+        _rows(load_run(stock.config).scene, drawn),
+        load_run(stock.config).train.cameras[0],
+        torch.ones(int(drawn.sum()), 1),
+    )
+    if not on_cpu:
+        _by_cuda(pipeline, monkeypatch)
+    model.show(make_display(model.field, answer, shown=0, part=part))
+    with splatfacto_on_cpu():
+        outputs = _outputs(pipeline)
+    torch.testing.assert_close(outputs["accumulation"][..., 0], alpha, atol=1e-5, rtol=1e-4)
+    whole = outputs["accumulation"] if part == "the selection alone" else torch.zeros_like(outputs["accumulation"])
+    torch.testing.assert_close(outputs["selection"], whole, atol=1e-5, rtol=1e-4)
+    everything = make_display(model.field, answer, shown=0)
+    model.show(everything)
+    assert model.crop_box is None
+    with splatfacto_on_cpu():
+        assert float(_outputs(pipeline)["accumulation"].sum()) > float(alpha.sum())
+
+
+def _rows(scene, rows):
+    return type(scene)(scene.means[rows], scene.quats[rows], scene.scales[rows], scene.opacities[rows])
+
+
+@pytest.mark.parametrize("on_cpu", [True, False])
+def test_a_crop_box_crops_the_scalars_too(pipeline, monkeypatch, on_cpu) -> None:
+    model = pipeline.model
+    if not on_cpu:
+        _by_cuda(pipeline, monkeypatch)
+    middle = float(model.means[:, 2].detach().median())
     above = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, middle + 5]), torch.tensor([10.0, 10.0, 10.0]))
     inside = above.within(model.means).reshape(-1)
     assert 0 < int(inside.sum()) < 60
-    model.publish({"inside": inside.float()})
-    cropped = _outputs(pipeline, obb_box=above)
-    torch.testing.assert_close(cropped["inside"], cropped["accumulation"], atol=1e-5, rtol=0)
+    everyone = respond(model.field, Question(("all",), torch.eye(8)[:1], threshold=-2.0))
+    model.show(make_display(model.field, everyone))
+    valid = everyone.valid.float()
+    with splatfacto_on_cpu():
+        everything = _outputs(pipeline)
+        cropped = _outputs(pipeline, obb_box=above)
+        nowhere = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 50.0]), torch.tensor([1.0, 1.0, 1.0]))
+        empty = _outputs(pipeline, obb_box=nowhere)
+        again = _outputs(pipeline)
+    if bool(valid.all()):
+        torch.testing.assert_close(cropped["selection"], cropped["accumulation"], atol=1e-5, rtol=0)
+    assert float(cropped["selection"].sum()) < float(everything["selection"].sum())
     assert cropped["accumulation"].sum() < everything["accumulation"].sum()
-
-    nowhere = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 50.0]), torch.tensor([1.0, 1.0, 1.0]))
-    empty = _outputs(pipeline, obb_box=nowhere)
     assert empty.keys() == cropped.keys()
-    assert float(empty["accumulation"].abs().max()) == float(empty["inside"].abs().max()) == 0
+    assert {name: value.shape for name, value in empty.items()} == {n: v.shape for n, v in cropped.items()}
+    assert float(empty["accumulation"].abs().max()) == float(empty["selection"].abs().max()) == 0
     assert torch.equal(empty["rgb"], empty["background"])
     assert all(bool(value.isfinite().all()) for value in empty.values())
-    assert _outputs(pipeline)["accumulation"].sum() == everything["accumulation"].sum()  # the box is not left over
+    assert again["accumulation"].sum() == everything["accumulation"].sum()  # the box is not left over
+
+
+def test_what_is_hidden_cannot_be_clicked(pipeline, stock: StockRun) -> None:
+    model, camera = pipeline.model, load_run(stock.config).train.cameras[0]
+    pose = camera.world_to_camera.inverse()
+    weights = model.in_sight(pose[:3, 3], pose[:3, 2])
+    front = int(weights.argmax())
+    assert float(weights[front]) > 0.01
+    answer = respond(model.field, QUESTION)
+    answer.selected[:] = (torch.arange(60) == front)[:, None]
+    model.show(make_display(model.field, answer, part="without the selection"))
+    behind = model.in_sight(pose[:3, 3], pose[:3, 2])
+    assert float(behind[front]) == 0
+    others = torch.arange(60) != front
+    assert (behind[others] >= weights[others]).all()
+    assert behind.sum() > 0
 
 
 def _pretend_lpips(monkeypatch: pytest.MonkeyPatch, replacement) -> None:
@@ -234,28 +301,10 @@ def test_every_field_of_a_splatfacto_config_is_taken_over() -> None:
     for f in fields(config):
         if f.name not in ("_target", "camera_optimizer"):
             setattr(config, f.name, f"value of {f.name}")
-    upgraded = NormLiftModelConfig.upgrade(config, semantics=Path("x"), queries=("a",))
+    upgraded = NormLiftModelConfig.upgrade(config, semantics=Path("x"))
     assert upgraded._target is NormLiftModel
     for f in fields(SplatfactoModelConfig):
         assert f.name == "_target" or getattr(upgraded, f.name) == getattr(config, f.name)
-    assert (upgraded.semantics, upgraded.queries) == (Path("x"), ("a",))
+    assert upgraded.semantics == Path("x")
     assert NormLiftModelConfig.upgrade(upgraded).semantics is None
     assert yaml.load(yaml.dump(upgraded), Loader=yaml.Loader) == upgraded
-
-
-def test_query_vectors_must_belong_to_the_queries(tmp_path: Path) -> None:
-    assert load_queries(tmp_path, ()) is None
-    with pytest.raises(
-        FileNotFoundError, match=r"queries\.safetensors is missing, which holds the vectors of \['mug'\]"
-    ):
-        load_queries(tmp_path, ("mug",))
-    save_queries(tmp_path, QueryVectors(torch.eye(3), torch.ones(1, 3)))
-    loaded = load_queries(tmp_path, ("a", "b", "c"))
-    assert loaded is not None
-    assert loaded.negatives is not None
-    assert torch.equal(loaded.vectors, torch.eye(3))
-    with pytest.raises(ValueError, match=r"has 3 vectors, the config names 1 queries \['mug'\]"):
-        load_queries(tmp_path, ("mug",))
-    (tmp_path / "queries.safetensors").write_bytes(b"x")
-    with pytest.raises(ValueError, match=r"queries\.safetensors is damaged"):
-        load_queries(tmp_path, ("mug",))

@@ -14,7 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.config import read_config
 from normlift_ns.plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.plugin.queries import QueryVectors
+from normlift_ns.plugin.queries import Question, load_question
 from normlift_ns.plugin.run_dir import load_field, run_directory, write_run
 from tests.plugin.conftest import lifted_field
 from tests.plugin.stock_run import StockRun, working_directory
@@ -42,12 +42,14 @@ def test_a_lifted_run_has_the_files_that_nerfstudio_expects(copied: Path, tmp_pa
 
 def test_the_config_is_the_sources_with_another_method_and_model(copied: Path) -> None:
     source = load_run(copied)
-    run_dir = write_run(source, lifted_field(source), queries=("a",), query_vectors=QueryVectors(torch.eye(8)[:1]))
+    run_dir = write_run(source, lifted_field(source), question=Question(("a",), torch.eye(8)[:1]))
     config: Any = read_config(run_dir / "config.yml")
     stored: Any = source.config
     assert config.method_name == "normlift"
     assert type(config.pipeline.model) is NormLiftModelConfig
-    assert config.pipeline.model.queries == ("a",)
+    question = load_question(run_dir / "normlift")
+    assert question is not None
+    assert question.texts == ("a",)
     assert config.pipeline.model.semantics == Path("outputs/scene/normlift") / run_dir.name / "normlift"
     assert config.timestamp == run_dir.name
     for name in ("output_dir", "data", "experiment_name", "optimizers", "relative_model_dir", "viewer", "machine"):
@@ -193,10 +195,3 @@ def test_a_run_without_semantics_is_named(stock: StockRun) -> None:
         FileNotFoundError, match=r"is a splatfacto run without semantics \(no normlift/ in it\)\. Lift it"
     ):
         load_field(load_run(stock.config))
-
-
-def test_queries_need_their_vectors(stock: StockRun, tmp_path: Path) -> None:
-    source = load_run(stock.config)
-    with pytest.raises(ValueError, match=r"one vector for each of the 2 queries \['a', 'b'\]"):
-        write_run(source, lifted_field(source), queries=("a", "b"), output_dir=tmp_path)
-    assert os.listdir(tmp_path) == []

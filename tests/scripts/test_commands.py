@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo import DemoRoom
 from normlift_ns.encoders import RegionFeatures, write_langsplat
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
@@ -21,44 +20,12 @@ from normlift_ns.encoders.sam import MaskRules, SamMasks
 from normlift_ns.plugin import lifting
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import ask, encoder_of
+from normlift_ns.plugin.queries import load_question
 from normlift_ns.plugin.run_dir import load_field
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.encoders.tiny import CLIP, write_clip, write_sam
-
-SMALL = ("--encoder", "colour", "--k", "12")
-
-
-def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
-    """Exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
-    try:
-        entrypoint()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
-@pytest.fixture(scope="module")
-def room() -> DemoRoom:
-    return demo_room(6000)
-
-
-@pytest.fixture(scope="module")
-def trained(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of a run of stock splatfacto in the room."""
-    folder = tmp_path_factory.mktemp("room")
-    write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
-    return write_splatfacto_run(room, folder / "room", folder / "outputs")
-
-
-@pytest.fixture(scope="module")
-def lifted(trained: Path) -> Path:
-    """config.yml of the lifted run."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        flags = ("--load-config", trained, *SMALL, "--timestamp", "one", "--queries", "red", "yellow")
-        assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    return trained.parents[2] / "normlift" / "one" / "config.yml"
+from tests.scripts.conftest import SMALL, run_entry
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
@@ -73,7 +40,9 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
     assert after > 0.7
     assert field.manifest["encoder"]["encoder"] == "colour"
     assert field.manifest["statistics"]["views"] == 12
-    assert run.model_config.queries == ("red", "yellow")  # pyright: ignore[reportAttributeAccessIssue]
+    question = load_question(lifted.parent / "normlift")
+    assert question is not None
+    assert question.texts == ("red", "yellow")
     assert sorted(p.name for p in lifted.parent.iterdir()) == [
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
     ]  # fmt: skip

@@ -1,115 +1,107 @@
-"""nerfstudio's own commands on a lifted run, as a user starts them, on the CPU."""
+"""Stock ns-render and ns-eval on a lifted run: the queries stored in the run are rendered, without a text encoder."""
 
 from __future__ import annotations
 
+import gzip
 import json
-import os
-import re
-import signal
-import socket
-import subprocess
-import sys
-import time
-import urllib.error
-import urllib.request
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInterpolated
 from PIL import Image
 
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
-from normlift_ns.scripts.lift import NormLift, SourceOptions
+from normlift_ns import render
+from normlift_ns.method_configs.normlift import normlift_method
+from normlift_ns.plugin.adapters import load_run
+from normlift_ns.plugin.asking import ask, encoder_of
+from normlift_ns.plugin.queries import load_question
+from normlift_ns.plugin.run_dir import load_field
+from normlift_ns.scripts import query
+from tests.scripts.conftest import run_entry
 
-pytestmark = pytest.mark.slow
-
-BIN = Path(sys.executable).parent
-ENVIRONMENT = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
-SECONDS = 300
-"""Until a command must have done its work; importing nerfstudio takes 20 of them."""
-
-
-@pytest.fixture(scope="module")
-def lifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of a lifted run."""
-    folder = tmp_path_factory.mktemp("stock")
-    room = demo_room(4000)
-    write_capture(room, folder / "room", views=4, held_out=2, width=80, height=60)
-    trained = write_splatfacto_run(room, folder / "room", folder / "outputs")
-    source = SourceOptions(encoder="colour", region_count=64)
-    return NormLift(trained, timestamp="t", queries=("red",), source=source).main() / "config.yml"
+NAMES = ["overlay", "segmentation", "selection", "reliability", "n_eff", "relevancy_0", "relevancy_1"]
 
 
-def run(command: str, *flags: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    words = [str(BIN / command), *map(str, flags)]
-    return subprocess.run(words, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=SECONDS, check=False)
+@pytest.fixture(autouse=True)
+def without_encoders(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*args: object) -> None:
+        raise AssertionError("an encoder was made")
+
+    monkeypatch.setitem(all_methods, "normlift", normlift_method.config)
+    monkeypatch.setattr("normlift_ns.plugin.panel.encoder_of", never)
 
 
-def test_ns_render_draws_reliability_and_relevancy(lifted, tmp_path):
-    names = ("rgb", "reliability", "relevancy_0")
-    flags = ("dataset", "--load-config", lifted, "--output-path", "out", "--image-format", "png", "--split", "test")
-    done = run("ns-render", *flags, "--rendered-output-names", *names, cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    for name in names:
-        pictures = sorted((tmp_path / "out" / "test" / name).iterdir())
+def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
+    names = [*NAMES, "raw-relevancy_1", "raw-selection", "depth"]
+    DatasetRender(lifted, output_path=tmp_path, rendered_output_names=names, split="test", image_format="png").main()
+    run = load_run(lifted)
+    field = load_field(run)
+    answer = ask(field, encoder_of(field), ["red", "yellow"])  # as stored
+    values = torch.stack([answer.relevancy[:, 1], answer.selected.any(dim=1).float()], dim=1)
+    for name, camera in zip(run.held_out.names, run.held_out.cameras):
+        expected, _ = render(run.scene, camera, values)
+        for i, output in enumerate(("raw-relevancy_1", "raw-selection")):
+            with gzip.open(tmp_path / "test" / output / f"{Path(name).stem}.npy.gz") as file:
+                assert np.allclose(np.load(file)[..., 0], expected[..., i].numpy(), atol=1e-5)
+        overlay = np.asarray(Image.open(tmp_path / "test" / "overlay" / f"{Path(name).stem}.png")).astype(int)
+        found = expected[..., 1].numpy() > 0.9
+        assert found.sum() > 50
+        assert (np.ptp(overlay[found], axis=1) > 30).mean() > 0.95
+        assert (np.ptp(overlay[expected[..., 1].numpy() < 0.01], axis=1) < 8).mean() > 0.99
+    assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
+
+
+def test_ns_render_draws_every_output(lifted: Path, tmp_path: Path) -> None:
+    DatasetRender(lifted, output_path=tmp_path, split="test", image_format="png").main()
+    stock = {"gt-rgb", "rgb", "depth", "accumulation", "background"}
+    assert {path.name for path in (tmp_path / "test").iterdir()} == stock | set(NAMES)
+
+
+def test_ns_render_camera_path_and_interpolate(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)  # for videos only
+    pose = np.vstack([load_run(lifted).train._poses[0].numpy(), [0, 0, 0, 1]])
+    camera = {"camera_to_world": pose.flatten().tolist(), "fov": 60, "aspect": 1}
+    path = {"camera_type": "perspective", "render_height": 40, "render_width": 60, "camera_path": [camera] * 2}
+    (tmp_path / "path.json").write_text(json.dumps({**path, "seconds": 1, "fps": 2}))
+    options = {"rendered_output_names": ["overlay", "relevancy_0"], "output_format": "images", "image_format": "png"}
+    RenderCameraPath(
+        lifted, camera_path_filename=tmp_path / "path.json", output_path=tmp_path / "a" / "x.mp4", **options
+    ).main()  # type: ignore[arg-type]
+    RenderInterpolated(
+        lifted, pose_source="eval", interpolation_steps=2, output_path=tmp_path / "b" / "x.mp4", **options
+    ).main()  # type: ignore[arg-type]
+    for folder, size in (("a", (120, 40)), ("b", (320, 120))):
+        pictures = sorted((tmp_path / folder / "x").iterdir())
         assert len(pictures) == 2
-        assert all(np.ptp(np.asarray(Image.open(path).convert("RGB"))) > 50 for path in pictures), name
-    rendered = np.asarray(Image.open(tmp_path / "out" / "test" / "rgb" / "0004.png").convert("RGB")).astype(float)
-    photo = np.asarray(Image.open(lifted.parents[4] / "room" / "images" / "0004.png").convert("RGB"))
-    assert np.abs(rendered - photo).mean() < 3
+        assert Image.open(pictures[0]).size == size
 
 
-def test_ns_eval_measures_the_pictures(lifted, tmp_path):
-    done = run("ns-eval", "--load-config", lifted, "--output-path", tmp_path / "eval.json", cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    results = json.loads((tmp_path / "eval.json").read_text())
-    assert results["method_name"] == "normlift"
-    assert results["results"]["psnr"] > 35  # the photographs are pictures of these very Gaussians
-    assert "lpips" in results["results"] or "LPIPS is left out" in done.stderr
+def test_ns_eval(lifted: Path, tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="LPIPS is left out"):
+        ComputePSNR(lifted, output_path=tmp_path / "eval.json", render_output_path=tmp_path / "pictures").main()
+    document = json.loads((tmp_path / "eval.json").read_text())
+    assert document["method_name"] == "normlift"
+    assert document["results"]["psnr"] > 25
+    assert (tmp_path / "pictures").exists()
 
 
-def test_ns_export_writes_the_gaussians(lifted, tmp_path):
-    done = run("ns-export", "gaussian-splat", "--load-config", lifted, "--output-dir", "out", cwd=tmp_path)
-    missing = re.search(r"(lib[\w.+-]+): cannot open shared object file", done.stderr)
-    if missing is not None:
-        pytest.skip(f"open3d, which ns-export imports, needs the system library {missing[1]}")
-    assert done.returncode == 0, done.stdout + done.stderr
-    header = (tmp_path / "out" / "splat.ply").read_bytes()[:2000].split(b"end_header")[0].decode()
-    count = re.search(r"element vertex (\d+)", header)
-    assert count is not None
-    assert 3500 < int(count[1]) <= 4000  # all but the faintest
-
-
-def test_ns_viewer_answers(lifted, tmp_path):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    flags = ("--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    words = [str(BIN / "ns-viewer"), "--load-config", str(lifted), *map(str, flags)]
-    log = tmp_path / "log"
-    with log.open("w") as output:
-        viewer = subprocess.Popen(words, cwd=tmp_path, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
-    try:
-        page = first_page(f"http://127.0.0.1:{port}/", viewer)
-        time.sleep(2)
-        assert viewer.poll() is None, log.read_text()
-        assert b"<html" in page, log.read_text()
-    finally:
-        viewer.send_signal(signal.SIGINT)
-        try:
-            viewer.wait(timeout=20)
-        except subprocess.TimeoutExpired:
-            viewer.kill()
-            viewer.wait()
-
-
-def first_page(address: str, viewer: subprocess.Popen[bytes]) -> bytes:
-    """What a server answers at last; b"" if it stopped or the time is over."""
-    end = time.monotonic() + SECONDS
-    while viewer.poll() is None and time.monotonic() < end:
-        try:
-            with urllib.request.urlopen(address, timeout=5) as answer:
-                return answer.read()
-        except (urllib.error.URLError, OSError):
-            time.sleep(0.5)
-    return b""
+def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
+    shutil.copytree(lifted.parent, copy.parent)
+    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save", "True")
+    rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
+    stored = load_question(copy.parent / "normlift")
+    assert stored is not None
+    assert stored.texts == ("teal", "pink", "orange")
+    assert (stored.threshold, stored.min_reliability, stored.refined) == (0.7, 0.25, False)
+    before = (copy.parent / "normlift" / "queries.safetensors").read_bytes()
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "oragne") == 1
+    assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 0
+    assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before

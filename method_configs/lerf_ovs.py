@@ -1,0 +1,21 @@
+"""`ns-train normlift-lerf-ovs`: scenes of the LERF-OVS benchmark, which are COLMAP folders with images/ and sparse/0.
+
+Its labelled frames are training views as well, so all images train; they have the size that the labels have.
+"""
+
+from pathlib import Path
+
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from normlift_ns.method_configs.normlift import trainer_config
+from normlift_ns.plugin.model import NormLiftModelConfig
+
+lerf_ovs_method = MethodSpecification(
+    config=trainer_config(
+        "normlift-lerf-ovs",
+        ColmapDataParserConfig(load_3D_points=True, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"),
+        NormLiftModelConfig(),
+    ),
+    description="normlift for scenes of the LERF-OVS benchmark: COLMAP folders, all images train.",
+)

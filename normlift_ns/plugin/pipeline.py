@@ -1,0 +1,119 @@
+"""`ns-train normlift`: splatfacto's training, and a lift at its end."""
+
+from __future__ import annotations
+
+import shutil
+import traceback
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+import yaml
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from normlift_ns.core.files import atomic_path
+from normlift_ns.encoders.build import SourceOptions, make_source
+from normlift_ns.plugin.adapters import load_run
+from normlift_ns.plugin.asking import encoder_settings, pose
+from normlift_ns.plugin.checkpoint import numpy_numbers
+from normlift_ns.plugin.config import FIELD_FOLDER
+from normlift_ns.plugin.lifting import LiftOptions, lift_run
+from normlift_ns.plugin.model import NormLiftModel
+from normlift_ns.plugin.queries import save_question
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer
+
+
+@dataclass
+class NormLiftPipelineConfig(VanillaPipelineConfig):
+    """splatfacto's pipeline, and what to lift when the training ends."""
+
+    _target: type = field(default_factory=lambda: NormLiftPipeline)
+    source: SourceOptions = field(default_factory=SourceOptions)
+    """What to see in the images."""
+    lift: LiftOptions = field(default_factory=LiftOptions)
+    """What to lift and how."""
+    queries: tuple[str, ...] = ()
+    """Texts to store in the run; ns-render and ns-viewer show their relevancy."""
+
+
+class NormLiftPipeline(VanillaPipeline):
+    """Trains as splatfacto does; after the last checkpoint is saved, lifts that checkpoint in the same run."""
+
+    config: NormLiftPipelineConfig
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        torch.serialization.add_safe_globals(numpy_numbers())  # nerfstudio loads its own checkpoints without, and fails
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Those of splatfacto, and the lift.
+
+        Raises:
+            ValueError, FileNotFoundError: the encoder or a query cannot be used; better known before the training.
+        """
+        callbacks = super().get_training_callbacks(training_callback_attributes)
+        trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
+        model.detach()  # of a lifted checkpoint that is trained further
+        if trainer is not None and trainer.local_rank == 0:
+            source = make_source(self.config.source)
+            if len(self.config.queries) > 0:
+                source.text(self.config.queries)
+            after = [TrainingCallbackLocation.AFTER_TRAIN]
+            callbacks.append(TrainingCallback(after, _lift_at_the_end, args=[trainer]))
+        return callbacks
+
+
+def _lift_at_the_end(trainer: Trainer, step: int) -> None:
+    """Nothing that goes wrong here reaches the training, which is complete and saved."""
+    config = trainer.base_dir / "config.yml"
+    try:
+        lift_trained(trainer)
+    except Exception:  # whatever it is
+        if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
+            shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
+        traceback.print_exc()
+        CONSOLE.rule("Error", style="red")
+        CONSOLE.print(
+            f"The training is complete and saved, but lifting it at step {step} failed, see above. "
+            f"Lift it again with: ns-normlift --load-config {config}",
+            soft_wrap=True,
+        )
+
+
+def lift_trained(trainer: Trainer) -> Path:
+    """Lifts the last checkpoint of a trainer, writes the field and its config into the run, and shows it in the viewer.
+
+    Returns:
+        Folder of the field.
+    """
+    pipeline: Any = trainer.pipeline
+    options, path = pipeline.config, trainer.base_dir / "config.yml"
+    CONSOLE.print("Lifting the trained scene")
+    run = load_run(path)
+    source = make_source(options.source, str(pipeline.device))
+    encoder = encoder_settings(options.source)
+    device = "cuda" if pipeline.device.type == "cuda" else "cpu"
+    result = lift_run(run, source, options.lift, trainer.base_dir.parent / ".cache", device=device, encoder=encoder)
+    folder = trainer.base_dir / FIELD_FOLDER
+    result.field.save(folder, overwrite=True)
+    question = None
+    if len(options.queries) > 0:
+        question = pose(result.field, source, options.queries)
+        save_question(folder, question)
+    trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.dump(trainer.config), "utf8")
+    with trainer.train_lock:
+        pipeline.model.attach(result.field, question)
+    viewer: Any = trainer.viewer_state
+    if hasattr(viewer, "_trigger_rerender"):
+        viewer._trigger_rerender()
+    CONSOLE.print(f"Lifted: {folder}. Ask it with: ns-normlift-query --load-config {path} --text ...", soft_wrap=True)
+    return folder

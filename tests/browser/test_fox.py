@@ -1,0 +1,75 @@
+"""A person before the fox capture: a real scene, without any stored query."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from tests.browser.viewer import CHROMIUM, Tab, chromium, coloured, hue_mask, middle, ns_viewer
+from tests.captures import needs_shared
+
+pytestmark = [
+    pytest.mark.slow,
+    needs_shared,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"),
+]
+
+
+def test_a_person_finds_the_fox(fox_run: Path, tmp_path: Path, pictures: Path) -> None:
+    log = tmp_path / "viewer.log"
+    with ns_viewer(fox_run, log, cwd=tmp_path) as address, chromium() as browser:
+        tab = Tab(browser, address)
+        tab.press("Hide Train Cams")
+        tab.drag(-400, 150, button="right")  # brings the fox into the middle
+        tab.settle()
+        photo = tab.picture()
+        tab.page.screenshot(path=pictures / "fox.png")
+        assert "Nothing is asked." in tab.status()
+
+        tab.choose("Output type", "overlay")
+        assert coloured(tab.picture()).mean() < 0.001
+        tab.type("Prompts", "orange; crimson")
+        tab.press("Query")
+        tab.says("crimson")
+        tab.type("Threshold", "0.35")
+        tab.choose("Prompt shown", "0: orange")
+        tab.settle()
+        tab.page.screenshot(path=pictures / "fox_orange.png")
+        orange = coloured(tab.picture())
+        print("orange covers", orange.mean(), "of the picture, its mean colour is", photo[orange].mean(axis=0))
+        assert 0.005 < orange.mean() < 0.3
+        red, green, blue = photo[orange].mean(axis=0)
+        assert red > green > blue
+        assert red - blue > 50
+        rest = photo[~orange].mean(axis=0)
+        assert rest[0] - rest[2] < 0.5 * (red - blue)
+
+        tab.choose("Prompt shown", "1: crimson")
+        tab.settle()
+        crimson = coloured(tab.picture())
+        assert (orange & crimson).sum() < 0.2 * min(orange.sum(), crimson.sum()) + 50
+        assert hue_mask(photo, 0.97, 0.3)[crimson].mean() > 3 * hue_mask(photo, 0.97, 0.3).mean()
+
+        tab.press("Click: more like this")
+        tab.says("Click on something in the scene")
+        tab.click(*middle(orange))
+        tab.says("Clicked Gaussian")
+        tab.settle()
+        tab.page.screenshot(path=pictures / "fox_click.png")
+        x, y = map(int, middle(orange))
+        assert coloured(tab.picture())[y - 2 : y + 3, x - 2 : x + 3].mean() > 0.5
+
+        tab.choose("Draw", "the selection alone")
+        tab.choose("Output type", "rgb")
+        tab.settle()
+        tab.page.screenshot(path=pictures / "fox_alone.png")
+        assert (np.abs(tab.picture().astype(int) - (38, 42, 55)).max(axis=2) < 12).mean() > 0.4
+        tab.press("Export selection")
+        tab.says("Gaussians written to")
+        (ply,) = (fox_run.parent / "exports").glob("*.ply")
+        assert 0 < PlyData.read(ply)["vertex"].count <= tab.selected()
+        assert tab.problems == []
+    assert "Traceback" not in log.read_text()

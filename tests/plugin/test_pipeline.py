@@ -1,0 +1,162 @@
+"""`ns-train normlift` by nerfstudio's own Trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.eval_utils import eval_setup
+
+from normlift_ns.core.refine import RefineConfig
+from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.method_configs.normlift import normlift_method
+from normlift_ns.method_configs.scannet import scannet_method
+from normlift_ns.plugin import pipeline as module
+from normlift_ns.plugin.adapters import load_run
+from normlift_ns.plugin.asking import ask, encoder_of
+from normlift_ns.plugin.config import rerooted
+from normlift_ns.plugin.lifting import LiftOptions
+from normlift_ns.plugin.queries import load_question
+from normlift_ns.plugin.run_dir import load_field
+from tests.plugin.stock_run import StockRun, train_splatfacto
+
+LIFT = LiftOptions(vote=RefineConfig(k=6))
+
+
+@pytest.fixture
+def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., StockRun]:
+    """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
+    methods = {m.config.method_name: m.config for m in (normlift_method, scannet_method)}
+    monkeypatch.setattr("tests.plugin.stock_run.method_configs", methods)
+    monkeypatch.setattr("normlift_ns.plugin.model.rasterization", None)  # splatfacto's is replaced, ours not wanted
+
+    def train(
+        timestamp: str,
+        method: str = "normlift",
+        checkpoint: Path | None = None,
+        prepare: Any = lambda trainer: None,
+        **pipeline: Any,
+    ) -> StockRun:
+        def configure(config: TrainerConfig) -> None:
+            config.output_dir = Path("trained")
+            config.pipeline.model.num_random = 60  # type: ignore[attr-defined]
+            config.load_checkpoint = checkpoint
+            values = {"source": SourceOptions(encoder="colour", region_count=12), "lift": LIFT, **pipeline}
+            for name, value in values.items():
+                setattr(config.pipeline, name, value)
+
+        return train_splatfacto(
+            workspace, Path("scene"), method=method, timestamp=timestamp, steps=2, configure=configure, prepare=prepare
+        )
+
+    return train
+
+
+def test_the_run_is_lifted_in_place(train: Callable[..., StockRun], registered: None) -> None:
+    trained = train("whole", queries=("red", "sky blue"))
+    run_dir = trained.config.parent
+    assert sorted(p.name for p in run_dir.iterdir() if not p.name.startswith("events")) == [
+        "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
+    ]  # fmt: skip
+    assert [p.name for p in (run_dir / "nerfstudio_models").iterdir()] == ["step-000000001.ckpt"]
+
+    run = load_run(trained.config)
+    field = load_field(run)
+    assert len(field) == 60
+    assert field.scalars.reliability.max() > 0.2
+    question = load_question(run_dir / "normlift")
+    assert question is not None
+    assert question.texts == ("red", "sky blue")
+    expected = ask(field, encoder_of(field), ["red", "sky blue"])
+
+    model = trained.trainer.pipeline.model  # the viewer of the training
+    assert torch.equal(model.normlift.answer.relevancy, expected.relevancy)
+    loaded = eval_setup(trained.config, update_config_callback=lambda c: rerooted(c, trained.config))[1].model
+    assert torch.equal(loaded.normlift.answer.selected, expected.selected)
+    assert torch.equal(loaded.means, model.means)
+
+    stored = yaml.load(trained.config.read_text(), Loader=yaml.Loader)
+    assert stored.pipeline.lift == LIFT
+    assert stored.pipeline.source.encoder == "colour"
+    again = load_run(trained.config).config.pipeline
+    assert (again.lift, again.queries) == (LIFT, ("red", "sky blue"))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("broken", ["lift_run", "save_question", "pose"])
+def test_a_failing_lift_leaves_the_training_whole(
+    train: Callable[..., StockRun], registered: None, monkeypatch, capsys, broken: str
+) -> None:
+    def fail(*args: Any, **kwargs: Any) -> None:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr(module, broken, fail)
+    trained = train(broken, queries=("red",))
+    shown = capsys.readouterr()
+    assert "out of luck" in shown.err
+    assert "The training is complete and saved" in shown.out
+    assert f"ns-normlift --load-config {trained.trainer.base_dir / 'config.yml'}" in shown.out
+    run = load_run(trained.config)
+    assert torch.equal(run.scene.means, trained.trainer.pipeline.model.means.detach())
+    assert not (trained.config.parent / "normlift").exists()
+    loaded = eval_setup(trained.config, update_config_callback=lambda c: rerooted(c, trained.config))[1].model
+    assert loaded.field is None
+    with pytest.raises(FileNotFoundError, match="without semantics"):
+        load_field(run)
+
+
+def test_mistakes_show_before_the_training(train: Callable[..., StockRun]) -> None:
+    with pytest.raises(ValueError, match="orange"):
+        train("typo", queries=("oragne",))
+    with pytest.raises(FileNotFoundError, match=r"missing\.pt"):
+        train("weights", source=SourceOptions(encoder_pretrained="missing.pt"))
+    with pytest.raises(ValueError, match="regions-dir"):
+        train("regions", source=SourceOptions(encoder="colour", regions="files"))
+
+
+def test_training_a_lifted_checkpoint_further_forgets_its_field(train: Callable[..., StockRun]) -> None:
+    first = train("first")
+    field = first.trainer.pipeline.model.field
+    assert field is not None
+    state = first.trainer.pipeline.state_dict()
+    assert not any("normlift" in name for name in state)
+    callbacks = first.trainer.pipeline.get_training_callbacks(
+        module.TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=None, trainer=None)
+    )
+    assert len(callbacks) == 2
+    assert first.trainer.pipeline.model.field is None
+    assert first.trainer.pipeline.model.config.semantics is None
+
+
+def test_frozen_points_stay_where_they_are(train: Callable[..., StockRun]) -> None:
+    before: dict[str, torch.Tensor] = {}
+
+    def remember(trainer: Any) -> None:
+        before.update({name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()})
+
+    trained = train("frozen", method="normlift-scannet", prepare=remember)
+    after = trained.trainer.pipeline.model.gauss_params
+    assert torch.equal(before["means"], after["means"])
+    assert all(not torch.equal(before[name], after[name]) for name in ("scales", "opacities", "features_dc"))
+    outputs = trained.trainer.pipeline.datamanager.train_dataparser_outputs
+    assert outputs.dataparser_scale == 1
+    assert torch.equal(outputs.dataparser_transform, torch.eye(4)[:3])
+    assert len(outputs.image_filenames) == 10
+    run = load_run(trained.config)
+    assert (run.train.cameras[0].width, run.train.cameras[0].height) == (23, 17)  # half of 48 x 36, undistorted
+    assert len(load_field(run)) == 60
+
+
+def test_a_stock_checkpoint_is_trained_on_and_lifted(train: Callable[..., StockRun], stock: StockRun) -> None:
+    """`ns-train normlift --load-checkpoint …`, with a full checkpoint, optimizers included."""
+    (checkpoint,) = (stock.config.parent / "nerfstudio_models").iterdir()
+    trained = train("further", checkpoint=checkpoint)
+    run = load_run(trained.config)
+    assert run.step == 4  # the stock run ended with step 2
+    assert len(load_field(run)) == 60
+    before = load_run(stock.config).scene
+    assert (run.scene.means - before.means).abs().max() < 1e-2
