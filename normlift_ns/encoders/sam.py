@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -186,13 +186,13 @@ class SamMasks:
     def _whole(self, found: _Candidates, crops: Sequence[Box], size: tuple[int, int]) -> Bool[Tensor, "c h w"]:
         masks = torch.zeros(len(found.crop), *size, dtype=torch.bool, device=found.crop.device)
         for i, (x0, y0, x1, y1) in enumerate(crops):
-
-            def paint(index: Tensor, x0: int = x0, y0: int = y0, x1: int = x1, y1: int = y1) -> None:
-                masks[index, y0:y1, x0:x1] = self.network.enlarge(found.logits[index], (y1 - y0, x1 - x0)) > 0
-
-            for _ in self.network.masks(paint, (found.crop == i).nonzero()[:, 0]):
-                pass
+            index, within = (found.crop == i).nonzero()[:, 0], (y1 - y0, x1 - x0)
+            inside = self.network.masks(partial(self._inside, within), found.logits[index])
+            masks[index, y0:y1, x0:x1] = torch.cat([masks.new_zeros(0, *within), *inside])
         return masks
+
+    def _inside(self, size: tuple[int, int], logits: Tensor) -> Tensor:
+        return self.network.enlarge(logits, size) > 0
 
     @cached_property
     def _checkpoint(self) -> str:
