@@ -95,11 +95,11 @@ def centre_evidence(world: World) -> Evidence:
     row, view = weights.row_index(), weights.column.long()
     cell = torch.full((len(row),), -1, dtype=torch.int64)
     rows, views = row.cpu(), view.cpu()
-    means = world.scene.means.cpu()
+    means = world.scene.means.cpu().double()
     for v, camera in enumerate(world.cameras):
         here = (views == v).nonzero().squeeze(1)
-        seen = means[rows[here]] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        place = seen @ camera.K.T
+        pose = camera.world_to_camera.double()
+        place = (means[rows[here]] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.double().T
         x, y = (place[:, i] / place[:, 2].clamp(min=1e-6) for i in (0, 1))
         inside = (place[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         x, y = (c.clamp(0, size - 1).long() for c, size in ((x, camera.width), (y, camera.height)))
