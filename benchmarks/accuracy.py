@@ -16,6 +16,7 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from benchmarks.damage import LADDER, Damage, observe
+from benchmarks.damage import LADDER, Damage, Observed, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import (
     VARIANTS,
@@ -37,12 +38,15 @@ from benchmarks.variants import (
     top_evidence,
 )
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
-from normlift_ns import Neighbors, RefineConfig, lift, nearest_neighbors
+from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors, refine
 from normlift_ns.core.metrics import bin_means, class_scores, classify, confusion, spearman
 
 SEEDS = 5
 VARIES = 0.05
 """Accuracy varies over bins of reliability if their means span at least this much."""
+KEYS = {"knn": "plain_knn", "norm": "norm_only", "support": "support_only"}
+"""Names of variants in the results, where they differ."""
+PRESETS = ("preset_half", "preset_every_second_view")
 OTHERS = {"sfs": "A^2 weights", "occam": "centre pixels", "vala": "gated geometric median", "drsplat": "top-k rays"}
 
 
@@ -100,18 +104,32 @@ class Bench:
             row[variant] = scores_3d(world, scores, self.counted)
             if not self.sampled:
                 row[variant] |= scores_2d(world, scores)
+        if not self.sampled:
+            row |= self._presets(observed, lifted, plain)
         row["vala"] = scores_3d(
             world, median_scores(observed, self.classes, self.counted if self.sampled else None), self.counted
         )
         for name, other in self.others.items():
             seen = observe(other, self.words, damage, seed)
-            row[name] = scores_3d(
-                world, lifted_scores(lift(seen.evidence, seen.features), self.classes), self.counted
-            )
+            row[name] = scores_3d(world, lifted_scores(lift(seen.evidence, seen.features), self.classes), self.counted)
         correct = classify(plain.cosine, plain.valid) == world.truth
         for name, key in (("reliability", lifted.reliability), ("norm", lifted.norm)):
             row[f"{name}_bins"] = bins_of(key[known], correct[known])
         return row
+
+    def _presets(self, observed: Observed, lifted: Lifted, plain: Scores) -> dict[str, Any]:
+        """The full variant by faster lifts, as in `benchmarks.presets`."""
+        means = self.world.scene.means
+        read = partial(lifted.directions, dtype=torch.float16)
+        source = refine(means, read, lifted.reliability, self.config, neighbors=self.neighbors).long()
+        half = Scores(plain.cosine[source], plain.valid[source])
+        views = list(range(0, observed.evidence.num_views, 2))
+        columns = observed.evidence.columns_of(views)
+        fewer = lift(observed.evidence.select_views(views), observed.features[columns])
+        scores = lifted_scores(fewer, self.classes)
+        second = refined_scores("full", means, fewer, scores, self.neighbors, self.config)
+        found = {"half": half, "every_second_view": second}
+        return {f"preset_{name}": scores_3d(self.world, scores, self.counted) for name, scores in found.items()}
 
 
 def worlds(quick: bool, names: Sequence[str], views: int | None = None) -> Iterator[tuple[World, Words]]:
@@ -160,7 +178,7 @@ def summarize(rows: list[dict[str, Any]], report: Report) -> None:
         of_scene = [row for row in rows if row["scene"] == scene]
         steps = list(dict.fromkeys(row["damage"] for row in of_scene))
         seeds = sorted({row["seed"] for row in of_scene})
-        methods = [m for m in (*VARIANTS, *OTHERS) if m in of_scene[0]]
+        methods = [m for m in (*VARIANTS, *OTHERS, *PRESETS) if m in of_scene[0]]
 
         def value(method: str, metric: str, seed: int, steps: Sequence[str], rows: list = of_scene) -> float:
             """Mean over steps of the ladder of one seed."""
@@ -172,14 +190,18 @@ def summarize(rows: list[dict[str, Any]], report: Report) -> None:
             report.add(f"{prefix}{key}_ci95", half, "points, half of the 95 % interval over seeds")
 
         for method in methods:
-            group = "ablation" if method in VARIANTS else "baseline"
+            group = "ablation" if method in VARIANTS else "preset" if method in PRESETS else "baseline"
+            name = KEYS.get(method, method.removeprefix("preset_"))
             for metric in of_scene[0][method]:
-                add(f"{group}.{method}.{metric}", [value(method, metric, s, steps) for s in seeds])
+                add(
+                    f"{group}.{name}.{metric}",
+                    [value(method, metric, s, steps) for s in seeds],
+                )
             for step in steps:
-                add(f"ladder.{step}.{method}.miou", [value(method, "miou", s, [step]) for s in seeds])
+                add(f"ladder.{step}.{name}.miou", [value(method, "miou", s, [step]) for s in seeds])
         for method in VARIANTS[:-1]:
             pairs = [value("full", "miou", s, steps) - value(method, "miou", s, steps) for s in seeds]
-            add(f"ablation.full_minus_{method}.miou", pairs)
+            add(f"ablation.full_minus_{KEYS.get(method, method)}.miou", pairs)
         _add_reliability(of_scene, steps, prefix, report)
 
 

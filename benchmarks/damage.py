@@ -2,8 +2,9 @@
 
 The feature of a mask is normalise(t + C c + O o + N n): t the text vector of its class, c one direction that all image
 features share (the modality gap), o a direction of the object's own, n noise of this mask in this view, that follows
-the covariance of text vectors, so that it is confusion rather than static. c and o are orthogonal to the classes. With the default lengths
-C, O and N one object in two views has cosine 0.83, two objects 0.64, image and own text 0.34, another text 0.25.
+the covariance of text vectors, so that it is confusion rather than static. c and o are orthogonal to the classes. With
+the default lengths C, O and N one object in two views has cosine 0.83, two objects 0.64, image and own text 0.34,
+another text 0.25.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Damage:
     dropped: float = 0.0
     """Share of masks that are missing: unlabelled pixels."""
     shifted: float = 0.0
-    """Blocks (a fortieth of the image's width) by which every mask is off, in a direction of its own; of overlapping masks the later wins."""
+    """Blocks (a fortieth of the image's width) by which every mask is off, in a direction of its own; of overlapping
+    masks the later wins."""
     boundary: float = 0.0
     """Share of cells that take the label found two blocks away in a random direction: frayed edges."""
     pose: float = 0.0

@@ -5,9 +5,9 @@
 
 Procedure, fixed before any run: start from the defaults. For two rounds, go through tau, gamma, sigma_d, K, Delta in
 this order and set each to the value of its grid with the highest mean mIoU over `FIT` (damages, all scenes, seeds from
-100 on); a change counts only if it gains at least `WORTH` points. Then report defaults and fitted values on `HELD_OUT` (other damages,
-seeds from 200 on), with 95 % intervals of the paired difference, the curve of every parameter around the defaults
-there, and the two readings of unlabelled pixels. Writes results/fit.json.
+100 on); a change counts only if it gains at least `WORTH` points. Then report defaults and fitted values on `HELD_OUT`
+(other damages, seeds from 200 on), with 95 % intervals of the paired difference, the curve of every parameter around
+the defaults there, and the two readings of unlabelled pixels. Writes results/fit.json.
 """
 
 from __future__ import annotations

@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 from benchmarks.accuracy import OTHERS
 from benchmarks.plots import DOCS, NAMES
 from benchmarks.report import RESULTS
-from benchmarks.variants import VARIANTS
 
 TITLES = {
-    "none": "without refinement", "knn": "plain KNN voting", "linear": "linear averaging", "norm": "norm only",
-    "support": "support only", "full": "full",
+    "none": "without refinement", "plain_knn": "plain KNN voting", "linear": "linear averaging", "norm_only": "norm only",
+    "support_only": "support only", "full": "full",
 }  # fmt: skip
 PRESET_FLAGS = {
     "exact": "`--precision double`", "float32": "default", "half_resolution": "`--lift-downscale 2`",
@@ -53,24 +52,27 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]
     yield ""
 
 
-def presets(document: Document) -> Iterator[str]:
-    """Time, memory and error of the whole lift on a GPU."""
+def presets(document: Document, accuracy: Document) -> Iterator[str]:
+    """Time, memory and error of the whole lift on a GPU, and what it does to mIoU where that was measured."""
     yield from ("## Presets on a GPU", "", document.origin, "")
     v, rows = document.values, []
     for name, label in NAMES.items():
         if f"{name}.s" in v:
             seconds, memory = f"{v[f'{name}.s']:.3g} s", f"{v[f'{name}.peak_gib']:.2f} GiB"
             error, other = f"{v[f'{name}.rms_error']:.2g}", f"{100 * v[f'{name}.other_share']:.2g} %"
-            rows.append((label, PRESET_FLAGS.get(name, "benchmark only"), seconds, memory, error, other))
+            key = "ablation.full.miou" if name == "float32" else f"preset.{name}.miou"
+            miou = _interval(accuracy.values, key) or "not measured"
+            rows.append((label, PRESET_FLAGS.get(name, "benchmark only"), seconds, memory, error, other, miou))
     if len(rows) == 0:
         return
-    header = ("preset", "how", "time", "peak memory", "RMS error of refined directions", "Gaussians off by > 0.1")
+    header = ("preset", "how", "time", "peak memory", "RMS error", "directions off by > 0.1", "mIoU, tabletop")
     yield from table(header, rows)
     ratio = v["float32.s"] / v["every_second_view.s"]
     yield (
-        f"Half of the views is {ratio:.1f}x as fast as the default, and moves {100 * v['every_second_view.other_share']:.0f} % of the "
-        f"refined directions by more than 0.1; half of the resolution moves {100 * v['half_resolution.other_share']:.0f} %. Float32 instead "
-        f"of float64 moves {100 * v['float32.other_share']:.2g} %."
+        f"Half of the views is {ratio:.1f}x as fast as the default, and moves "
+        f"{100 * v['every_second_view.other_share']:.0f} % of the refined directions by more than 0.1, because every "
+        f"view has noise of its own; half of the resolution moves {100 * v['half_resolution.other_share']:.0f} %. "
+        f"Float32 instead of float64 moves {100 * v['float32.other_share']:.2g} %."
     )
     yield ""
 
@@ -78,7 +80,7 @@ def presets(document: Document) -> Iterator[str]:
 def every_metric(title: str, document: Document, keep: str = "") -> Iterator[str]:
     """All (or some) metrics of one file as they stand."""
     yield from (f"## {title}", "", document.origin, "")
-    metrics = [m for m in document.content["metrics"] if keep in m["key"].split("_")+[""]]
+    metrics = [m for m in document.content["metrics"] if keep in [*m["key"].split("_"), ""]]
     if len(metrics) > 0:
         rows = [
             (f"`{m['key']}`", f"{m['value']:.4g} {m['unit']}", "" if m["error"] is None else f"{m['error']:.1e}")
@@ -118,7 +120,7 @@ def plot_accuracy(document: Document, target: Path) -> None:
     mpl.rcParams["svg.hashsalt"] = "accuracy"  # the same file for the same figures
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     axes = figure.subplots()
-    for i, name in enumerate(VARIANTS):
+    for i, name in enumerate(TITLES):
         values = [document.values[f"ladder.{step}.{name}.miou"] for step in steps]
         bars = [document.values[f"ladder.{step}.{name}.miou_ci95"] for step in steps]
         places = [x + 0.13 * (i - 2.5) for x in range(len(steps))]
@@ -130,23 +132,34 @@ def plot_accuracy(document: Document, target: Path) -> None:
     figure.savefig(target, metadata={"Date": None})
 
 
-def main() -> None:
-    documents = {name: Document(RESULTS / f"{name}.json") for name in ("cpu", "forms", "presets", "h100", "accuracy")}
+def page(documents: dict[str, Document]) -> str:
+    """docs/speed_and_error.md."""
     lines = [
         "# Speed and error",
         "",
-        "Written by `python -m benchmarks.pages` from `benchmarks/results/*.json`. A time stands beside the error of the result that took it.",
+        "Written by `python -m benchmarks.pages` from `benchmarks/results/*.json`. A time stands beside the error of",
+        "the result that took it.",
         "",
-        *presets(documents["presets"]),
+        *presets(documents["presets"], documents["accuracy"]),
         *accuracy(documents["accuracy"]),
         *every_metric("The core on a GPU", documents["h100"]),
         *every_metric("The core on a CPU", documents["cpu"]),
         *every_metric("Forms on disk, tolerance 0.01", documents["forms"], keep="tol0.01"),
     ]
-    (DOCS / "speed_and_error.md").write_text("\n".join(lines).rstrip() + "\n")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def documents() -> dict[str, Document]:
+    """All results files that the page speaks of."""
+    return {name: Document(RESULTS / f"{name}.json") for name in ("cpu", "forms", "presets", "h100", "accuracy")}
+
+
+def main() -> None:
+    found = documents()
+    (DOCS / "speed_and_error.md").write_text(page(found))
     written = [DOCS / "speed_and_error.md"]
-    if documents["accuracy"].found:
-        plot_accuracy(documents["accuracy"], DOCS / "accuracy.svg")
+    if found["accuracy"].found:
+        plot_accuracy(found["accuracy"], DOCS / "accuracy.svg")
         written.append(DOCS / "accuracy.svg")
     print("Written: " + ", ".join(map(str, written)))
 

@@ -122,13 +122,12 @@ def top_evidence(world: World, top: int = TOP) -> Evidence:
             cell = cells[place].flatten().long()[:, None].expand_as(which)
             keep = best > 0
             parts.append((projected.gaussian[member[which[keep]]].long(), cell[keep], best[keep]))
-    rows = SparseRows.from_coo(*(torch.cat(x) for x in zip(*parts)), len(world.scene))
+    row, column, value = (torch.cat(x) for x in zip(*parts))
+    rows = SparseRows.from_coo(row, column, value, len(world.scene))
     return replace(world.evidence, offsets=rows.offsets, region=rows.column, weight=rows.weight)
 
 
-def median_scores(
-    observed: Observed, classes: Tensor, gaussians: Tensor | None = None, *, steps: int = 10
-) -> Scores:
+def median_scores(observed: Observed, classes: Tensor, gaussians: Tensor | None = None, *, steps: int = 10) -> Scores:
     """VALA: views that hardly see a Gaussian are left out, the others give the geometric median by cosine distance
     (Weiszfeld iterations with weights E / (1 - cosine), renormalised to the sphere).
     """

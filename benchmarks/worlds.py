@@ -1,7 +1,7 @@
 """Scenes whose every Gaussian has a known class, with evidence on cells fine enough for any damage to the masks.
 
-Evidence is rasterized once, on the joint cells of the exact masks and of `BLOCKS` square blocks across every image. Whatever
-damage does to masks is then a new grouping of cells (`Evidence.regroup`), and no damage rasterizes again.
+Evidence is rasterized once, on the joint cells of the exact masks and of `BLOCKS` square blocks across every image.
+Whatever damage does to masks is then a new grouping of cells (`Evidence.regroup`), and no damage rasterizes again.
 """
 
 from __future__ import annotations
@@ -156,9 +156,7 @@ def demo(num_gaussians: int = 40_000) -> World:
         torch.stack([view_labels(room, camera).long() - 1 for camera in some]) for some in (cameras, held_out)
     )
     evidence, cells = cell_evidence(room.scene, cameras, maps)
-    return World(
-        "demo", room.scene, cameras, evidence, cells, room.labels, len(room.names), held_out, held_out_maps
-    )
+    return World("demo", room.scene, cameras, evidence, cells, room.labels, len(room.names), held_out, held_out_maps)
 
 
 def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:

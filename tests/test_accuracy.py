@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.accuracy import Bench, summarize
+from benchmarks.accuracy import KEYS, Bench, summarize
 from benchmarks.damage import LADDER, Damage, Lengths, observe
 from benchmarks.fit import MOST, observation
+from benchmarks.pages import documents, page
 from benchmarks.report import Report
 from benchmarks.variants import (
     VARIANTS,
@@ -78,7 +79,9 @@ def test_features_have_the_geometry_that_is_documented():
 
     rows = _features(torch.arange(12).repeat(40), words, Damage(), Lengths(), g).view(40, 12, -1)
     same = torch.einsum("vkd,wkd->vwk", rows, rows)[torch.triu_indices(40, 40, 1).unbind()].mean()
-    other = torch.einsum("vkd,vld->vkl", rows, rows)[:, torch.triu_indices(12, 12, 1)[0], torch.triu_indices(12, 12, 1)[1]].mean()
+    other = torch.einsum("vkd,vld->vkl", rows, rows)[
+        :, torch.triu_indices(12, 12, 1)[0], torch.triu_indices(12, 12, 1)[1]
+    ].mean()
     text = rows @ words.classes.T
     own = text.diagonal(dim1=1, dim2=2).mean()
     off = (text.sum() - text.diagonal(dim1=1, dim2=2).sum()) / (40 * 12 * 11)
@@ -168,13 +171,19 @@ def test_rows_and_their_summary(world):
     values = {metric.key: metric.value for metric in report.metrics}
     for variant in VARIANTS:
         expected = sum(row[variant]["miou"] for row in rows) / 4
-        assert values[f"ablation.{variant}.miou"] == pytest.approx(expected)
+        assert values[f"ablation.{KEYS.get(variant, variant)}.miou"] == pytest.approx(expected)
     for other in ("sfs", "occam", "vala", "drsplat"):
         assert 0 < values[f"baseline.{other}.miou"] <= 100
     assert values["ablation.full_minus_none.miou"] == pytest.approx(
         values["ablation.full.miou"] - values["ablation.none.miou"]
     )
     assert 0 <= values["ablation.full.miou_2d"] <= 100
+    assert values["preset.half.miou"] == pytest.approx(values["ablation.full.miou"], abs=1)
+
+
+def test_the_page_is_made_of_the_committed_results():
+    written = ROOT / "docs" / "speed_and_error.md"
+    assert written.read_text() == page(documents()), "write it again: python -m benchmarks.pages"
 
 
 @pytest.mark.slow
@@ -185,5 +194,5 @@ def test_quick_accuracy_benchmark(tmp_path):
     print(done.stdout)
     values = {m["key"]: m["value"] for m in json.loads((tmp_path / "accuracy.json").read_text())["metrics"]}
     assert values["ladder.few views.full.miou"] > values["ladder.few views.none.miou"]
-    assert values["ablation.full.miou"] > values["ablation.norm.miou"]
+    assert values["ablation.full.miou"] > values["ablation.norm_only.miou"]
     assert values["reliability.spearman_bins_mean"] > 0.7

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64
 from scipy import stats
@@ -104,12 +104,12 @@ def localized(score: Float[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, any_pe
 
 def spearman(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
     """Rank correlation, ties at their mean rank, in -1..1; NaN where one side is constant."""
-    return float(stats.spearmanr(_numpy(a), _numpy(b)).statistic) if _vary(a, b) else float("nan")
+    return _statistic(stats.spearmanr, a, b)
 
 
 def kendall(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
     """Kendall's tau-b, in -1..1; NaN where one side is constant."""
-    return float(stats.kendalltau(_numpy(a), _numpy(b)).statistic) if _vary(a, b) else float("nan")
+    return _statistic(stats.kendalltau, a, b)
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:
@@ -136,9 +136,7 @@ def bin_means(
     return tuple(torch.stack([x.double()[part].mean() for part in parts]) for x in (key, values))  # type: ignore[return-value]
 
 
-def _vary(*arrays: Tensor) -> bool:
-    return all(len(x) > 1 and bool((x != x[0]).any()) for x in arrays)
-
-
-def _numpy(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().double().numpy()
+def _statistic(correlate: Callable[..., Any], a: Tensor, b: Tensor) -> float:
+    if not all(len(x) > 1 and bool((x != x[0]).any()) for x in (a, b)):
+        return float("nan")
+    return float(correlate(*(x.detach().cpu().double().numpy() for x in (a, b))).statistic)

@@ -62,11 +62,7 @@ def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
     values = score.double().numpy().ravel()
     counts, edges = np.histogram(values, bins=_HISTOGRAM_BINS)
     padded = np.concatenate([[-1], counts, [-1]])
-    peaks = [
-        i
-        for i in range(_HISTOGRAM_BINS)
-        if counts[i] >= _LEAST_PEAK and padded[i] < counts[i] >= padded[i + 2]
-    ]
+    peaks = [i for i in range(_HISTOGRAM_BINS) if counts[i] >= _LEAST_PEAK and padded[i] < counts[i] >= padded[i + 2]]
     if len(peaks) < max(1, instances) or np.ptp(values) == 0:
         otsu = threshold_otsu(values) if np.ptp(values) > 0 else values[0]
         return float((otsu + np.percentile(values, 75)) / 2)
@@ -88,7 +84,7 @@ def cleaned(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
         return torch.zeros_like(mask)
     largest = (labels == 1 + facts[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
     outlines, _ = cv2.findContours(largest, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return torch.from_numpy(cv2.drawContours(largest, outlines, -1, 1, cv2.FILLED)).bool()
+    return torch.from_numpy(cv2.drawContours(largest, outlines, -1, (1,), cv2.FILLED)).bool()
 
 
 def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:

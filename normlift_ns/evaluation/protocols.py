@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -122,9 +121,9 @@ def run_lerf(runs: Iterator[LiftedRun], labels: Sequence[Path], options: LerfOpt
     """
     files = [read_frames(folder) for folder in labels]
     rows, missing = [], []
-    for folder, found, lifted in zip(labels, files, runs):
+    for folder, given, lifted in zip(labels, files, runs):
         cameras = lifted.cameras()
-        found, absent = match_views(found, cameras)
+        found, absent = match_views(given, cameras)
         missing += [f"{folder.name}/{stem}" for stem in absent]
         for file in found:
             camera = cameras[file.stem]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,7 +28,7 @@ CLASS_SETS = {
     10: (1, 2, 4, 5, 6, 7, 8, 9, 10, 33),
 }
 """NYU40 ids of the three sets."""
-SCENES = tuple(f"scene{x}_00" for x in "0000 0062 0070 0097 0140 0200 0347 0400 0590 0645".split())
+SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", "0200", "0347", "0400", "0590", "0645"])
 """Scenes of the published table."""
 
 
@@ -107,7 +108,7 @@ def evaluate_scannet(
     """
     other: WithoutDirection = "none" if without_direction == "first" else "first"
     results, rows = {}, []
-    for classes in CLASS_SETS:
+    for classes, ids in CLASS_SETS.items():
         scores = {
             rule: [scene_scores(s, classes, min_opacity=min_opacity, without_direction=rule) for s in scenes]
             for rule in (without_direction, other)
@@ -118,8 +119,8 @@ def evaluate_scannet(
         for scene, found in zip(scenes, scores[without_direction]):
             rows += [
                 {"scene": scene.name, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
-                for i, iou, accuracy in zip(CLASS_SETS[classes], found.iou.tolist(), found.accuracy.tolist())
-                if iou == iou  # absent classes are NaN
+                for i, iou, accuracy in zip(ids, found.iou.tolist(), found.accuracy.tolist())
+                if not math.isnan(iou)  # the scene lacks the class
             ]
     names = [scene.name for scene in scenes]
     missing = [name for name in SCENES if name not in names]

@@ -32,7 +32,9 @@ def square(category, x, y, size=5, **more):
 
 def test_polygons_are_filled_joined_and_scaled(tmp_path):
     file = write_frame(
-        tmp_path / "ramen", "frame_00006", [square("egg", 2, 3), square("egg", 20, 10, bbox=[20, 10, 25, 15]), square("bowl", 4, 4)]
+        tmp_path / "ramen",
+        "frame_00006",
+        [square("egg", 2, 3), square("egg", 20, 10, bbox=[20, 10, 25, 15]), square("bowl", 4, 4)],
     )
     frame = read_frame(file, 40, 30)
     assert list(frame.masks) == ["egg", "bowl"]
@@ -76,7 +78,9 @@ def test_margin_over_the_best_background_word():
 
 def test_histogram_threshold_is_the_valley_left_of_the_kth_peak():
     g = torch.Generator().manual_seed(0)
-    parts = [centre + 0.01 * torch.randn(count, generator=g) for centre, count in ((0.1, 9000), (0.5, 4000), (0.9, 3000))]
+    parts = [
+        centre + 0.01 * torch.randn(count, generator=g) for centre, count in ((0.1, 9000), (0.5, 4000), (0.9, 3000))
+    ]
     score = torch.cat(parts).view(100, 160)
     assert 0.55 < histogram_threshold(score, 1) < 0.89
     assert 0.12 < histogram_threshold(score, 2) < 0.49
@@ -105,7 +109,11 @@ def test_langsplat_reading():
     assert float(average.max()) == pytest.approx(1, abs=1e-5)
     assert float(mixed[45, 31]) == pytest.approx((1 + float(average[45, 31])) / 2)
     truth = relevancy.bool()
-    scores = FrameScores(frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]}), relevancy[..., None], relevancy[..., None][..., :0])
+    scores = FrameScores(
+        frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]}),
+        relevancy[..., None],
+        relevancy[..., None][..., :0],
+    )
     (row,) = frame_rows(scores, "langsplat", margin=0, clean=False)
     assert 0.8 < row["iou"] < 0.87  # corners, where the mean is below 0.4, are cut off: 15 % of the square
     assert row["localized"] == 1

@@ -24,7 +24,9 @@ def random_scene(seed: int, n: int = 400) -> SceneLabels:
     cosine = torch.rand(n, 19, generator=g)
     valid = torch.rand(n, generator=g) > 0.2
     nyu40 = torch.randint(0, 41, (n,), generator=g)
-    return SceneLabels(f"scene{seed}", torch.where(valid[:, None], cosine, 0.0), valid, torch.rand(n, generator=g), nyu40)
+    return SceneLabels(
+        f"scene{seed}", torch.where(valid[:, None], cosine, 0.0), valid, torch.rand(n, generator=g), nyu40
+    )
 
 
 def loop(scene: SceneLabels, classes: int, first: bool) -> tuple[float, float]:
@@ -43,7 +45,7 @@ def loop(scene: SceneLabels, classes: int, first: bool) -> tuple[float, float]:
     ious, recalls = [], []
     for c in range(1, classes + 1):
         hits = sum(t == c and f == c for t, f in zip(truth, found))
-        union = sum(t == c or f == c for t, f in zip(truth, found))
+        union = sum(c in (t, f) for t, f in zip(truth, found))
         if c in truth:
             ious.append(hits / union)
             recalls.append(hits / truth.count(c))

@@ -1,4 +1,4 @@
-"""ns-normlift-eval on a lifted demo room: its three protocols as a user types them, with stand-in vectors and labels."""
+"""ns-normlift-eval on a lifted demo room: its protocols as a user types them, with stand-in vectors and labels."""
 
 from __future__ import annotations
 
