@@ -18,9 +18,13 @@ from benchmarks.plots import DOCS, NAMES
 from benchmarks.report import RESULTS
 
 TITLES = {
-    "none": "without refinement", "plain_knn": "plain KNN voting", "linear": "linear averaging", "norm_only": "norm only",
-    "support_only": "support only", "full": "full",
-}  # fmt: skip
+    "none": "without refinement",
+    "plain_knn": "plain KNN voting",
+    "linear": "linear averaging",
+    "norm_only": "norm only",
+    "support_only": "support only",
+    "full": "full",
+}
 PRESET_FLAGS = {
     "exact": "`--precision double`", "float32": "default", "half_resolution": "`--lift-downscale 2`",
     "every_second_view": "`--max-views` half", "low_rank": "`--form low_rank --tolerance 0.05`",
