@@ -36,7 +36,15 @@ def training_indices(name: str) -> list[int]:
 
 
 def training_cameras(name: str) -> list[Camera]:
-    """Cameras of the 90 % training split, lens distortion taken out as nerfstudio's full-image data manager does it."""
+    """Cameras of the 90 % training split."""
+    cameras = all_cameras(name)
+    return [cameras[i] for i in training_indices(name)]
+
+
+def all_cameras(name: str) -> list[Camera]:
+    """Cameras of all frames in order of their names, lens distortion taken out as nerfstudio's full-image data manager
+    does it.
+    """
     capture = SHARED / "captures" / name
     meta = json.loads((capture / "transforms.json").read_text())
     run = SHARED / "captures" / "outputs" / name / "splatfacto" / "run"
@@ -44,8 +52,8 @@ def training_cameras(name: str) -> list[Camera]:
     frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
     K, width, height = _undistorted_intrinsics(meta)
     cameras = []
-    for i in training_indices(name):
-        pose = np.array(world["transform"] + [[0, 0, 0, 1]]) @ np.array(frames[i]["transform_matrix"])
+    for frame in frames:
+        pose = np.array(world["transform"] + [[0, 0, 0, 1]]) @ np.array(frame["transform_matrix"])
         pose[:3, 3] *= world["scale"]
         pose[:, 1:3] *= -1  # OpenGL to OpenCV
         pose = torch.linalg.inv(torch.from_numpy(pose))

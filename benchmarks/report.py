@@ -46,7 +46,9 @@ class Report:
         document = {
             "hardware": hardware(),
             "versions": {"python": platform.python_version(), **{x: version(x) for x in PACKAGES if find_spec(x)}},
-            "command": " ".join(["python -m", f"benchmarks.{Path(sys.argv[0]).stem}", *(a for a in sys.argv[1:] if a == "--quick")]),
+            "command": " ".join(
+                ["python -m", f"benchmarks.{Path(sys.argv[0]).stem}", *(a for a in sys.argv[1:] if a == "--quick")]
+            ),
             "metrics": [asdict(metric) for metric in self.metrics],
         }
         folder.mkdir(parents=True, exist_ok=True)

@@ -30,6 +30,9 @@ ALLOWED = {
     "plugin": BASE
     | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib", "plyfile"}
     | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin")},
+    "evaluation": BASE
+    | {"cv2", "plyfile", "skimage"}
+    | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin", "evaluation")},
 }
 
 

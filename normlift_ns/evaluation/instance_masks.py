@@ -1,0 +1,124 @@
+"""Captures with instance masks: per-Gaussian truth from the masks' own evidence, and pixels of held-out views."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, confusion
+from normlift_ns.encoders.images import read_pixels
+from normlift_ns.encoders.regions import LabelFiles
+from normlift_ns.evaluation.results import Evaluation
+
+
+@dataclass(frozen=True)
+class Names:
+    """What the values of instance masks are called."""
+
+    classes: tuple[str, ...]
+    """Distinct names, the queries."""
+    class_of: Mapping[int, int]
+    """Class of every value; values that are not there do not count."""
+
+
+def read_names(path: Path) -> Names:
+    """Reads {"labels": {"1": "table", ...}, "background": 0}, or only the inner part; equal names are one class.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file of another form.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f'names of the masks {path} do not exist; write {{"labels": {{"1": "table", ...}}}}')
+    try:
+        document = json.loads(path.read_text("utf8"))
+        labels = document.get("labels", document)
+        of_value = {int(value): str(name) for value, name in labels.items()}
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, ValueError) as error:
+        raise ValueError(f'{path} names no masks ({error}); expected {{"labels": {{"1": "table", ...}}}}') from error
+    if len(of_value) == 0:
+        raise ValueError(f'{path} names no masks; expected {{"labels": {{"1": "table", ...}}}}')
+    classes = tuple(dict.fromkeys(of_value.values()))
+    return Names(classes, {value: classes.index(name) for value, name in of_value.items()})
+
+
+def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width: int) -> Int64[Tensor, "h w"]:
+    """Class of every pixel of an image, -1 where it does not count.
+
+    Raises:
+        FileNotFoundError, ValueError: a mask that is missing, or of another size; the message names it.
+    """
+    path = masks.path(name)
+    values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else read_pixels(path)
+    if values.shape != (height, width):
+        raise ValueError(
+            f"mask {path} has shape {values.shape}, its image {name} is {height} x {width} (height x width); make "
+            "masks of the size of the (undistorted) image"
+        )
+    found, inverse = np.unique(values, return_inverse=True)
+    table = torch.tensor([names.class_of.get(int(value), NO_CLASS) for value in found])
+    return table[torch.from_numpy(inverse.reshape(values.shape))]
+
+
+def gaussian_truth(
+    evidence: Evidence, classes: int, *, purity: float = 0.75, min_weight: float = 1.0
+) -> Int64[Tensor, " n"]:
+    """Class of every Gaussian from evidence of the exact masks, whose columns are the classes view by view.
+
+    Args:
+        purity: least share of the class in the weight of the Gaussian, pixels that do not count included.
+        min_weight: least weight in all views together, in pixels; -1 below either.
+    """
+    columns = torch.arange(evidence.num_regions) % classes
+    by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.weight))
+    total = by_class.sum(1) + evidence.unlabeled.row_sums().to(by_class)
+    best = by_class.max(dim=1)
+    known = (total >= min_weight) & (best.values >= purity * total)
+    return torch.where(known, best.indices, NO_CLASS)
+
+
+def evaluate_masks(
+    names: Sequence[str],
+    truth: Int64[Tensor, " n"],
+    found: Int64[Tensor, " n"],
+    pixels: Sequence[tuple[Int64[Tensor, "h w"], Int64[Tensor, "h w"]]],
+    reliability: Float[Tensor, " n"],
+    settings: Mapping[str, object],
+) -> Evaluation:
+    """miou_3d and macc_3d over Gaussians, miou_2d and macc_2d over the pixels of all held-out views together.
+
+    Args:
+        pixels: truth and answer of every held-out view.
+    """
+    classes = len(names)
+    of_gaussians = class_scores(confusion(truth, found, classes))
+    counts = sum((confusion(t, f, classes) for t, f in pixels), torch.zeros(classes, classes + 1, dtype=torch.int64))
+    of_pixels = class_scores(counts)
+    known = truth >= 0
+    correct = (found == truth)[known].double()
+    results = {
+        "miou_3d": of_gaussians.miou,
+        "macc_3d": of_gaussians.macc,
+        "accuracy_3d": float(correct.mean()) if len(correct) > 0 else float("nan"),
+        "miou_2d": of_pixels.miou,
+        "macc_2d": of_pixels.macc,
+        "gaussians_with_truth_share": float(known.double().mean()),
+        "zero_evidence_share": float((reliability == 0).double().mean()),
+    }
+    rows = [
+        {"class": name, "gaussians": int((truth == c).sum()), **_row(of_gaussians, c, "3d"), **_row(of_pixels, c, "2d")}
+        for c, name in enumerate(names)
+    ]
+    return Evaluation(results, rows, {"protocol": "masks", **settings})
+
+
+def _row(scores: ClassScores, c: int, suffix: str) -> dict[str, float]:
+    return {f"iou_{suffix}": float(scores.iou[c]), f"accuracy_{suffix}": float(scores.accuracy[c])}

@@ -1,0 +1,179 @@
+"""The three protocols on lifted runs: from files and options to figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from normlift_ns.core.evidence import UNLABELED
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.metrics import WithoutDirection, classify
+from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
+from normlift_ns.encoders.regions import LabelFiles
+from normlift_ns.encoders.source import TextEncoder
+from normlift_ns.evaluation.instance_masks import evaluate_masks, gaussian_truth, read_classes, read_names
+from normlift_ns.evaluation.lerf import MARGIN, Average, FrameScores, Rule, frame_rows, summarize_lerf
+from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
+from normlift_ns.evaluation.results import Evaluation
+from normlift_ns.evaluation.scannet import NYU40, SceneLabels, check_identity, evaluate_scannet, read_labels
+from normlift_ns.raster.rasterize import rasterize_evidence, render
+
+if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
+    from normlift_ns.core.gaussians import Camera
+    from normlift_ns.plugin.adapters import SourceRun
+
+
+@dataclass(frozen=True)
+class ScannetOptions:
+    """Protocol scannet; --labels gives one *_vh_clean_2.labels.ply per run."""
+
+    min_opacity: float = 0.1
+    """Truth of fainter Gaussians does not count; 0: all count."""
+    without_direction: WithoutDirection = "first"
+    """Gaussians without direction are wall (first, as in published scripts) or of no class (none); the other is
+    reported beside it."""
+
+
+@dataclass(frozen=True)
+class LerfOptions:
+    """Protocol lerf; --labels gives one folder of label files per run."""
+
+    rule: Rule = "background"
+    """background: above all background words by the margin; auto: SFS's threshold from the histogram; langsplat: the
+    relevancy of LERF, scaled."""
+    margin: float = MARGIN
+    """Of rule background; SFS's code has 0."""
+    average: Average = "frames"
+    """frames: categories of a frame, then frames; pairs: all frames and categories alike; categories: frames of a
+    category, then categories."""
+    clean: bool = False
+    """Open, close, keep the largest component and fill its holes, as SFS's code does and the paper does not say."""
+    scale: Literal["unit", "norm"] = "unit"
+    """What is composited: cosines, or cosines times ||f||, the length of features as SFS lifts them."""
+
+
+@dataclass(frozen=True)
+class MaskOptions:
+    """Protocol masks; --labels gives a folder of instance masks, PNG or NPY, named as the images."""
+
+    names: Path | None = None
+    """JSON file with the name of every value of the masks; by default labels.json beside their folder."""
+    purity: float = 0.75
+    """Least share of one class in the weight of a Gaussian that has a truth."""
+    min_weight: float = 1.0
+    """Least weight of a Gaussian that has a truth, in pixels over all training views."""
+
+
+@dataclass(frozen=True)
+class LiftedRun:
+    """A run and its semantics."""
+
+    run: SourceRun
+    field: SemanticField
+    encoder: TextEncoder
+    refined: bool
+
+    def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
+        """Of every Gaussian's direction to the texts, 0 without direction."""
+        return self.field.query(self.encoder.text(names), refined=self.refined).float()
+
+    @property
+    def valid(self) -> Bool[Tensor, " n"]:
+        """Gaussians with a direction."""
+        return self.field.valid(refined=self.refined)
+
+    def composited(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
+        """[H, W, Q] and alpha [H, W]."""
+        return render(self.run.scene, camera, values, rasterize_mode=self.run.rasterize_mode)
+
+    def cameras(self) -> dict[str, Camera]:
+        """Of all photographs, trained and held out, by the stem of the image."""
+        views = (self.run.train, self.run.held_out)
+        return {Path(name).stem: camera for some in views for name, camera in zip(some.names, some.cameras)}
+
+
+def run_scannet(runs: Iterator[LiftedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
+    """Protocol scannet over one run per scene.
+
+    Raises:
+        FileNotFoundError, ValueError: labels that are missing, damaged or of another number of points.
+    """
+    truths = [read_labels(path) for path in labels]
+    scenes = []
+    for path, nyu40, lifted in zip(labels, truths, runs):
+        name = path.name.split("_vh_clean")[0]
+        check_identity(name, len(lifted.run.scene), nyu40, path)
+        cosine = lifted.cosine(tuple(NYU40.values()))
+        scenes.append(SceneLabels(name, cosine, lifted.valid, lifted.run.scene.opacities, nyu40))
+    return evaluate_scannet(scenes, min_opacity=options.min_opacity, without_direction=options.without_direction)
+
+
+def run_lerf(runs: Iterator[LiftedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
+    """Protocol lerf over one run per scene; all frames of all scenes count alike in `average`.
+
+    Raises:
+        FileNotFoundError, ValueError: labels that are missing, damaged or of other images.
+    """
+    files = [read_frames(folder) for folder in labels]
+    rows, missing = [], []
+    for folder, given, lifted in zip(labels, files, runs):
+        cameras = lifted.cameras()
+        found, absent = match_views(given, cameras)
+        missing += [f"{folder.name}/{stem}" for stem in absent]
+        for file in found:
+            camera = cameras[file.stem]
+            frame = read_frame(file, camera.width, camera.height)
+            scores = _frame_scores(lifted, camera, frame, options)
+            rows += [
+                {"scene": folder.name, **row, "frame": f"{folder.name}/{frame.stem}"}
+                for row in frame_rows(scores, options.rule, margin=options.margin, clean=options.clean)
+            ]
+    settings = {**asdict(options), "labels_without_image": missing}
+    return summarize_lerf(rows, options.average, settings)
+
+
+def _frame_scores(lifted: LiftedRun, camera: Camera, frame: LabeledFrame, options: LerfOptions) -> FrameScores:
+    prompts, langsplat = tuple(frame.masks), options.rule == "langsplat"
+    cosine = lifted.cosine((*prompts, *(CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS)))
+    if options.scale == "norm":
+        cosine = cosine * lifted.field.scalars.norm[:, None].to(cosine)
+    values, _ = lifted.composited(camera, cosine)
+    values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
+    return FrameScores(frame, relevancy(values, background, form="lerf") if langsplat else values, background)
+
+
+def run_masks(lifted: LiftedRun, folder: Path, options: MaskOptions) -> Evaluation:
+    """Protocol masks on one run: 3D over Gaussians whose truth the masks of the training views tell, 2D in held-out
+    views.
+
+    Raises:
+        FileNotFoundError, ValueError: masks or names that are missing or damaged; the message names the file.
+    """
+    run, names = lifted.run, read_names(options.names or folder.parent / "labels.json")
+    masks = LabelFiles(folder)
+
+    def classes(name: str, camera: Camera) -> Tensor:
+        return read_classes(masks, name, names, camera.height, camera.width)
+
+    count = len(names.classes)
+    cosine, valid = lifted.cosine(names.classes), lifted.valid
+    evidence = rasterize_evidence(
+        run.scene,
+        run.train.cameras,
+        (classes(name, camera).int().clamp(min=UNLABELED) for name, camera in zip(run.train.names, run.train.cameras)),
+        num_regions=[count] * len(run.train),
+        rasterize_mode=run.rasterize_mode,
+    )
+    truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
+    pixels = []
+    for name, camera in zip(run.held_out.names, run.held_out.cameras):
+        values, alpha = lifted.composited(camera, cosine)
+        pixels.append((classes(name, camera), classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)))
+    settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(pixels)}
+    found, reliability = classify(cosine, valid), lifted.field.scalars.reliability
+    return evaluate_masks(names.classes, truth, found, pixels, reliability, settings)

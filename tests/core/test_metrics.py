@@ -1,0 +1,131 @@
+"""Metrics against loops over sets and cases worked by hand."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns.core.metrics import (
+    bin_means,
+    class_scores,
+    classify,
+    confusion,
+    kendall,
+    localized,
+    lowest_jaccard,
+    mask_iou,
+    mask_recall,
+    spearman,
+)
+
+
+def scores_by_sets(truth: list[int], found: list[int], classes: int) -> tuple[list[float], list[float]]:
+    """The definition of the ScanNet protocol, with sets of points."""
+    counted = {i for i, t in enumerate(truth) if t >= 0}
+    ious, accuracies = [], []
+    for c in range(classes):
+        t = {i for i in counted if truth[i] == c}
+        f = {i for i in counted if found[i] == c}
+        ious.append(len(t & f) / len(t | f) if t else math.nan)
+        accuracies.append(len(t & f) / len(t) if t else math.nan)
+    return ious, accuracies
+
+
+def mean_of_present(values: list[float]) -> float:
+    present = [value for value in values if not math.isnan(value)]
+    return sum(present) / len(present) if present else math.nan
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), min_size=1, max_size=40))
+def test_scores_equal_their_definition_by_sets(pairs):
+    truth, found = (list(x) for x in zip(*pairs))
+    scores = class_scores(confusion(torch.tensor(truth), torch.tensor(found), 5))
+    ious, accuracies = scores_by_sets(truth, found, 5)
+    assert scores.iou.tolist() == pytest.approx(ious, nan_ok=True)
+    assert scores.accuracy.tolist() == pytest.approx(accuracies, nan_ok=True)
+    assert scores.miou == pytest.approx(mean_of_present(ious), nan_ok=True)
+    assert scores.macc == pytest.approx(mean_of_present(accuracies), nan_ok=True)
+
+
+def test_absent_classes_and_ignored_points_by_hand():
+    truth = torch.tensor([0, 0, 0, 1, 1, -1, -1])
+    found = torch.tensor([0, 0, 2, 1, 0, 1, 0])  # class 2 is absent: a false find of it hurts class 0 only
+    scores = class_scores(confusion(truth, found, 4))
+    assert scores.iou[:2].tolist() == [2 / 4, 1 / 2]  # ignored points are in no union
+    assert scores.accuracy[:2].tolist() == [2 / 3, 1 / 2]
+    assert scores.iou[2:].isnan().all()
+    assert scores.miou == 0.5
+
+
+def test_confusion_works_on_images_and_refuses_unknown_classes():
+    truth = torch.tensor([[0, 1], [1, -1]])
+    assert confusion(truth, truth, 2).tolist() == [[1, 0, 0], [0, 2, 0]]
+    with pytest.raises(ValueError, match=r"found holds class 2, expected 0\.\.1"):
+        confusion(truth, truth + 1, 2)
+    assert math.isnan(class_scores(confusion(torch.tensor([-1]), torch.tensor([0]), 2)).miou)
+
+
+def test_gaussians_without_direction_are_no_class_or_the_first_one():
+    cosine = torch.tensor([[0.1, 0.3], [0.0, 0.0], [0.2, 0.2]])
+    valid = torch.tensor([True, False, True])
+    assert classify(cosine, valid).tolist() == [1, -1, 0]
+    assert classify(cosine, valid, without_direction="first").tolist() == [1, 0, 0]
+    truth = torch.tensor([1, 1, 0])
+    ours = class_scores(confusion(truth, classify(cosine, valid), 2))
+    published = class_scores(confusion(truth, classify(cosine, valid, without_direction="first"), 2))
+    assert ours.iou.tolist() == [1, 0.5]
+    assert published.iou.tolist() == [0.5, 0.5]  # the wall pays for points that nobody saw
+
+
+def test_masks_by_hand():
+    a, b = torch.tensor([[1, 1], [0, 0]]).bool(), torch.tensor([[1, 0], [1, 0]]).bool()
+    none = torch.zeros_like(a)
+    assert (mask_iou(a, b), mask_recall(a, b)) == (1 / 3, 1 / 2)
+    assert mask_iou(none, none) == 1
+    assert mask_iou(none, a) == 0
+    assert math.isnan(mask_recall(a, none))
+
+
+def test_localisation_with_ties():
+    score = torch.tensor([[0.5, 0.1], [0.5, 0.2]])
+    assert localized(score, torch.tensor([[True, False], [False, False]]))
+    lower = torch.tensor([[False, False], [True, False]])
+    assert not localized(score, lower)
+    assert localized(score, lower, any_peak=True)
+    assert not localized(score, ~lower & torch.tensor([[False, True], [True, True]]), any_peak=True)
+
+
+def mean_ranks(x: list[float]) -> list[float]:
+    return [sum(y < v for y in x) + (sum(y == v for y in x) + 1) / 2 for v in x]
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=2, max_size=15))
+def test_rank_correlations_equal_their_definitions(pairs):
+    a, b = ([float(x) for x in side] for side in zip(*pairs))
+    n = len(a)
+    found = spearman(torch.tensor(a), torch.tensor(b)), kendall(torch.tensor(a), torch.tensor(b))
+    if len(set(a)) == 1 or len(set(b)) == 1:
+        assert all(map(math.isnan, found))
+        return
+    ra, rb = (torch.tensor(mean_ranks(x), dtype=torch.float64) for x in (a, b))
+    expected = float(torch.corrcoef(torch.stack([ra, rb]))[0, 1])
+    assert found[0] == pytest.approx(expected, abs=1e-12)
+    signs = [((a[i] > a[j]) - (a[i] < a[j]), (b[i] > b[j]) - (b[i] < b[j])) for i in range(n) for j in range(i)]
+    total = sum(x * y for x, y in signs)
+    untied = [sum(abs(pair[side]) for pair in signs) for side in (0, 1)]
+    assert found[1] == pytest.approx(total / math.sqrt(untied[0] * untied[1]), abs=1e-12)
+
+
+def test_jaccard_of_the_lowest_and_bins_by_hand():
+    a, b = torch.arange(10.0), torch.tensor([1.0, 9, 0, 8, 7, 6, 5, 4, 3, 2])
+    assert lowest_jaccard(a, b, 0.2) == 1 / 3  # {0, 1} and {2, 0}
+    assert lowest_jaccard(a, a, 0.2) == 1
+    assert lowest_jaccard(torch.zeros(10), a, 0.2) == 1  # ties go in by index
+    keys, values = bin_means(torch.tensor([3.0, 1, 2, 4]), torch.tensor([0.0, 1, 1, 0]), 2)
+    assert (keys.tolist(), values.tolist()) == ([1.5, 3.5], [1, 0])
+    with pytest.raises(ValueError, match="5 bins need"):
+        bin_means(torch.zeros(4), torch.zeros(4), 5)

@@ -1,0 +1,74 @@
+"""Truth of Gaussians from masks, names and figures of protocol masks; results on disk."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from normlift_ns import Evidence
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.encoders.regions import LabelFiles
+from normlift_ns.evaluation.instance_masks import evaluate_masks, gaussian_truth, read_classes, read_names
+from normlift_ns.evaluation.results import Evaluation, write_evaluation
+
+
+def test_names_join_equal_classes(tmp_path):
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps({"labels": {"1": "chair", "2": "table", "7": "chair"}, "background": 0}))
+    names = read_names(path)
+    assert names.classes == ("chair", "table")
+    assert names.class_of == {1: 0, 2: 1, 7: 0}
+    path.write_text('{"3": "cup"}')
+    assert read_names(path).class_of == {3: 0}
+    for content in ("[1]", '{"labels": {}}', '{"labels": {"a": "b"}}', "{"):
+        path.write_text(content)
+        with pytest.raises(ValueError, match="names no masks"):
+            read_names(path)
+    with pytest.raises(FileNotFoundError, match="do not exist"):
+        read_names(tmp_path / "none.json")
+
+
+def test_masks_become_classes(tmp_path):
+    (tmp_path / "m").mkdir()
+    (tmp_path / "labels.json").write_text('{"labels": {"1": "a", "2": "b", "7": "a"}}')
+    Image.fromarray(np.array([[0, 1], [2, 7], [9, 1]], dtype=np.uint8)).save(tmp_path / "m" / "0001.png")
+    masks, names = LabelFiles(tmp_path / "m"), read_names(tmp_path / "labels.json")
+    assert read_classes(masks, "images/0001.jpg", names, 3, 2).tolist() == [[-1, 0], [1, 0], [-1, 0]]
+    with pytest.raises(ValueError, match=r"0001\.png has shape \(3, 2\), its image .* is 4 x 2"):
+        read_classes(masks, "images/0001.jpg", names, 4, 2)
+    with pytest.raises(FileNotFoundError, match="0002"):
+        read_classes(masks, "images/0002.jpg", names, 3, 2)
+
+
+def test_truth_needs_purity_and_weight():
+    # columns: class 0 and 1 of view 0, class 0 and 1 of view 1
+    weight = torch.tensor([[3.0, 0.2, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 3.0, 0.0, 0.0]])
+    row, column = weight.nonzero(as_tuple=True)
+    rows = SparseRows.from_coo(row, column, weight[row, column], 4)
+    blank = SparseRows.from_coo(torch.tensor([3]), torch.tensor([1]), torch.tensor([2.0]), 4)
+    evidence = Evidence(rows.offsets, rows.column, rows.weight, torch.tensor([0, 0, 1, 1]).int(), blank, 2)
+    assert gaussian_truth(evidence, 2).tolist() == [0, -1, -1, -1]  # pure; mixed; too light; mostly background
+    assert gaussian_truth(evidence, 2, min_weight=0.1, purity=0.5).tolist() == [0, 0, 1, 1]
+
+
+def test_figures_by_hand(tmp_path):
+    truth, found = torch.tensor([0, 0, 1, -1]), torch.tensor([0, -1, 1, 0])
+    image = torch.tensor([[0, 1], [1, -1]])
+    evaluation = evaluate_masks(
+        ["a", "b"], truth, found, [(image, torch.zeros_like(image))], torch.tensor([1.0, 0, 1, 1]), {}
+    )
+    results = evaluation.results
+    assert (results["miou_3d"], results["accuracy_3d"]) == ((1 / 2 + 1) / 2, pytest.approx(2 / 3))
+    assert (results["miou_2d"], results["macc_2d"]) == ((1 / 3 + 0) / 2, 1 / 2)
+    assert (results["zero_evidence_share"], results["gaussians_with_truth_share"]) == (0.25, 0.75)
+    assert evaluation.rows[0]["gaussians"] == 2
+
+    with_gap = Evaluation({**results, "none": math.nan}, evaluation.rows, evaluation.settings)
+    write_evaluation(tmp_path / "o" / "out.json", with_gap, experiment_name="e", method_name="m", checkpoint="c")
+    document = json.loads((tmp_path / "o" / "out.json").read_text())
+    assert list(document)[:4] == ["experiment_name", "method_name", "checkpoint", "results"]  # as ns-eval
+    assert document["results"]["none"] is None
+    assert document["settings"] == {"protocol": "masks"}

@@ -1,0 +1,131 @@
+"""The LERF-OVS protocol by hand: labels, thresholds, cleaning, localisation, averages."""
+
+import json
+
+import pytest
+import torch
+
+from normlift_ns.evaluation.lerf import (
+    FrameScores,
+    box_filtered,
+    cleaned,
+    found_mask,
+    frame_rows,
+    histogram_threshold,
+    in_boxes,
+    summarize_lerf,
+)
+from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
+
+
+def write_frame(folder, stem, objects, width=40, height=30):
+    info = {"name": f"{stem}.jpg", "width": width, "height": height}
+    folder.mkdir(exist_ok=True)
+    (folder / f"{stem}.json").write_text(json.dumps({"info": info, "objects": objects}))
+    return folder / f"{stem}.json"
+
+
+def square(category, x, y, size=5, **more):
+    corners = [[x, y], [x + size, y], [x + size, y + size], [x, y + size]]
+    return {"category": category, "segmentation": corners, **more}
+
+
+def test_polygons_are_filled_joined_and_scaled(tmp_path):
+    file = write_frame(
+        tmp_path / "ramen",
+        "frame_00006",
+        [square("egg", 2, 3), square("egg", 20, 10, bbox=[20, 10, 25, 15]), square("bowl", 4, 4)],
+    )
+    frame = read_frame(file, 40, 30)
+    assert list(frame.masks) == ["egg", "bowl"]
+    egg = torch.zeros(30, 40, dtype=torch.bool)
+    egg[3:9, 2:8] = egg[10:16, 20:26] = True  # fillPoly draws its outline too
+    assert torch.equal(frame.masks["egg"], egg)
+    assert frame.boxes["egg"] == [(2, 3, 7, 8), (20, 10, 25, 15)]
+    half = read_frame(file, 20, 15)
+    assert half.masks["egg"].shape == (15, 20)
+    assert half.boxes["egg"][1] == (10, 5, 12.5, 7.5)
+    with pytest.raises(ValueError, match="labels an image of 40 x 30 pixels, the run's is 40 x 40"):
+        read_frame(file, 40, 40)
+
+
+def test_files_that_do_not_fit(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no label files"):
+        read_frames(tmp_path)
+    good = write_frame(tmp_path, "frame_1", [square("egg", 0, 0)])
+    bad = write_frame(tmp_path, "frame_2", [{"category": "egg", "segmentation": [[1, 2]]}])
+    with pytest.raises(ValueError, match=r"frame_2\.json is no label file of LERF-OVS"):
+        read_frame(bad, 40, 30)
+    assert match_views([good, bad], {"frame_1": None}) == ([good], ["frame_2"])
+    with pytest.raises(ValueError, match="none of the 2 label files"):
+        match_views([good, bad], {"other": None})
+
+
+def frame_of(masks, boxes=None):
+    return LabeledFrame("f", masks, boxes or {name: [(0.0, 0.0, 1.0, 1.0)] for name in masks})
+
+
+def test_margin_over_the_best_background_word():
+    truth = torch.tensor([[True, True, False, False]])
+    prompt = torch.tensor([[[0.30], [0.215], [0.23], [0.10]]])
+    background = torch.tensor([[[0.20, 0.1], [0.1, 0.20], [0.20, 0.2], [0.2, 0.2]]])
+    scores = FrameScores(frame_of({"egg": truth}), prompt, background)
+    (row,) = frame_rows(scores, "background", margin=0.02, clean=False)
+    assert (row["iou"], row["accuracy"], row["localized"]) == (1 / 3, 1 / 2, 1.0)
+    (row,) = frame_rows(scores, "background", margin=0.0, clean=False)
+    assert row["iou"] == 2 / 3  # SFS's margin lets the second pixel in
+
+
+def test_histogram_threshold_is_the_valley_left_of_the_kth_peak():
+    g = torch.Generator().manual_seed(0)
+    parts = [
+        centre + 0.01 * torch.randn(count, generator=g) for centre, count in ((0.1, 9000), (0.5, 4000), (0.9, 3000))
+    ]
+    score = torch.cat(parts).view(100, 160)
+    assert 0.55 < histogram_threshold(score, 1) < 0.89
+    assert 0.12 < histogram_threshold(score, 2) < 0.49
+    flat = torch.full((10, 10), 0.3)
+    assert histogram_threshold(flat, 1) == pytest.approx(0.3)
+    background = torch.zeros(100, 160, 0)
+    assert int(found_mask(score, background, "auto", margin=0, instances=1).sum()) == 3000
+
+
+def test_cleaning_keeps_the_largest_component_without_holes():
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[5:25, 5:25] = True
+    mask[12:16, 12:16] = False  # a hole that closing leaves
+    mask[30:36, 30:36] = True  # a smaller component
+    mask[2, 35] = True  # a speck
+    expected = torch.zeros_like(mask)
+    expected[5:25, 5:25] = True
+    assert torch.equal(cleaned(mask), expected)
+    assert not cleaned(torch.zeros(8, 8, dtype=torch.bool)).any()
+
+
+def test_langsplat_reading():
+    relevancy = torch.zeros(90, 90)
+    relevancy[30:60, 30:60] = 1.0
+    average, mixed = box_filtered(relevancy)
+    assert float(average.max()) == pytest.approx(1, abs=1e-5)
+    assert float(mixed[45, 31]) == pytest.approx((1 + float(average[45, 31])) / 2)
+    truth = relevancy.bool()
+    scores = FrameScores(
+        frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]}),
+        relevancy[..., None],
+        relevancy[..., None][..., :0],
+    )
+    (row,) = frame_rows(scores, "langsplat", margin=0, clean=False)
+    assert 0.8 < row["iou"] < 0.87  # corners, where the mean is below 0.4, are cut off: 15 % of the square
+    assert row["localized"] == 1
+    elsewhere = scores._replace(frame=frame_of({"egg": truth}, {"egg": [(0.0, 0.0, 9.0, 9.0)]}))
+    assert frame_rows(elsewhere, "langsplat", margin=0, clean=False)[0]["localized"] == 0
+    assert in_boxes([(1.0, 0.0, 2.0, 1.0)], 3, 4).nonzero().tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
+
+
+def test_order_of_averages_by_hand():
+    def row(frame, category, iou):
+        return {"frame": frame, "category": category, "iou": iou, "accuracy": iou, "localized": 1.0}
+
+    rows = [row("a", "egg", 1.0), row("b", "egg", 0.0), row("b", "bowl", 0.5), row("b", "nori", 0.0)]
+    miou = {order: summarize_lerf(rows, order, {}).results["miou"] for order in ("frames", "pairs", "categories")}
+    assert miou == pytest.approx({"frames": (1 + 1 / 6) / 2, "pairs": 1.5 / 4, "categories": (0.5 + 0.5 + 0) / 3})

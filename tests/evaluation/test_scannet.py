@@ -1,0 +1,117 @@
+"""The ScanNet protocol against a loop over points, and by hand; labels in ScanNet's file format."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from normlift_ns.evaluation.scannet import (
+    CLASS_SETS,
+    NYU40,
+    SceneLabels,
+    check_identity,
+    evaluate_scannet,
+    read_labels,
+    scene_scores,
+)
+from tests.scenes import generator
+
+
+def random_scene(seed: int, n: int = 400) -> SceneLabels:
+    g = generator(seed)
+    cosine = torch.rand(n, 19, generator=g)
+    valid = torch.rand(n, generator=g) > 0.2
+    nyu40 = torch.randint(0, 41, (n,), generator=g)
+    return SceneLabels(
+        f"scene{seed}", torch.where(valid[:, None], cosine, 0.0), valid, torch.rand(n, generator=g), nyu40
+    )
+
+
+def loop(scene: SceneLabels, classes: int, first: bool) -> tuple[float, float]:
+    """OpenGaussian's protocol, point by point: labels 1..C, 0 ignored, opacity rule, prediction of ignored points 0."""
+    ids = CLASS_SETS[classes]
+    columns = [list(NYU40).index(i) for i in ids]
+    truth, found = [], []
+    for j in range(len(scene.nyu40)):
+        label = ids.index(int(scene.nyu40[j])) + 1 if int(scene.nyu40[j]) in ids else 0
+        label = 0 if float(scene.opacity[j]) < 0.1 else label
+        scores = [float(scene.cosine[j, c]) for c in columns]
+        answer = scores.index(max(scores)) + 1  # all 0 without direction: class 1
+        answer = answer if first or bool(scene.valid[j]) else -1
+        truth.append(label)
+        found.append(answer if label > 0 else 0)
+    ious, recalls = [], []
+    for c in range(1, classes + 1):
+        hits = sum(t == c and f == c for t, f in zip(truth, found))
+        union = sum(c in (t, f) for t, f in zip(truth, found))
+        if c in truth:
+            ious.append(hits / union)
+            recalls.append(hits / truth.count(c))
+    return sum(ious) / len(ious), sum(recalls) / len(recalls)
+
+
+@pytest.mark.parametrize("classes", CLASS_SETS)
+def test_equals_the_loop(classes):
+    scenes = [random_scene(seed, n=150 + 100 * seed) for seed in range(3)]
+    found = evaluate_scannet(scenes)
+    for suffix, first in (("", True), ("_none", False)):
+        expected = [loop(scene, classes, first) for scene in scenes]
+        assert found.results[f"miou_{classes}{suffix}"] == pytest.approx(sum(x for x, _ in expected) / 3, abs=1e-12)
+        assert found.results[f"macc_{classes}{suffix}"] == pytest.approx(sum(x for _, x in expected) / 3, abs=1e-12)
+    assert found.results[f"miou_{classes}"] != found.results[f"miou_{classes}_none"]
+
+
+def test_sets_are_those_of_the_protocol():
+    assert [len(ids) for ids in CLASS_SETS.values()] == [19, 15, 10]
+    assert {NYU40[i] for i in CLASS_SETS[19]} - {NYU40[i] for i in CLASS_SETS[15]} == {
+        "picture", "refrigerator", "showercurtain", "bathtub"
+    }  # fmt: skip
+    assert {NYU40[i] for i in CLASS_SETS[15]} - {NYU40[i] for i in CLASS_SETS[10]} == {
+        "cabinet", "counter", "desk", "curtain", "sink"
+    }  # fmt: skip
+
+
+def test_opacity_absent_classes_and_missing_directions_by_hand():
+    names = list(NYU40)
+    nyu40 = torch.tensor([1, 2, 2, 5, 40, 2])  # wall, floor, floor, chair, a class outside all sets, floor
+    cosine = torch.zeros(6, 19)
+    for j, seen in enumerate((1, 2, 5, 5, 5)):
+        cosine[j, names.index(seen)] = 0.3
+    valid = torch.tensor([True, True, True, True, True, False])
+    opacity = torch.tensor([0.9, 0.9, 0.9, 0.05, 0.9, 0.9])  # the chair is too faint to count
+    scene = SceneLabels("s", cosine, valid, opacity, nyu40)
+    scores = scene_scores(scene, 10)
+    assert scores.iou[0] == 1 / 2  # the last floor, never seen, is called wall
+    assert scores.iou[1] == 1 / 3
+    assert scores.iou[2:].isnan().all()  # no chair that counts; the floor called chair hurts the floor alone
+    assert scene_scores(scene, 10, without_direction="none").iou[0] == 1
+    assert scene_scores(scene, 10, min_opacity=0).iou[3] == 1 / 2
+    evaluation = evaluate_scannet([scene])
+    assert {row["class"] for row in evaluation.rows} == {"wall", "floor"}
+    assert evaluation.results["without_direction_share"] == pytest.approx(1 / 6)
+    assert not any(math.isnan(value) for value in evaluation.results.values())
+
+
+def write_labels(path, labels, name="label"):
+    vertices = np.zeros(len(labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), (name, "u2")])
+    vertices[name] = labels
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+
+
+def test_labels_in_scannets_format(tmp_path):
+    path = tmp_path / "scene0000_00_vh_clean_2.labels.ply"
+    write_labels(path, [1, 36, 0, 40])
+    assert read_labels(path).tolist() == [1, 36, 0, 40]
+    check_identity("s", 4, read_labels(path), path)
+    with pytest.raises(ValueError, match=r"has 5 Gaussians, .*labels\.ply 4 vertices"):
+        check_identity("s", 5, read_labels(path), path)
+    write_labels(path, [1], name="class")
+    with pytest.raises(ValueError, match=r"no vertex property label \(found x, y, z, red, class\)"):
+        read_labels(path)
+    path.write_bytes(b"ply\nformat")
+    with pytest.raises(ValueError, match="damaged or no PLY file"):
+        read_labels(path)
+    with pytest.raises(FileNotFoundError, match="do not exist"):
+        read_labels(tmp_path / "none.ply")

@@ -1,0 +1,145 @@
+"""ns-normlift-eval on a lifted demo room: its protocols as a user types them, with stand-in vectors and labels."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES
+from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.evaluation.scannet import NYU40
+from normlift_ns.scripts import evaluate, lift
+
+
+def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
+    try:
+        entrypoint()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+@pytest.fixture(scope="module")
+def room() -> DemoRoom:
+    return demo_room(3000)
+
+
+@pytest.fixture(scope="module")
+def workspace(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Holds the capture in room/ and the lifted run in outputs/."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    write_capture(room, folder / "room", views=8, held_out=2, width=128, height=96)
+    trained = write_splatfacto_run(room, folder / "room", folder / "outputs")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        flags = ("--encoder", "colour", "--k", "12", "--timestamp", "t", "--region-count", "400")
+        assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *flags) == 0
+    return folder
+
+
+def evaluated(monkeypatch, workspace: Path, protocol: str, labels: Path, *flags: object) -> dict:
+    config, output = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml", workspace / f"{protocol}.json"
+    given = ("--protocol", protocol, "--load-config", config, "--labels", labels, "--output-path", output)
+    assert run_entry(monkeypatch, evaluate.entrypoint, *given, *flags) == 0
+    return json.loads(output.read_text())
+
+
+def stand_ins(path: Path, words: dict[str, str]) -> Path:
+    """Vectors of words, each that of a colour."""
+    vectors = ColourEncoder().text(list(words.values())).numpy()
+    np.savez(path, **dict(zip(words, vectors)))
+    return path
+
+
+def test_masks_of_a_capture(workspace, monkeypatch, capsys):
+    document = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance")
+    results = document["results"]
+    assert document["experiment_name"] == "room"
+    assert document["method_name"] == "normlift"
+    assert results["miou_3d"] > 0.5
+    assert results["miou_2d"] > 0.4
+    assert 0.5 < results["gaussians_with_truth_share"] < 1
+    assert len(document["rows"]) == 13
+    assert document["settings"]["held_out_views"] == 2
+    assert "miou_3d" in capsys.readouterr().out
+    plain = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", "--refined", False)
+    assert plain["results"]["miou_3d"] != results["miou_3d"]
+
+
+def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
+    ids = list(NYU40)[: len(room.names)]
+    vertices = np.zeros(len(room.labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u2")])
+    vertices["label"] = [ids[label] if label >= 0 else 0 for label in room.labels.tolist()]
+    path = workspace / "scene0000_00_vh_clean_2.labels.ply"
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+    colours = [*room.names, *["black", "white", "grey", "beige", "magenta", "lime"]]
+    vectors = stand_ins(workspace / "names.npz", dict(zip(NYU40.values(), colours)))
+    document = evaluated(monkeypatch, workspace, "scannet", path, "--text-vectors", vectors)
+    results = document["results"]
+    assert document["settings"]["scenes"] == ["scene0000_00"]
+    assert len(document["settings"]["missing_scenes"]) == 9
+    assert results["miou_19"] > 0.5
+    assert results["miou_10"] >= results["miou_19"] - 0.2
+    assert {row["class"] for row in document["rows"] if row["classes"] == 19} == {NYU40[i] for i in ids}
+
+
+def write_polygons(folder: Path, instance: Path, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
+    values = np.array(Image.open(instance))
+    objects = []
+    for name in wanted:
+        mask = (values == names.index(name) + 1).astype(np.uint8)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        objects += [{"category": name, "segmentation": o[:, 0].tolist()} for o in outlines if len(o) > 8]
+    folder.mkdir(parents=True, exist_ok=True)
+    info = {"name": instance.name, "width": values.shape[1], "height": values.shape[0]}
+    (folder / f"{instance.stem}.json").write_text(json.dumps({"info": info, "objects": objects}))
+
+
+def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
+    wanted, labels = ("sky blue", "bright blue", "dark green"), workspace / "label" / "room"
+    for stem in ("0000", "0008"):  # a training view and a held-out one
+        write_polygons(labels, workspace / "room" / "instance" / f"{stem}.png", room.names, wanted)
+    (labels / "0099.json").write_text((labels / "0000.json").read_text())
+    words = {**{name: name for name in wanted}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
+    words |= {"floor": "light brown", "object": "chocolate brown", "things": "grey"}
+    vectors = stand_ins(workspace / "words.npz", words)
+    assert set(CANONICAL_NEGATIVES) <= set(words)
+    found = {}
+    for rule in ("background", "langsplat", "auto"):
+        flags = ("--rule", rule, "--text-vectors", vectors)
+        found[rule] = evaluated(monkeypatch, workspace, "lerf", labels, *flags)
+    results = found["background"]["results"]
+    assert results["loc_acc"] > 0.6
+    assert results["miou"] > 0.3
+    assert found["background"]["settings"]["labels_without_image"] == ["room/0099"]
+    assert {row["frame"] for row in found["auto"]["rows"]} <= {"room/0000", "room/0008"}
+    cleaned = evaluated(monkeypatch, workspace, "lerf", labels, "--clean", True, "--text-vectors", vectors)
+    assert cleaned["results"]["miou"] != results["miou"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--protocol", "masks"), "folder of label maps"),
+        (("--protocol", "lerf"), "holds no label files"),
+        (("--protocol", "scannet"), "do not exist"),
+    ],
+)
+def test_missing_files_are_named(workspace, monkeypatch, capsys, flags, message):
+    config = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml"
+    (workspace / "labels.json").write_text('{"1": "red"}')
+    given = ("--load-config", config, "--labels", workspace / "none", "--output-path", workspace / "no.json")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *given, *flags) == 1
+    shown = capsys.readouterr().out
+    assert message in shown
+    assert not (workspace / "no.json").exists()
+    assert torch.is_grad_enabled()

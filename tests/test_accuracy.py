@@ -1,0 +1,198 @@
+"""The controlled benchmark: what damage is, that no damage is none, and that its shortcuts are exact."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.accuracy import KEYS, Bench, summarize
+from benchmarks.damage import LADDER, Damage, Lengths, observe
+from benchmarks.fit import MOST, observation
+from benchmarks.pages import documents, page
+from benchmarks.report import Report
+from benchmarks.variants import (
+    VARIANTS,
+    centre_evidence,
+    lifted_scores,
+    median_scores,
+    only,
+    refined_scores,
+    top_evidence,
+)
+from benchmarks.worlds import World, cell_evidence, made_words, truth_of
+from normlift_ns import RefineConfig, lift, nearest_neighbors, rasterize_evidence, refine, refine_variant
+from tests.scenes import dense, generator, orbit, random_scene
+
+ROOT = Path(__file__).resolve().parents[1]
+CLASSES = 4
+WORDS = made_words(CLASSES, dimension=128)
+
+
+def exact_maps(cameras, seed: int) -> torch.Tensor:
+    """Quarters of the image, in an order of their own in every view, and a strip of nothing."""
+    g, maps = generator(seed), []
+    for camera in cameras:
+        y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+        quarter = (y > camera.height / 2).long() * 2 + (x > camera.width / 2).long()
+        classes = torch.randperm(CLASSES, generator=g)[quarter]
+        classes[:2] = -1
+        maps.append(classes)
+    return torch.stack(maps)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    scene, cameras, held_out = random_scene(300, dtype=torch.float32), orbit(6), orbit(2, distance=5.0)
+    maps = exact_maps(cameras, 0)
+    evidence, cells = cell_evidence(scene, cameras, maps)
+    truth = torch.randint(-1, CLASSES, (300,), generator=generator(1))
+    return World("tiny", scene, cameras, evidence, cells, truth, CLASSES, held_out, exact_maps(held_out, 1))
+
+
+def test_without_damage_cells_become_the_exact_masks(world):
+    observed = observe(world, WORDS, Damage(noise=0.0), 0)
+    direct = rasterize_evidence(world.scene, world.cameras, world.cells.maps.int(), num_regions=[CLASSES] * 6)
+    assert torch.allclose(dense(observed.evidence.rows, 24), dense(direct.rows, 24), rtol=1e-5, atol=1e-6)
+    assert torch.allclose(dense(observed.evidence.unlabeled, 6), dense(direct.unlabeled, 6), rtol=1e-5, atol=1e-6)
+    rows = observed.features.view(6, CLASSES, -1)
+    assert torch.equal(rows[0], rows[5])
+    assert ((observed.features @ WORDS.classes.T).argmax(1) == torch.arange(CLASSES).repeat(6)).all()
+
+
+def test_truth_is_the_class_of_pure_and_heavy_gaussians(world):
+    truth = truth_of(world.evidence, world.cells, CLASSES)
+    direct = rasterize_evidence(world.scene, world.cameras, world.cells.maps.int(), num_regions=[CLASSES] * 6)
+    by_class = dense(direct.rows, 24).view(-1, 6, CLASSES).sum(1)
+    total = by_class.sum(1) + dense(direct.unlabeled, 6).sum(1)
+    expected = torch.where((total >= 1) & (by_class.max(1).values >= 0.75 * total), by_class.argmax(1), -1)
+    assert (truth == expected).float().mean() > 0.99
+    assert set(truth.tolist()) == {-1, 0, 1, 2, 3}
+
+
+def test_features_have_the_geometry_that_is_documented():
+    words, g = made_words(12), generator(0)
+    from benchmarks.damage import _features  # noqa: PLC0415
+
+    rows = _features(torch.arange(12).repeat(40), words, Damage(), Lengths(), g).view(40, 12, -1)
+    same = torch.einsum("vkd,wkd->vwk", rows, rows)[torch.triu_indices(40, 40, 1).unbind()].mean()
+    other = torch.einsum("vkd,vld->vkl", rows, rows)[
+        :, torch.triu_indices(12, 12, 1)[0], torch.triu_indices(12, 12, 1)[1]
+    ].mean()
+    text = rows @ words.classes.T
+    own = text.diagonal(dim1=1, dim2=2).mean()
+    off = (text.sum() - text.diagonal(dim1=1, dim2=2).sum()) / (40 * 12 * 11)
+    assert (float(same), float(other)) == (pytest.approx(0.83, abs=0.01), pytest.approx(0.64, abs=0.01))
+    assert (float(own), float(off)) == (pytest.approx(0.34, abs=0.01), pytest.approx(0.25, abs=0.01))
+
+
+def test_each_damage_does_what_its_name_says(world):
+    def columns(**damage):
+        return observe(world, WORDS, replace(Damage(), **damage), 3)
+
+    plain = columns()
+    assert len(plain.features) == 24
+    assert len(columns(split=1.0).features) == 48
+    assert len(columns(merged=1.0).features) < 24
+    assert len(columns(dropped=0.5).features) < 24
+    few = columns(views=2)
+    assert (few.evidence.num_views, len(few.features)) == (2, 8)
+    assert few.evidence.weight.sum() < plain.evidence.weight.sum()
+    heavy = columns(dominant=64.0)
+    assert heavy.evidence.weight.sum() > 5 * plain.evidence.weight.sum()
+    assert torch.equal(heavy.columns, plain.columns)
+    for moved in ("shifted", "pose"):
+        assert 0.05 < float((columns(**{moved: 8.0}).columns != plain.columns).float().mean()) < 0.9
+    assert 0.01 < float((columns(boundary=1.0).columns != plain.columns).float().mean()) < 0.4
+    right = (columns(wrong=1.0).features @ WORDS.classes.T).argmax(1) == torch.arange(CLASSES).repeat(6)
+    assert right.float().mean() < 0.3
+    again, other = columns(wrong=0.5), observe(world, WORDS, Damage(wrong=0.5), 4)
+    assert torch.equal(again.features, columns(wrong=0.5).features)
+    assert not torch.equal(again.features, other.features)
+
+
+def test_scores_of_variants_are_those_of_refined_directions(world):
+    observed = observe(world, WORDS, LADDER["hard"], 0)
+    lifted = lift(observed.evidence, observed.features)
+    plain, config = lifted_scores(lifted, WORDS.classes), RefineConfig(k=9)
+    neighbors = nearest_neighbors(world.scene.means, 9)
+    for variant in VARIANTS:
+        found = refined_scores(variant, world.scene.means, lifted, plain, neighbors, config)
+        expected = refine_variant(variant, world.scene.means, lifted, config, neighbors=neighbors)
+        cosine = expected @ WORDS.classes.T
+        scale = cosine.norm(dim=1, keepdim=True) / found.cosine.norm(dim=1, keepdim=True).clamp(min=1e-9)
+        assert torch.allclose(found.cosine * scale, cosine, atol=2e-5)  # the arg-max does not see the length
+        assert torch.equal(found.valid, (expected != 0).any(1))
+        some = torch.arange(0, 300, 7)
+        few = refined_scores(variant, world.scene.means, lifted, plain, only(neighbors, some), config)
+        assert torch.equal(few.cosine[some], found.cosine[some])
+
+
+def test_votes_of_the_fit_are_those_of_refine(world):
+    neighbors, voters = nearest_neighbors(world.scene.means, MOST), torch.arange(0, 300, 3)
+    one = observation(world, WORDS, "hard", LADDER["hard"], 5, neighbors, voters)
+    observed = observe(world, WORDS, LADDER["hard"], 5)
+    lifted = lift(observed.evidence, observed.features)
+    for config in (RefineConfig(), RefineConfig(k=12, tau=0.7, gamma=0.1, sigma_d=1.5, delta=0.0)):
+        expected = refine(world.scene.means, lifted.directions, lifted.reliability, config)[voters]
+        same = (one.sources(config, one.reliability(1.0)) == expected).float().mean()
+        assert same > 0.97  # cosines are kept in half precision
+
+
+def test_other_methods(world):
+    centre = centre_evidence(world)
+    per_view = dense(world.evidence.view_weights(), 6)
+    groups = centre.view_group_offsets.diff()
+    assert int(groups.max()) == 1  # one cell per Gaussian and view
+    found = dense(centre.view_weights(), 6)
+    assert torch.allclose(found[found > 0], per_view[found > 0], rtol=1e-5)
+    everything = top_evidence(world, top=10_000)
+    size = world.evidence.num_regions
+    assert torch.allclose(dense(everything.rows, size), dense(world.evidence.rows, size), rtol=1e-3, atol=1e-5)
+    assert top_evidence(world, top=1).weight.sum() < everything.weight.sum()
+    observed = observe(world, WORDS, Damage(noise=0.0), 0)
+    median = median_scores(observed, WORDS.classes)
+    assert torch.equal(median.valid, lift(observed.evidence, observed.features).norm > 0)
+    some = median_scores(observed, WORDS.classes, torch.tensor([5, 17]))
+    assert torch.allclose(some.cosine[[5, 17]], median.cosine[[5, 17]], atol=1e-6)
+
+
+def test_rows_and_their_summary(world):
+    rows = []
+    bench = Bench(world, WORDS, None, "cpu", RefineConfig(k=9))
+    for seed in range(2):
+        for name in ("mild", "hard"):
+            rows.append({"scene": "tiny", "damage": name, "seed": seed, **bench.run(LADDER[name], seed)})
+    report = Report("accuracy")
+    summarize(rows, report)
+    values = {metric.key: metric.value for metric in report.metrics}
+    for variant in VARIANTS:
+        expected = sum(row[variant]["miou"] for row in rows) / 4
+        assert values[f"ablation.{KEYS.get(variant, variant)}.miou"] == pytest.approx(expected)
+    for other in ("sfs", "occam", "vala", "drsplat"):
+        assert 0 < values[f"baseline.{other}.miou"] <= 100
+    assert values["ablation.full_minus_none.miou"] == pytest.approx(
+        values["ablation.full.miou"] - values["ablation.none.miou"]
+    )
+    assert 0 <= values["ablation.full.miou_2d"] <= 100
+    assert values["preset.half.miou"] == pytest.approx(values["ablation.full.miou"], abs=1)
+
+
+def test_the_page_is_made_of_the_committed_results():
+    written = ROOT / "docs" / "speed_and_error.md"
+    assert written.read_text() == page(documents()), "write it again: python -m benchmarks.pages"
+
+
+@pytest.mark.slow
+def test_quick_accuracy_benchmark(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.accuracy", "--quick", "--output", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    print(done.stdout)
+    values = {m["key"]: m["value"] for m in json.loads((tmp_path / "accuracy.json").read_text())["metrics"]}
+    assert values["ladder.few views.full.miou"] > values["ladder.few views.none.miou"]
+    assert values["ablation.full.miou"] > values["ablation.norm_only.miou"]
+    assert values["reliability.spearman_bins_mean"] > 0.7
