@@ -170,7 +170,9 @@ class Panel(torch.nn.Module):
             raise ValueError(f"{len(prompts)} prompts; ask for {MOST_PROMPTS} at most at a time.")
         if len(self._encoder) == 0:
             self.ask_8_status.set("Loading the text encoder.")
-            self._encoder.append(encoder_of(field, str(self._model[0].device)))
+            folder = self._model[0].config.semantics
+            cache = None if folder is None else folder.parents[1] / ".cache" / "texts"
+            self._encoder.append(encoder_of(field, str(self._model[0].device), cache))
         form, refined = cast(Any, self.ask_3_relevancy.value), self.ask_4_refined.value
         sure = self.show_3_reliability.value
         question = pose(
