@@ -60,7 +60,7 @@ class NormLiftEval:
         device = choose_device(self.device)
 
         from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
-        from normlift_ns.plugin.asking import encoder_of, with_text_vectors  # noqa: PLC0415
+        from normlift_ns.plugin.asking import encoder_of, with_texts  # noqa: PLC0415
         from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
 
         names: list[tuple[str, str]] = []
@@ -68,7 +68,7 @@ class NormLiftEval:
         def lifted(config: Path) -> LiftedRun:
             run = load_run(config, data=self.data)
             names.append((str(run.config.experiment_name), str(run.checkpoint.path)))
-            semantics = with_text_vectors(load_field(run), self.text_vectors)
+            semantics = with_texts(load_field(run), vectors=self.text_vectors)
             return LiftedRun(run, semantics, encoder_of(semantics, device), self.refined)
 
         runs: Iterator[LiftedRun] = (lifted(config) for config in self.load_config)  # scenes are large
