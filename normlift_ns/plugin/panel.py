@@ -130,6 +130,7 @@ class Panel(torch.nn.Module):
         """Lets the panel be used, once the model has a field, and shows an answer."""
         field = self._model[0].field
         assert field is not None
+        self._answer = answer  # first: hooks run in other threads, and compare what they read with it
         for element in self._elements():
             element.disabled = False
             if element.gui_handle is not None:
@@ -143,8 +144,9 @@ class Panel(torch.nn.Module):
             self.ask_2_negatives.value = "; ".join(question.negatives)
             usual = "cosine" if len(question.negatives) == 0 else "lerf"
             self.ask_3_relevancy.value = "auto" if question.form == usual else question.form
-            self.ask_4_refined.value = question.refined
-            self.show_3_reliability.value = question.min_reliability
+            _set(self.show_2_threshold, question.threshold)
+            _set(self.show_3_reliability, question.min_reliability)
+            _set(self.ask_4_refined, question.refined)
         self._replace(answer)
 
     def _elements(self) -> list[ViewerElement[Any]]:
@@ -189,9 +191,9 @@ class Panel(torch.nn.Module):
     @_reported
     def _ask_again(self) -> None:
         """The same question to the refined or the unrefined directions."""
-        field = self._model[0].field
-        if self._answer is not None and field is not None:
-            self._replace(respond(field, replace(self._answer.question, refined=self.ask_4_refined.value)), keep=True)
+        answer, field, refined = self._answer, self._model[0].field, self.ask_4_refined.value
+        if answer is not None and field is not None and answer.question.refined != refined:
+            self._replace(respond(field, replace(answer.question, refined=refined)), keep=True)
 
     @_reported
     def _judge(self) -> None:
