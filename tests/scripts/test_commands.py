@@ -342,3 +342,14 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     field = load_field(load_run(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml"))
     assert field.manifest["statistics"]["views"] == 11
     assert int(field.scalars.view_count.max()) <= 11
+
+
+def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, monkeypatch):
+    flags = ("--load-config", trained, *SMALL, "--timestamp", "double", "--precision", "double")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    double, single = (load_field(load_run(config)) for config in (lifted.parents[1] / "double" / "config.yml", lifted))
+    assert double.manifest["options"]["precision"] == "double"
+    difference = (double.scalars.reliability - single.scalars.reliability).abs()
+    assert 0 < float(difference.quantile(0.99)) < 1e-6
+    assert float(difference.max()) < 1e-2  # where a pixel of a faint Gaussian is on the other side of alpha = 1 / 255
+    assert (double.source != single.source).float().mean() < 0.01

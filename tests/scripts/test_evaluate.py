@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import cv2
@@ -18,15 +17,7 @@ from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfact
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.evaluation.scannet import NYU40
 from normlift_ns.scripts import evaluate, lift
-
-
-def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
-    try:
-        entrypoint()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
+from tests.scripts.conftest import run_entry
 
 
 @pytest.fixture(scope="module")
