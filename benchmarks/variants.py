@@ -16,13 +16,10 @@ from torch.nn.functional import normalize
 
 from benchmarks.damage import Observed
 from benchmarks.worlds import World
-from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, refine
+from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, rasterize_evidence, refine
 from normlift_ns.core.ablations import Variant
-from normlift_ns.core.refine import decay_width, spatial_decay
+from normlift_ns.core.refine import decay_width, voting_weights
 from normlift_ns.core.sparse import SparseRows, row_offsets
-from normlift_ns.raster import reference
-from normlift_ns.raster.projection import assign_tiles, project, to_world
-from normlift_ns.raster.settings import RasterSettings
 
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 TOP = 10
@@ -78,7 +75,7 @@ def _average(reliability: Tensor, scores: Scores, neighbors: Neighbors, config: 
     cosine, valid, width = scores.cosine.clone(), scores.valid.clone(), decay_width(neighbors, config)
     for i in (neighbors.index >= 0).any(1).nonzero().squeeze(1).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i].long()], dim=1).clamp(min=0)
-        weight = spatial_decay(neighbors, width, i).to(scores.cosine) * reliability[group]
+        weight = voting_weights(neighbors, width, i, reliability).to(scores.cosine)
         total = torch.einsum("ik,ikc->ic", weight, scores.cosine[group])
         found = weight.sum(1) > 0
         cosine[i] = torch.where(found[:, None], total, cosine[i])
@@ -112,18 +109,20 @@ def centre_evidence(world: World) -> Evidence:
 
 def top_evidence(world: World, top: int = TOP) -> Evidence:
     """Dr.Splat: a ray counts for the `top` Gaussians of largest weight only."""
-    settings, parts = RasterSettings(), []
-    scene, device = to_world(world.scene, torch.float32), world.scene.means.device
-    for camera, cells in zip(world.cameras, world.cells.of_pixel.to(device)):
-        projected = project(scene, camera, settings, False)
-        tiles = assign_tiles(projected, camera.width, camera.height, settings.tile_size)
-        for member, place, weight in reference._tiles(projected, tiles, camera.width, camera.height, settings):
-            best, which = weight.topk(min(top, weight.shape[1]), dim=1)
-            cell = cells[place].flatten().long()[:, None].expand_as(which)
-            keep = best > 0
-            parts.append((projected.gaussian[member[which[keep]]].long(), cell[keep], best[keep]))
-    row, column, value = (torch.cat(x) for x in zip(*parts))
-    rows = SparseRows.from_coo(row, column, value, len(world.scene))
+    parts, size = [], len(world.scene)
+    for camera, cells in zip(world.cameras, world.cells.of_pixel):
+        of_pixel = cells.flatten().to(world.scene.means.device)
+        pixels = torch.arange(len(of_pixel), dtype=torch.int32).view(cells.shape)
+        weights = rasterize_evidence(world.scene, [camera], [pixels], num_regions=[len(of_pixel)]).rows
+        by_pixel = SparseRows.from_coo(weights.column.long(), weights.row_index(), weights.weight, len(of_pixel))
+        order = by_pixel.weight.argsort(descending=True)
+        order = order[by_pixel.row_index()[order].argsort(stable=True)]
+        pixel = by_pixel.row_index()[order]
+        keep = torch.arange(len(order), device=order.device) - by_pixel.offsets[pixel] < top
+        gaussian, pixel, weight = by_pixel.column[order[keep]].long(), pixel[keep], by_pixel.weight[order[keep]]
+        found = SparseRows.from_coo(gaussian, of_pixel[pixel].long(), weight, size)
+        parts.append((found.row_index(), found.column, found.weight))
+    rows = SparseRows.stack(parts, size, world.scene.means.device)
     return replace(world.evidence, offsets=rows.offsets, region=rows.column, weight=rows.weight)
 
 

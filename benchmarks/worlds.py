@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +29,8 @@ BLOCKS = 40
 """Blocks across an image."""
 PIXEL_STEP = 4
 """Every so many pixels of held-out views, across and down, one is looked at."""
+SHADE = 0.3
+"""Optical depth of all floaters together in the median view: they take a quarter of its light."""
 PURITY, WEIGHT = 0.75, 1.0
 """A Gaussian has the class that holds this share of its weight in the exact masks of all training views, background
 included, if that weight is at least this many pixels; otherwise it does not count."""
@@ -111,9 +113,10 @@ def cell_evidence(
         labels.append(cells)
         masks.append(regions[0].long())
         centres.append(centre.float())
+    drawn = scene.to("cuda") if torch.cuda.is_available() else scene
     evidence = rasterize_evidence(
-        scene, cameras, labels, num_regions=[len(m) for m in masks], weight_power=weight_power
-    )
+        drawn, cameras, labels, num_regions=[len(m) for m in masks], weight_power=weight_power
+    ).to(scene.means.device)
     counts = torch.tensor([len(m) for m in masks])
     view = torch.repeat_interleave(torch.arange(views), counts)
     of_pixel = torch.stack(labels) + (counts.cumsum(0) - counts).int()[:, None, None]
@@ -161,24 +164,31 @@ def demo(num_gaussians: int = 40_000) -> World:
 
 def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
     """The world with so many more Gaussians, half-transparent blobs between cameras and what they see; classless."""
-    g = torch.Generator().manual_seed(seed)
-    count = round(share * len(world.scene))
+    scene, count, g = world.scene, round(share * len(world.scene)), torch.Generator().manual_seed(seed)
     eyes = torch.stack([camera.world_to_camera.double().inverse()[:3, 3] for camera in world.cameras]).float()
     eye = eyes[torch.randint(0, len(eyes), (count,), generator=g)]
     seen = (world.truth >= 0).nonzero().squeeze(1)
-    target = world.scene.means[seen[torch.randint(0, len(seen), (count,), generator=g)]]
+    target = scene.means[seen[torch.randint(0, len(seen), (count,), generator=g)]]
     means = eye + (target - eye) * (0.3 + 0.6 * torch.rand(count, 1, generator=g))
-    size = 4 * world.scene.scales.max(dim=1).values.median()
-    scene = world.scene
-    joined = GaussianScene(
-        torch.cat([scene.means, means]),
-        torch.cat([scene.quats, torch.randn(count, 4, generator=g)]),
-        torch.cat([scene.scales, size * (0.3 + torch.rand(count, 3, generator=g))]),
-        torch.cat([scene.opacities, 0.05 + 0.55 * torch.rand(count, generator=g)]),
-    )
+    opacities = 0.05 + 0.55 * torch.rand(count, generator=g)
+    depth = torch.stack([_optical_depth(means, opacities, camera) for camera in world.cameras]).median()
+    scales = (SHADE / depth).sqrt() * (0.5 + torch.rand(count, 3, generator=g))
+    floaters = GaussianScene(means, torch.randn(count, 4, generator=g), scales, opacities)
+    joined = GaussianScene(*(torch.cat([getattr(x, f.name) for x in (scene, floaters)]) for f in fields(scene)))
     evidence, cells = cell_evidence(joined, world.cameras, world.cells.maps)
     truth = torch.cat([world.truth, torch.full((count,), NO_CLASS)])
     return replace(world, name=f"{world.name}_floaters", scene=joined, evidence=evidence, cells=cells, truth=truth)
+
+
+def _optical_depth(means: Tensor, opacities: Tensor, camera: Camera) -> Tensor:
+    """Mean over the pixels of one view of what blobs of scale 1 add up to."""
+    pose, K = camera.world_to_camera.float(), camera.K.float()
+    place = means @ pose[:3, :3].T + pose[:3, 3]
+    pixel = place @ K.T
+    x, y, z = pixel[:, 0] / pixel[:, 2], pixel[:, 1] / pixel[:, 2], place[:, 2]
+    inside = (z > 0) & (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)
+    area = 2 * torch.pi * K[0, 0] * K[1, 1] / z**2
+    return (opacities * area)[inside].sum() / (camera.width * camera.height)
 
 
 @dataclass(frozen=True)

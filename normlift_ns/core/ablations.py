@@ -10,7 +10,7 @@ from torch import Tensor
 
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
-from normlift_ns.core.refine import RefineConfig, decay_width, refine, spatial_decay
+from normlift_ns.core.refine import RefineConfig, decay_width, refine, voting_weights
 
 Variant = Literal["none", "knn", "linear", "norm", "support", "full"]
 
@@ -58,7 +58,7 @@ def _linear_average(directions: Tensor, reliability: Tensor, neighbors: Neighbor
     out, width = torch.empty_like(directions), decay_width(neighbors, config)
     for i in torch.arange(len(directions), device=directions.device).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)
-        weight = spatial_decay(neighbors, width, i).to(directions.dtype) * reliability[group]
+        weight = voting_weights(neighbors, width, i, reliability).to(directions.dtype)
         out[i] = torch.einsum("ik,ikd->id", weight, directions[group])
     length = torch.linalg.vector_norm(out, dim=1, keepdim=True)
     return torch.where(length > 0, out / length, directions)

@@ -1,6 +1,7 @@
 """Mode voting against a Python loop, its invariances, and the ablation variants."""
 
 import math
+from decimal import Decimal, localcontext
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ def scene(seed: int, n: int = 60, classes: int = 3) -> tuple[torch.Tensor, torch
 
 
 def vote(means, u, r, config) -> list[int]:
-    """Equations 9 and 10, one term at a time."""
+    """Equations 9 and 10, one term at a time; distances from the nearest reliable member."""
     n = len(means)
     distance = (means[:, None] - means[None]).norm(dim=-1)
     nearest = torch.where(distance > 0, distance, math.inf).min(1).values
@@ -35,11 +36,12 @@ def vote(means, u, r, config) -> list[int]:
     for i in range(n):
         near = sorted((distance[i, j].item(), j) for j in range(n) if j != i)[: config.k]
         group = [i] + [j for _, j in near]
+        start = min((distance[i, j].item() for j in group if r[j] > 0), default=0.0)
 
         def score(j: int, i=i, group=group) -> float:
             total = 0.0
             for k in group:
-                d = math.exp(-0.5 * (distance[i, k].item() / (config.sigma_d * unit)) ** 2)
+                d = math.exp(-0.5 * (distance[i, k].item() ** 2 - start**2) / (config.sigma_d * unit) ** 2)
                 g = 1 / (1 + math.exp(-((u[k] @ u[j]).item() - config.tau) / config.gamma))
                 total += r[k].item() * d * g
             return r[j].item() * total
@@ -112,6 +114,28 @@ def test_unreliable_neighbourhoods_stay_untouched_and_are_counted():
     assert lost[30:].all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
+    """A Gaussian without evidence, 1,000 spacings from a cluster: exp(-500,000) is 0 in any format of the machine."""
+    means, u, r = scene(3)
+    means[0] = torch.tensor([1000.0, 0, 0])
+    u[0], r[0] = 0, 0
+    config = RefineConfig(k=12)
+    near = nearest_neighbors(means, config.k)
+    scores = {}
+    with localcontext() as context:
+        context.Emin = -(10**9)
+        for j in near.index[0].tolist():
+            total = Decimal(0)
+            for k, distance in zip(near.index[0].tolist(), near.distance[0].tolist()):
+                decay = (-(Decimal(distance) / Decimal(float(near.spacing.median()))) ** 2 / 2).exp()
+                agree = torch.sigmoid((u[j] @ u[k] - config.tau) / config.gamma)
+                total += Decimal(float(r[k] * agree)) * decay
+            scores[j] = Decimal(float(r[j])) * total
+    assert 0 < max(scores.values()) < Decimal(10) ** -100_000
+    assert int(refine(means.to(dtype), u.to(dtype), r.to(dtype), config)[0]) == max(scores, key=scores.__getitem__)
+
+
 def test_a_reliable_cluster_far_away_never_changes():
     means, u, r = scene(4)
     means[:20] += 1000
@@ -181,7 +205,7 @@ def test_ablation_variants_are_what_their_names_say():
     near = nearest_neighbors(means, 8)
     group = [7, *near.index[7].tolist()]
     distance = torch.cat([torch.zeros(1).double(), near.distance[7]])
-    weight = torch.exp(-0.5 * (distance / (3 * near.spacing.median())) ** 2) * lifted.reliability[group]
+    weight = torch.exp(-0.5 * (distance / (config.sigma_d * near.spacing.median())) ** 2) * lifted.reliability[group]
     assert torch.allclose(got["linear"][7], torch.nn.functional.normalize(weight @ u[group], dim=0))
     assert len({value.sum().item() for value in got.values()}) == 6
 
