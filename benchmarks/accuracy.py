@@ -39,7 +39,8 @@ from benchmarks.variants import (
 )
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors, refine
-from normlift_ns.core.metrics import bin_means, class_scores, classify, confusion, spearman
+from normlift_ns.core.metrics import class_scores, classify, confusion, spearman
+from normlift_ns.evaluation.signals import accuracy_bins
 
 SEEDS = 5
 VARIES = 0.05
@@ -67,12 +68,6 @@ def scores_3d(world: World, scores: Scores, counted: Tensor) -> dict[str, float]
     found = classify(scores.cosine[counted], scores.valid[counted])
     result = class_scores(confusion(world.truth[counted], found, world.classes))
     return {"miou": 100 * result.miou, "macc": 100 * result.macc}
-
-
-def bins_of(key: Tensor, correct: Tensor) -> list[float]:
-    """Mean accuracy in ten bins of equal count by the key, where it is positive."""
-    some = key > 0
-    return bin_means(key[some], correct[some].double())[1].tolist()
 
 
 class Bench:
@@ -114,7 +109,7 @@ class Bench:
             row[name] = scores_3d(world, lifted_scores(lift(seen.evidence, seen.features), self.classes), self.counted)
         correct = classify(plain.cosine, plain.valid) == world.truth
         for name, key in (("reliability", lifted.reliability), ("norm", lifted.norm)):
-            row[f"{name}_bins"] = bins_of(key[known], correct[known])
+            row[f"{name}_bins"] = accuracy_bins(key[known], correct[known])
         return row
 
     def _presets(self, observed: Observed, lifted: Lifted, plain: Scores) -> dict[str, Any]:

@@ -5,9 +5,10 @@
 
 Procedure: K stays at 36, because the time of the vote grows with its square, and sigma_d at 1 or more, because below
 that nobody but the Gaussian itself has a say; the curves go further. Every combination in `SEARCH` is tried on `FIT`
-(damages, all scenes, seeds from 100 on); the highest mean mIoU wins. Then `START` and the winner are compared on `HELD_OUT` (other damages, seeds from 200 on), with 95 % intervals of the
-paired difference, the curve of every parameter around the winner, and the other readings of unlabelled pixels and of
-the weights. Plain voting has its own best combination, which tells parameters from method. Writes results/fit.json.
+(damages, all scenes, seeds from 100 on); the highest mean mIoU wins. Then `START` and the winner are compared on
+`HELD_OUT` (other damages, seeds from 200 on), with 95 % intervals of the paired difference, the curve of every
+parameter around the winner, and the other readings of unlabelled pixels and of the weights. Plain voting has its own
+best combination, which tells parameters from method. Writes results/fit.json.
 """
 
 from __future__ import annotations

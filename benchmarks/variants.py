@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 from benchmarks.damage import Observed
 from benchmarks.worlds import World
 from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, rasterize_evidence, refine
-from normlift_ns.core.ablations import Variant
+from normlift_ns.core.ablations import Variant, variant_reliability
 from normlift_ns.core.refine import decay_width, voting_weights
 from normlift_ns.core.sparse import SparseRows, row_offsets
 
@@ -63,11 +63,10 @@ def refined_scores(
     config = config or RefineConfig()
     if variant == "none":
         return scores
+    reliability = variant_reliability(variant, lifted, beta)
     if variant == "linear":
-        return _average(lifted.reliability, scores, neighbors, config)
-    support = torch.where(lifted.n_eff > 0, lifted.n_eff / (lifted.n_eff + beta), 0.0)
-    reliability = {"knn": scores.valid.float(), "norm": lifted.norm, "support": support, "full": lifted.reliability}
-    source = refine(means, lifted.directions, reliability[variant], config, neighbors=neighbors).long()
+        return _average(reliability, scores, neighbors, config)
+    source = refine(means, lifted.directions, reliability, config, neighbors=neighbors).long()
     return Scores(scores.cosine[source], scores.valid[source])
 
 

@@ -31,7 +31,7 @@ ALLOWED = {
     | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib", "plyfile"}
     | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin")},
     "evaluation": BASE
-    | {"cv2", "plyfile", "skimage"}
+    | {"cv2", "plyfile", "skimage", "matplotlib"}
     | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin", "evaluation")},
 }
 

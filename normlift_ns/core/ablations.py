@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.core.forms import Scalars
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import RefineConfig, decay_width, refine, voting_weights
@@ -27,34 +28,45 @@ def refine_variant(
     """Directions after one variant of the refinement, unit rows or 0.
 
     Args:
-        variant: "none": the lift as it is. "knn": plain voting, every Gaussian with a direction counts the same (R =
-            1).
-            "linear": distance-weighted linear averaging of the directions of N+, weighted by R d_ik and normalised.
-            "norm": R = ||f||. "support": R = N_eff / (N_eff + beta). "full": NormLift.
-        beta: as in `lift`, for "support".
+        variant: "none": the lift as it is. "linear": distance-weighted linear averaging of the directions of N+,
+            weighted by R d_ik and normalised. The others vote with the R of `variant_reliability`.
+        beta: as in `lift`.
+    Raises:
+        ValueError: an unknown variant.
+    """
+    config = config or RefineConfig()
+    reliability, directions = variant_reliability(variant, lifted, beta), lifted.directions()
+    if variant == "none":
+        return directions
+    neighbors = neighbors or nearest_neighbors(means, config.k)
+    if variant == "linear":
+        return linear_average(directions, reliability, neighbors, config)
+    return directions[refine(means, directions, reliability, config, neighbors=neighbors).long()]
+
+
+def variant_reliability(variant: Variant, lifted: Lifted | Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
+    """R that a variant votes with.
+
+    "knn": plain voting, 1 for every Gaussian with a direction. "norm": ||f||. "support": N_eff / (N_eff + beta). Any
+    other: their product, NormLift's R.
+
     Raises:
         ValueError: an unknown variant.
     """
     if variant not in get_args(Variant):
         raise ValueError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
-    config = config or RefineConfig()
-    directions = lifted.directions()
-    if variant == "none":
-        return directions
-    neighbors = neighbors or nearest_neighbors(means, config.k)
-    if variant == "linear":
-        return _linear_average(directions, lifted.reliability, neighbors, config)
+    if variant == "knn":
+        return (lifted.norm > 0).to(lifted.norm.dtype)
+    if variant == "norm":
+        return lifted.norm
     support = torch.where(lifted.n_eff > 0, lifted.n_eff / (lifted.n_eff + beta), 0.0)
-    reliability = {
-        "knn": (lifted.norm > 0).to(lifted.norm.dtype),
-        "norm": lifted.norm,
-        "support": support,
-        "full": lifted.reliability,
-    }[variant]
-    return directions[refine(means, directions, reliability, config, neighbors=neighbors).long()]
+    return support if variant == "support" else lifted.norm * support
 
 
-def _linear_average(directions: Tensor, reliability: Tensor, neighbors: Neighbors, config: RefineConfig) -> Tensor:
+def linear_average(
+    directions: Float[Tensor, "n d"], reliability: Float[Tensor, " n"], neighbors: Neighbors, config: RefineConfig
+) -> Float[Tensor, "n d"]:
+    """normalise(sum_{k in N+} R_k d_ik u_k); u_i where nobody counts."""
     out, width = torch.empty_like(directions), decay_width(neighbors, config)
     for i in torch.arange(len(directions), device=directions.device).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)

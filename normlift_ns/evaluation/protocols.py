@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from normlift_ns.core.evidence import UNLABELED
@@ -25,7 +25,7 @@ from normlift_ns.raster.rasterize import rasterize_evidence, render
 
 if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
     from normlift_ns.core.gaussians import Camera
-    from normlift_ns.plugin.adapters import SourceRun
+    from normlift_ns.plugin.adapters import SourceRun, Views
 
 
 @dataclass(frozen=True)
@@ -97,23 +97,30 @@ class LiftedRun:
         return {Path(name).stem: camera for some in views for name, camera in zip(some.names, some.cameras)}
 
 
-def run_scannet(runs: Iterator[LiftedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
+def label_scene(lifted: LiftedRun, path: Path, nyu40: Int64[Tensor, " n"]) -> SceneLabels:
+    """What protocol scannet needs of a run.
+
+    Raises:
+        ValueError: another number of vertices than Gaussians.
+    """
+    name = path.name.split("_vh_clean")[0]
+    check_identity(name, len(lifted.run.scene), nyu40, path)
+    cosine = lifted.cosine(tuple(NYU40.values()))
+    return SceneLabels(name, cosine, lifted.valid, lifted.run.scene.opacities, nyu40)
+
+
+def run_scannet(runs: Iterable[LiftedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
     """Protocol scannet over one run per scene.
 
     Raises:
         FileNotFoundError, ValueError: labels that are missing, damaged or of another number of points.
     """
     truths = [read_labels(path) for path in labels]
-    scenes = []
-    for path, nyu40, lifted in zip(labels, truths, runs):
-        name = path.name.split("_vh_clean")[0]
-        check_identity(name, len(lifted.run.scene), nyu40, path)
-        cosine = lifted.cosine(tuple(NYU40.values()))
-        scenes.append(SceneLabels(name, cosine, lifted.valid, lifted.run.scene.opacities, nyu40))
+    scenes = [label_scene(lifted, path, nyu40) for path, nyu40, lifted in zip(labels, truths, runs)]
     return evaluate_scannet(scenes, min_opacity=options.min_opacity, without_direction=options.without_direction)
 
 
-def run_lerf(runs: Iterator[LiftedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
+def run_lerf(runs: Iterable[LiftedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
     """Protocol lerf over one run per scene; all frames of all scenes count alike in `average`.
 
     Raises:
@@ -147,33 +154,48 @@ def _frame_scores(lifted: LiftedRun, camera: Camera, frame: LabeledFrame, option
     return FrameScores(frame, relevancy(values, background, form="lerf") if langsplat else values, background)
 
 
-def run_masks(lifted: LiftedRun, folder: Path, options: MaskOptions) -> Evaluation:
-    """Protocol masks on one run: 3D over Gaussians whose truth the masks of the training views tell, 2D in held-out
-    views.
+@dataclass(frozen=True)
+class MaskTruth:
+    """What instance masks tell of a run."""
+
+    classes: tuple[str, ...]
+    gaussians: Int64[Tensor, " n"]
+    """Class of every Gaussian, -1 where it does not count."""
+    held_out: Sequence[Int64[Tensor, "h w"]]
+    """Class of every pixel of the held-out views."""
+    settings: Mapping[str, Any]
+
+
+def mask_truth(run: SourceRun, folder: Path, options: MaskOptions) -> MaskTruth:
+    """The truth of Gaussians from the masks of the training views, and that of pixels in held-out views.
 
     Raises:
         FileNotFoundError, ValueError: masks or names that are missing or damaged; the message names the file.
     """
-    run, names = lifted.run, read_names(options.names or folder.parent / "labels.json")
-    masks = LabelFiles(folder)
+    names, masks = read_names(options.names or folder.parent / "labels.json"), LabelFiles(folder)
 
-    def classes(name: str, camera: Camera) -> Tensor:
-        return read_classes(masks, name, names, camera.height, camera.width)
+    def classes(views: Views) -> Iterator[Tensor]:
+        for name, camera in zip(views.names, views.cameras):
+            yield read_classes(masks, name, names, camera.height, camera.width)
 
     count = len(names.classes)
-    cosine, valid = lifted.cosine(names.classes), lifted.valid
     evidence = rasterize_evidence(
         run.scene,
         run.train.cameras,
-        (classes(name, camera).int().clamp(min=UNLABELED) for name, camera in zip(run.train.names, run.train.cameras)),
+        (found.int().clamp(min=UNLABELED) for found in classes(run.train)),
         num_regions=[count] * len(run.train),
         rasterize_mode=run.rasterize_mode,
     )
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
-    pixels = []
-    for name, camera in zip(run.held_out.names, run.held_out.cameras):
+    settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(run.held_out)}
+    return MaskTruth(names.classes, truth, list(classes(run.held_out)), settings)
+
+
+def run_masks(lifted: LiftedRun, truth: MaskTruth) -> Evaluation:
+    """Protocol masks on one run: 3D over Gaussians, 2D in held-out views."""
+    cosine, pixels = lifted.cosine(truth.classes), []
+    for camera, exact in zip(lifted.run.held_out.cameras, truth.held_out):
         values, alpha = lifted.composited(camera, cosine)
-        pixels.append((classes(name, camera), classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)))
-    settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(pixels)}
-    found, reliability = classify(cosine, valid), lifted.field.scalars.reliability
-    return evaluate_masks(names.classes, truth, found, pixels, reliability, settings)
+        pixels.append((exact, classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)))
+    found, reliability = classify(cosine, lifted.valid), lifted.field.scalars.reliability
+    return evaluate_masks(truth.classes, truth.gaussians, found, pixels, reliability, truth.settings)

@@ -35,10 +35,16 @@ def mean(values: Sequence[float]) -> float:
 
 
 def write_evaluation(
-    path: Path, evaluation: Evaluation, *, experiment_name: str, method_name: str, checkpoint: str
+    path: Path,
+    evaluation: Evaluation,
+    *,
+    experiment_name: str,
+    method_name: str,
+    checkpoint: str,
+    studies: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes experiment_name, method_name, checkpoint and results as ns-eval does, then settings and rows; NaN as
-    null.
+    """Writes experiment_name, method_name, checkpoint and results as ns-eval does, then settings, rows and studies;
+    NaN as null.
     """
     document = {
         "experiment_name": experiment_name,
@@ -47,6 +53,7 @@ def write_evaluation(
         "results": evaluation.results,
         "settings": evaluation.settings,
         "rows": evaluation.rows,
+        **({"studies": studies} if studies else {}),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:

@@ -90,14 +90,21 @@ def scene_scores(
     Truth outside the set, and that of Gaussians of opacity below `min_opacity`, does not count. All names of the set
     are asked, also those that the scene lacks; IoU and recall are of the classes that it has.
     """
+    truth, found = answers(scene, classes, min_opacity=min_opacity, without_direction=without_direction)
+    return class_scores(confusion(truth, found, classes))
+
+
+def answers(
+    scene: SceneLabels, classes: int, *, min_opacity: float, without_direction: WithoutDirection
+) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
+    """Truth and answer of every Gaussian, as indices into the set of classes; see `scene_scores`."""
     ids = list(NYU40)
     columns = [ids.index(i) for i in CLASS_SETS[classes]]
     class_of = torch.full((max(int(scene.nyu40.max()), *ids) + 1,), NO_CLASS)
     class_of[list(CLASS_SETS[classes])] = torch.arange(classes)
     truth = class_of[scene.nyu40.clamp(min=0)]
     truth = torch.where(scene.opacity < min_opacity, NO_CLASS, truth)
-    found = classify(scene.cosine[:, columns], scene.valid, without_direction=without_direction)
-    return class_scores(confusion(truth, found, classes))
+    return truth, classify(scene.cosine[:, columns], scene.valid, without_direction=without_direction)
 
 
 def evaluate_scannet(

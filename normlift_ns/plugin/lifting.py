@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -153,6 +155,7 @@ def lift_run(
             "features": source.identity,
             "options": asdict(options),
             "statistics": statistics,
+            "cost": _cost(stages.seconds, device),
         }
         built = SemanticField.build(
             lifted, scene.means, copied, tolerance=options.tolerance, form=options.form, provenance=provenance
@@ -186,6 +189,15 @@ class _Stages:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
+    """Seconds of the stages so far and in all, and the most memory of this process and of the GPU, GiB."""
+    unit = 2**30 if sys.platform == "darwin" else 2**20
+    memory = {"memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
+    if torch.device(device).type == "cuda":
+        memory["gpu_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
+    return {**{f"{stage}_s": value for stage, value in seconds.items()}, "total_s": sum(seconds.values()), **memory}
 
 
 def _statistics(lifted: Lifted) -> dict[str, Any]:

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from rich.table import Table
 
+from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
 from normlift_ns.evaluation.protocols import (
     LerfOptions,
     LiftedRun,
     MaskOptions,
     ScannetOptions,
+    mask_truth,
     run_lerf,
     run_masks,
     run_scannet,
 )
 from normlift_ns.evaluation.results import Evaluation, write_evaluation
+from normlift_ns.evaluation.studies import (
+    Evaluate,
+    Row,
+    mask_signals,
+    plain_signals,
+    scannet_signals,
+    study_votes,
+    timing,
+)
+from normlift_ns.evaluation.votes import ablation, sweeps
 from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
 
 
@@ -38,12 +51,16 @@ class NormLiftEval:
     """Name of the output file."""
     refined: bool = True
     """Evaluate the refined directions."""
+    study: tuple[Literal["ablation", "sweeps", "signals", "timing"], ...] = ()
+    """What to measure besides. ablation: the variants of the refinement. sweeps: every parameter of the vote around
+    the run's own. signals: Gaussians without evidence, accuracy by R and by norm, R against opacity. timing: what
+    lifting took. Holds all runs in memory."""
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look names up in instead of the encoder that the runs were lifted with."""
     data: Path | None = None
     """Where the dataset is now, if it was moved; for one run."""
     device: str = "auto"
-    """auto, cpu or cuda: where the text encoder runs."""
+    """auto, cpu or cuda: where the text encoder runs, and the votes of --study."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
@@ -71,21 +88,52 @@ class NormLiftEval:
             semantics = with_texts(load_field(run), vectors=self.text_vectors)
             return LiftedRun(run, semantics, encoder_of(semantics, device), self.refined)
 
-        runs: Iterator[LiftedRun] = (lifted(config) for config in self.load_config)  # scenes are large
-        if self.protocol == "scannet":
-            evaluation = run_scannet(runs, self.labels, self.scannet)
-        elif self.protocol == "lerf":
-            evaluation = run_lerf(runs, self.labels, self.lerf)
-        else:
-            evaluation = run_masks(next(runs), self.labels[0], self.masks)
+        # Scenes are large: one is held at a time, unless they are studied.
+        runs: Iterable[LiftedRun] = (lifted(config) for config in self.load_config)
+        if self.study or self.protocol == "masks":
+            runs = list(runs)
+        evaluate, measure_signals = self._protocol(runs)
+        evaluation, studies = evaluate(runs), {}
+        for name in self.study:
+            held = list(runs)
+            if name == "signals":
+                studies[name] = measure_signals(held)
+            elif name == "timing":
+                studies[name] = timing(held)
+            else:
+                studies[name] = study_votes(held, evaluate, {"ablation": ablation, "sweeps": sweeps}[name], device)
         experiments, checkpoints = (", ".join(values) for values in zip(*names))
         write_evaluation(
-            self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints
-        )
-        CONSOLE.print(rows_table(evaluation))
+            self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
+            studies=studies,
+        )  # fmt: skip
+        written = [self.output_path, *self._plots(studies, next(iter(evaluation.results)))]
+        CONSOLE.print(rows_table(evaluation.rows))
         CONSOLE.print(results_table(evaluation))
-        CONSOLE.print(f"Written: {self.output_path}", highlight=False)
+        for name, rows in studies.items():
+            CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
+        CONSOLE.print(f"Written: {', '.join(map(str, written))}", highlight=False)
         return evaluation
+
+    def _protocol(self, runs: Iterable[LiftedRun]) -> tuple[Evaluate, Callable[[Sequence[LiftedRun]], list[Row]]]:
+        """How to score runs, and how to measure the signals of R."""
+        if self.protocol == "scannet":
+            given = {"labels": self.labels, "options": self.scannet}
+            return partial(run_scannet, **given), partial(scannet_signals, **given)
+        if self.protocol == "lerf":
+            return partial(run_lerf, labels=self.labels, options=self.lerf), partial(plain_signals, labels=self.labels)
+        truth = mask_truth(next(iter(runs)).run, self.labels[0], self.masks)
+        return lambda some: run_masks(next(iter(some)), truth), lambda some: mask_signals(some[0], truth)
+
+    def _plots(self, studies: Mapping[str, list[Row]], metric: str) -> Iterator[Path]:
+        """Figures beside the output file."""
+        for name in {"sweeps", "signals"} & set(studies):
+            path = self.output_path.with_name(f"{self.output_path.stem}_{name}.svg")
+            if name == "sweeps":
+                plot_sweeps(studies[name], metric, metric, path)
+            else:
+                plot_signals(studies[name][0], path)
+            yield path
 
 
 def results_table(evaluation: Evaluation) -> Table:
@@ -96,11 +144,19 @@ def results_table(evaluation: Evaluation) -> Table:
     return table
 
 
-def rows_table(evaluation: Evaluation) -> Table:
-    """One row per class, with scene or frame where there are several."""
-    table = Table(*(evaluation.rows[0] if len(evaluation.rows) > 0 else ()))
-    for row in evaluation.rows:
+def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
+    """One row per class, with scene or frame where there are several; or per vote."""
+    table = Table(*(rows[0] if len(rows) > 0 else ()), title=title)
+    for row in rows:
         table.add_row(*(f"{x:.3f}" if isinstance(x, float) else str(x) for x in row.values()))
+    return table
+
+
+def signals_table(rows: Sequence[Row]) -> Table:
+    """One column per scene."""
+    table = Table("signal", *(str(row.get("scene", "value")) for row in rows), title="signals")
+    for name in (key for key in rows[0] if key != "scene"):
+        table.add_row(name, *(f"{row[name]:.3f}" for row in rows))
     return table
 
 

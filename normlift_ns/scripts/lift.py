@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -135,7 +132,9 @@ def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str,
     table.add_row(
         "seconds", "  ".join(f"{name} {t:.1f}" for name, t in result.seconds.items()) + f"  total {total:.1f}"
     )
-    table.add_row("peak memory", peak_memory())
+    cost = facts["cost"]
+    gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""
+    table.add_row("peak memory", f"{cost['memory_gib']:.2f} GiB{gpu}")
     table.add_row("stored as", f"{facts['form']}, {chosen['bytes'] / 1e6:.1f} MB, cosines within {chosen['bound']:.1e}")
     others = (f"{name} {form['bytes'] / 1e6:.1f} MB" for name, form in facts["forms"].items() if name != facts["form"])
     table.add_row("", "instead of " + ", ".join(others))
@@ -143,13 +142,6 @@ def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str,
     text = queries[0] if len(queries) > 0 else "…"
     table.add_row("next", f'ns-normlift-query --load-config {run_dir / "config.yml"} --text "{text}"')
     return Panel(table, title="[bold][green]:tada: Lifted :tada:", expand=False)
-
-
-def peak_memory() -> str:
-    """Largest memory of this process so far, and of the GPU."""
-    scale = 2**30 if sys.platform == "darwin" else 2**20
-    host = f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale:.2f} GiB"
-    return f"{host}, GPU {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB" if torch.cuda.is_available() else host
 
 
 def entrypoint() -> None:

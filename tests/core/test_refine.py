@@ -38,7 +38,7 @@ def vote(means, u, r, config) -> list[int]:
         group = [i] + [j for _, j in near]
         start = min((distance[i, j].item() for j in group if r[j] > 0), default=0.0)
 
-        def score(j: int, i=i, group=group) -> float:
+        def score(j: int, i=i, group=group, start=start) -> float:
             total = 0.0
             for k in group:
                 d = math.exp(-0.5 * (distance[i, k].item() ** 2 - start**2) / (config.sigma_d * unit) ** 2)
@@ -128,7 +128,7 @@ def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
         for j in near.index[0].tolist():
             total = Decimal(0)
             for k, distance in zip(near.index[0].tolist(), near.distance[0].tolist()):
-                decay = (-(Decimal(distance) / Decimal(float(near.spacing.median()))) ** 2 / 2).exp()
+                decay = (-((Decimal(distance) / Decimal(float(near.spacing.median()))) ** 2) / 2).exp()
                 agree = torch.sigmoid((u[j] @ u[k] - config.tau) / config.gamma)
                 total += Decimal(float(r[k] * agree)) * decay
             scores[j] = Decimal(float(r[j])) * total

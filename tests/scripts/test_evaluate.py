@@ -15,6 +15,7 @@ from plyfile import PlyData, PlyElement
 from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.evaluation import votes
 from normlift_ns.evaluation.scannet import NYU40
 from normlift_ns.scripts import evaluate, lift
 from tests.scripts.conftest import run_entry
@@ -66,6 +67,33 @@ def test_masks_of_a_capture(workspace, monkeypatch, capsys):
     assert plain["results"]["miou_3d"] != results["miou_3d"]
 
 
+def test_studies_of_masks(workspace, monkeypatch, capsys):
+    monkeypatch.setattr(votes, "SWEEPS", {"beta": (0.5,), "k": (6, 12), "delta": (0.0, 0.1)})
+    flags = ("--study", "ablation", "sweeps", "signals", "timing")
+    document = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", *flags)
+    studies = document["studies"]
+    assert list(studies) == ["ablation", "sweeps", "signals", "timing"]
+    by_variant = {row["variant"]: row for row in studies["ablation"]}
+    assert list(by_variant) == ["none", "knn", "linear", "norm", "support", "full"]
+    assert by_variant["full"]["miou_3d"] == pytest.approx(document["results"]["miou_3d"], abs=5e-3)  # from stored u
+    plain = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", "--refined", False)
+    assert by_variant["none"]["miou_3d"] == plain["results"]["miou_3d"]
+    assert len({row["miou_3d"] for row in by_variant.values()}) > 3
+    assert [(row["parameter"], row["value"]) for row in studies["sweeps"]][2] == ("k", 12)
+    assert len(studies["sweeps"]) == 5
+    own = [r["miou_3d"] for r in studies["sweeps"] if (r["parameter"], r["value"]) in (("k", 12), ("delta", 0.0))]
+    assert own == [by_variant["full"]["miou_3d"]] * 2
+    (signals,) = studies["signals"]
+    assert signals["zero.share"] == pytest.approx(document["results"]["zero_evidence_share"])
+    assert signals["zero.accuracy"] is None  # no mask tells the class of what nobody sees
+    assert signals["reliability.spearman_bins"] > 0.5
+    assert sum(v for k, v in signals.items() if k.startswith("histogram.")) == pytest.approx(1 - signals["zero.share"])
+    (cost,) = studies["timing"]
+    assert cost["total_s"] > cost["vote_s"] > 0
+    assert {p.name for p in workspace.glob("masks_*.svg")} == {"masks_sweeps.svg", "masks_signals.svg"}
+    assert "spearman_bins" in capsys.readouterr().out
+
+
 def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     ids = list(NYU40)[: len(room.names)]
     vertices = np.zeros(len(room.labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u2")])
@@ -81,6 +109,12 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     assert results["miou_19"] > 0.5
     assert results["miou_10"] >= results["miou_19"] - 0.2
     assert {row["class"] for row in document["rows"] if row["classes"] == 19} == {NYU40[i] for i in ids}
+    flags = ("--study", "signals", "ablation", "--text-vectors", vectors)
+    studies = evaluated(monkeypatch, workspace, "scannet", path, *flags)["studies"]
+    assert studies["signals"][0]["scene"] == "scene0000_00"
+    assert 0.5 < studies["signals"][0]["seen.accuracy"] < 1
+    assert [row["variant"] for row in studies["ablation"]][-1] == "full"
+    assert studies["ablation"][-1]["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
 
 
 def write_polygons(folder: Path, instance: Path, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
@@ -113,6 +147,9 @@ def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
     assert results["miou"] > 0.3
     assert found["background"]["settings"]["labels_without_image"] == ["room/0099"]
     assert {row["frame"] for row in found["auto"]["rows"]} <= {"room/0000", "room/0008"}
+    (signals,) = evaluated(monkeypatch, workspace, "lerf", labels, *flags, "--study", "signals")["studies"]["signals"]
+    assert "opacity.spearman" in signals
+    assert "all.accuracy" not in signals  # nothing tells the class of a Gaussian
     cleaned = evaluated(monkeypatch, workspace, "lerf", labels, "--clean", True, "--text-vectors", vectors)
     assert cleaned["results"]["miou"] != results["miou"]
 
