@@ -42,7 +42,7 @@ from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors
 from normlift_ns.core.metrics import class_scores, classify, confusion, spearman
 from normlift_ns.evaluation.signals import accuracy_bins
 
-SEEDS = 5
+SEEDS = 8
 VARIES = 0.05
 """Accuracy varies over bins of reliability if their means span at least this much."""
 KEYS = {"knn": "plain_knn", "norm": "norm_only", "support": "support_only"}

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from benchmarks.accuracy import mean_and_interval, scores_3d, worlds
+from benchmarks.accuracy import SEEDS, mean_and_interval, scores_3d, worlds
 from benchmarks.damage import LADDER, Lengths, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import lifted_scores, refined_scores
@@ -32,7 +32,6 @@ from normlift_ns.evaluation.signals import signals
 VIEWS = (2, 4, 8, 16, 32)
 NOISE = (0.0, 0.6, 1.2, 2.0, 3.0)
 MIXES = tuple(i / 10 for i in range(11))
-SEEDS = 5
 
 
 def evidence_table(world: World, words: Words, report: Report) -> None:
@@ -47,11 +46,25 @@ def evidence_table(world: World, words: Words, report: Report) -> None:
             scores = lifted_scores(lifted, words.classes.to(world.truth.device))
             answer = classify(scores.cosine, scores.valid)
             found.append(signals(lifted, world.scene.opacities, world.truth, answer))
+            found[-1] |= mistakes(lifted.reliability, world.truth, answer)
         for key in found[0]:
             mean, half = mean_and_interval([one[key] for one in found])
             report.add(f"{world.name}.{step}.{key}", mean, "of 1")
             if key.endswith(("accuracy", "spearman_bins")):
                 report.add(f"{world.name}.{step}.{key}_ci95", half, "half of the 95 % interval over seeds")
+
+
+def mistakes(reliability: Tensor, truth: Tensor, answer: Tensor) -> dict[str, float]:
+    """Where R is in its sixth to eighth tenth: share of wrong answers, and which of them name the largest class."""
+    counts = (truth >= 0) & (reliability > 0)
+    tenths = reliability[counts].argsort().tensor_split(10)
+    some = torch.cat(tenths[5:8])
+    found, exact = answer[counts][some], truth[counts][some]
+    wrong, largest = found != exact, truth[counts].bincount().argmax()
+    return {
+        "middle.wrong": float(wrong.double().mean()),
+        "middle.wrong_largest": float((found == largest)[wrong].double().mean()),
+    }
 
 
 def views_curve(world: World, words: Words, report: Report) -> None:

@@ -36,9 +36,9 @@ class RefineConfig:
     """Width of the spatial decay, > 0, in units of the scene's median distance to the nearest Gaussian at another
     place (scenes are rescaled).
     """
-    tau: float = 0.8
+    tau: float = 0.95
     """Cosine at which two directions half agree, in -1..1."""
-    gamma: float = 0.2
+    gamma: float = 0.4
     """Softness of that agreement, > 0."""
     delta: float = 0.0
     """Delta, margin by which the best neighbour must win, >= 0."""

@@ -152,9 +152,9 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
     with capsys.disabled():
         print(f"\nmIoU before and after refinement: {scores}, sum {summed}; sofa {sofa}")
     before, after = np.mean(list(scores.values()), axis=0)
-    assert after >= 0.9
+    assert after >= 0.92
     assert all(refined > raw for raw, refined in scores.values())
-    assert after > before + 0.005
+    assert after > before + 0.02
     assert summed[1] >= 0.9
     truth = room.labels == room.names.index("sky blue")
     assert sofa["fraction"] == pytest.approx(float(truth.float().mean()), rel=0.2)
