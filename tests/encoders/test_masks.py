@@ -1,4 +1,4 @@
-"""Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats, flood fill."""
+"""Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
+from normlift_ns.encoders.masks import Suppression, boxes_of, mask_nms, stack_masks
 
 
 def nms_by_hand(masks: list[set], scores: list[float], rules: Suppression) -> list[bool]:
@@ -118,62 +118,8 @@ def test_boxes(masks, empty):
         assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
 
 
-def components_by_hand(mask: np.ndarray) -> list[set]:
-    """8-connected components by flood fill, in the order of their first pixels."""
-    left, found = pixels(mask), []
-    for start in sorted(left):
-        if start not in left:
-            continue
-        left.remove(start)
-        piece, front = {start}, [start]
-        while front:
-            y, x = front.pop()
-            near = {(y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)} & left
-            left -= near
-            piece |= near
-            front.extend(near)
-        found.append(piece)
-    return found
-
-
-def clean_by_hand(mask: np.ndarray, least: int) -> tuple[list[np.ndarray], bool]:
-    """All right answers: several where the largest of small pieces has equals."""
-    mask, changed = mask.copy(), False
-    for hole in components_by_hand(~mask):
-        if len(hole) < least:
-            mask[tuple(np.array(sorted(hole)).T)] = True
-            changed = True
-    pieces = components_by_hand(mask)
-    stay = [piece for piece in pieces if len(piece) >= least]
-    largest = max(map(len, pieces))
-    answers = [set().union(*stay)] if len(stay) > 0 else [piece for piece in pieces if len(piece) == largest]
-    results = []
-    for answer in answers:
-        results.append(np.zeros_like(mask))
-        results[-1][tuple(np.array(sorted(answer)).T)] = True
-    return results, changed or len(stay) < len(pieces)
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    mask=arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))),
-    margin=st.tuples(*[st.integers(0, 3)] * 4),
-    least=st.integers(1, 12),
-)
-def test_small_regions(mask, margin, least):
-    mask = np.pad(mask, (margin[:2], margin[2:]))
-    mask[mask.shape[0] // 2, mask.shape[1] // 2] = True
-    masks = torch.from_numpy(mask)[None]
-    found, changed = clean_masks(masks, boxes_of(masks), least)
-    answers, different = clean_by_hand(mask, least)
-    assert any(np.array_equal(found[0].numpy(), answer) for answer in answers)
-    assert changed.tolist() == [different]
-
-
 @pytest.mark.parametrize("count", [0, 3])
 def test_no_masks_and_whole_images(count):
     masks = torch.ones(count, 4, 5, dtype=torch.bool)
-    cleaned, changed = clean_masks(masks, boxes_of(masks), 10)
-    assert torch.equal(cleaned, masks) and changed.tolist() == [False] * count
     assert mask_nms(masks, torch.ones(count)).tolist() == [True, False, False][:count]
     assert stack_masks(masks).shape == (max(1, count), 4, 5)
