@@ -65,7 +65,7 @@ class _Grid(NamedTuple):
     """Places of pixels: rows are wider than the image, so that none begins where another ends, and an empty one lies
     below each mask."""
 
-    count: int
+    masks: int
     height: int
     width: int
 
@@ -81,7 +81,7 @@ class _Grid(NamedTuple):
 
     def edges(self, masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, " e"]:
         """Of masks."""
-        changes = masks.new_zeros(self.count, self.height + 1, self.row)
+        changes = masks.new_zeros(self.masks, self.height + 1, self.row)
         inside = changes[:, :-1]
         inside[:, :, 0], inside[:, :, self.width] = masks[:, :, 0], masks[:, :, -1]
         torch.ne(masks[:, :, 1:], masks[:, :, :-1], out=inside[:, :, 1 : self.width])
@@ -92,7 +92,7 @@ class _Grid(NamedTuple):
     def frame(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
         """First places of rows, and those after their last pixels: of the rows with edges and those above and below,
         since rows of `least` pixels are large by themselves; else of all rows."""
-        near = torch.full((self.count, self.height + 1), self.width < least, device=edges.device)
+        near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
         near.view(-1)[edges // self.row] = True
         near[:, :-1] |= near[:, 1:].clone()
         near[:, 1:] |= near[:, :-1].clone()
@@ -133,9 +133,9 @@ def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
 def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
     """Which runs are in the largest piece of their mask."""
     mask, none = runs.start // grid.size, len(runs.piece)
-    area = mask.new_zeros(grid.count).scatter_reduce(0, mask, runs.area, "amax")
+    area = mask.new_zeros(grid.masks).scatter_reduce(0, mask, runs.area, "amax")
     piece = torch.where(runs.area == area[mask], runs.piece, none)
-    return runs.piece == mask.new_full((grid.count,), none).scatter_reduce(0, mask, piece, "amin")[mask]
+    return runs.piece == mask.new_full((grid.masks,), none).scatter_reduce(0, mask, piece, "amin")[mask]
 
 
 def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:

@@ -154,6 +154,24 @@ def test_batches_change_nothing(encoder):
     torch.testing.assert_close(encoder.text(prompts)[64:65], encoder.text(prompts[64:65]), rtol=0, atol=1e-5)
 
 
+def test_crops_of_several_views_fill_batches(encoder, monkeypatch):
+    """Seven views of 0, 1, 3, 3, 0, 70 and 1 regions: 78 crops in two batches instead of six."""
+    many = (torch.arange(48 * 64).reshape(1, 48, 64) * 70 // (48 * 64)).int()
+    none, one = torch.full_like(many, -1), torch.where(MAPS == 1, 0, -1).int()
+    views = [(IMAGE + 10 * i, labels) for i, labels in enumerate((none, one, MAPS, MAPS, none, many, one))]
+    expected = [encoder.encode(*view) for view in views]
+    sizes, rows = [], OpenClipEncoder._image_rows
+    monkeypatch.setattr(
+        OpenClipEncoder, "_image_rows", lambda self, crops: (sizes.append(len(crops)), rows(self, crops))[1]
+    )
+    found = list(encoder.encode_each(iter(views)))
+    assert sizes == [64, 14]
+    assert [features.shape for features in found] == [features.shape for features in expected]
+    for features, alone in zip(found, expected):
+        torch.testing.assert_close(features, alone, rtol=0, atol=1e-5)
+    assert not torch.allclose(found[2], found[3], atol=1e-3)
+
+
 def test_no_region_needs_no_weights(weights):
     encoder = OpenClipEncoder(NAME, str(weights / "tiny.pt"))
     assert encoder.encode(IMAGE, torch.full((1, 48, 64), -1, dtype=torch.int32)).shape == (0, 24)

@@ -83,7 +83,7 @@ def test_blobs_and_holes_in_them(blobs, least):
 @pytest.mark.parametrize("share", [0.002, 0.1, 0.4, 0.5, 0.6, 0.9, 0.998])
 def test_noise(share, device):
     g = np.random.default_rng(3)
-    cleaned, changed = assert_right(g.random((6, 90, 131)) < share, 20, device)
+    _, changed = assert_right(g.random((6, 90, 131)) < share, 20, device)
     assert all(changed)
 
 
