@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from normlift_ns.encoders.masks import Suppression, boxes_of, mask_nms, stack_masks
+from tests.encoders.tiny import needs_cuda
 
 
 def nms_by_hand(masks: list[set], scores: list[float], rules: Suppression) -> list[bool]:
@@ -64,8 +65,8 @@ def test_suppression_is_that_of_the_protocol(masks, data, rules):
     assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores, rules)
 
 
-def test_suppression_of_overlaps_as_large_as_those_of_photographs():
-    """Many masks in chunks of pixels, with areas from specks to half of the image."""
+def discs() -> np.ndarray:
+    """Pairs of discs that nearly agree, of areas from specks to half of the image."""
     g = np.random.default_rng(0)
     y, x = np.mgrid[:120, :160]
     masks = []
@@ -73,8 +74,12 @@ def test_suppression_of_overlaps_as_large_as_those_of_photographs():
         cy, cx, r = g.uniform(0, 120), g.uniform(0, 160), np.exp(g.uniform(0.5, 4.2))
         masks.append((y - cy) ** 2 + (x - cx) ** 2 < r**2)
         masks.append((y - cy - g.normal()) ** 2 + (x - cx) ** 2 < (r * g.uniform(0.9, 1.1)) ** 2)
-    masks = np.array([mask for mask in masks if mask.any()])
-    scores = g.uniform(0.6, 1, len(masks))
+    return np.array([mask for mask in masks if mask.any()])
+
+
+def test_suppression_of_overlaps_as_large_as_those_of_photographs():
+    masks = discs()
+    scores = np.random.default_rng(1).uniform(0.6, 1, len(masks))
     found = mask_nms(torch.from_numpy(masks), torch.from_numpy(scores))
     assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores.tolist(), Suppression())
     assert 5 < int(found.sum()) < len(masks) // 2
@@ -92,6 +97,16 @@ def test_a_small_mask_inside_a_large_one_goes_whatever_its_score():
     small[0, 2:5, 2:5] = True
     for scores in ([0.8, 0.9], [0.9, 0.8]):
         assert mask_nms(torch.cat([large, small]), torch.tensor(scores)).tolist() == [True, False]
+
+
+@needs_cuda
+def test_a_gpu_finds_the_same():
+    masks = torch.from_numpy(discs())
+    scores = 0.6 + 0.4 * torch.rand(len(masks), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(mask_nms(masks.cuda(), scores.cuda()).cpu(), mask_nms(masks, scores))
+    assert torch.equal(stack_masks(masks.cuda()).cpu(), stack_masks(masks))
+    assert torch.equal(boxes_of(masks.cuda()).cpu(), boxes_of(masks))
+    assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
 
 
 @settings(max_examples=100, deadline=None)

@@ -22,7 +22,7 @@ from normlift_ns.encoders.sam_network import SamNetwork
 from normlift_ns.encoders.sam_weights import load_sam, published_config, published_name
 from tests.captures import needs_shared
 from tests.encoders.test_masks import nms_by_hand, pixels
-from tests.encoders.tiny import SIDE, tiny_sam, write_sam
+from tests.encoders.tiny import SIDE, needs_cuda, tiny_sam, write_sam
 
 EVERYTHING = Suppression(iou=1.0, score=-1.0, outer=0.0, inner=2.0)
 LOOSE = MaskRules(points_per_side=6, predicted_iou=0.5, stability=0.3, suppression=Suppression(score=0.1))
@@ -131,12 +131,19 @@ def test_the_masks_are_those_of_metas_generator(weights, monkeypatch, size):
         assert 0 < sum(stay) < len(stay)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+@needs_cuda
 def test_a_gpu_finds_what_the_cpu_finds(weights, monkeypatch):
     image, path = noise(160, 120), str(weights / "tiny")
     networks = [SamNetwork.load(path, device) for device in ("cpu", "cuda")]
     exact, half = (network.embed(network.pixels([image]))[0].cpu() for network in networks)
-    assert float((half - exact).norm() / exact.norm()) < 0.01
+    assert 0 < float((half - exact).norm() / exact.norm()) < 0.01 and half.dtype == torch.float32
+    points = point_grid(5) * torch.tensor([120, 160])
+    (logits, ious), (there, scores) = (
+        map(torch.cat, zip(*network.prompt(exact.to(device), points, (160, 120))))
+        for network, device in zip(networks, ("cpu", "cuda"))
+    )
+    torch.testing.assert_close(there.cpu(), logits, rtol=0, atol=5e-3 * float(logits.abs().max()))  # TF32
+    torch.testing.assert_close(scores.cpu(), ious, rtol=0, atol=1e-3)
     monkeypatch.setattr(SamNetwork, "decode", lambda self, _, points: tuple(x.to(self._device) for x in blobs(points)))
     rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, region_area=15)
     cpu, gpu = (SamMasks(path, device=device, rules=rules).masks(image) for device in ("cpu", "cuda"))

@@ -10,9 +10,9 @@ from scipy import ndimage
 
 from normlift_ns.encoders import small_regions
 from normlift_ns.encoders.small_regions import clean_masks
+from tests.encoders.tiny import DEVICES
 
 EIGHT = np.ones((3, 3))
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"))]
 
 
 def areas(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
