@@ -253,6 +253,51 @@ def damage(folder: Path, kind: str) -> Path:
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
+        ({"model": {"image_encoder.trunk.pos_embed": torch.zeros(2)}}, "it is of SAM 2, as its .*trunk.pos_embed says"),
+        ({"image_encoder.layers.0.x": torch.zeros(2)}, "it is of MobileSAM, as its parameter image_encoder.layers.0.x"),
+        ("hq", "it is of HQ-SAM, as its parameter mask_decoder.hf_token.weight says"),
+        ("sam2", "config.json is of model type 'sam2', expected 'sam', the first SAM"),
+        ("sam2_video", "config.json is of model type 'sam2_video', expected 'sam', the first SAM"),
+        ({"weight": torch.zeros(2)}, "it has no image_encoder.pos_embed, which Meta's files of the first SAM"),
+    ],
+)
+def test_other_kinds_of_sam_are_named(weights, tmp_path, kind, message):
+    path = tmp_path / "weights.pt"
+    if kind == "hq":
+        kind = {**tiny_sam().state_dict(), "mask_decoder.hf_token.weight": torch.zeros(1, 8)}
+    if isinstance(kind, dict):
+        torch.save(kind, path)
+    elif kind == "sam2":
+        path = tmp_path
+        transformers.Sam2Config().save_pretrained(tmp_path)
+    else:
+        path = tmp_path
+        (tmp_path / "config.json").write_text(json.dumps({"model_type": kind}))
+    with pytest.raises(ValueError, match=message) as info:
+        SamMasks(str(path)).masks(noise(30, 40))
+    for part in (str(path), "the first SAM, ViT-B, -L or -H", "facebook/sam-vit-huge", "sam_vit_h_4b8939.pth"):
+        assert part in str(info.value)
+
+
+def test_weights_of_another_network_are_not_downloaded(monkeypatch, tmp_path):
+    asked = []
+
+    def download(name, allow_patterns):
+        asked.append((name, allow_patterns))
+        (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2_video"}))
+        return str(tmp_path)
+
+    monkeypatch.setattr("normlift_ns.encoders.sam_weights.probe", lambda address: None)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(ValueError, match="of model type 'sam2_video', expected 'sam', the first SAM"):
+        SamMasks("facebook/sam2-hiera-large").masks(noise(30, 40))
+    assert all(patterns == ["config.json"] for _, patterns in asked)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
         ("other network", "model type 'bert', expected 'sam'"),
         ("truncated", "damaged or not of SAM"),
         ("no weights", r"the folder has no model\.safetensors"),
