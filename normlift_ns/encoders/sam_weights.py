@@ -17,8 +17,8 @@ from normlift_ns.encoders.weights import content_identity, first_line, probe
 
 DEFAULT_SAM = "facebook/sam-vit-huge"
 REMEDY = (
-    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such as "
-    "sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
+    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
+    "as sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
 )
 _FILES = ("model.safetensors", "pytorch_model.bin")
 _FIRST = "the first SAM, ViT-B, -L or -H"
