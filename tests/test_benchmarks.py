@@ -38,7 +38,8 @@ def test_quick_front_ends_benchmark(tmp_path):
     assert done.returncode == 0, done.stderr
     print(done.stdout)
     metrics = {metric["key"]: metric for metric in json.loads((tmp_path / "front_ends.json").read_text())["metrics"]}
-    assert {"sam_network_rate", "sam_labels_s", "nms_10_s", "encode_10_s", "share_10", "patches_s"} <= set(metrics)
+    keys = {"nms_10_s", "clean_10_s", "encode_10_s", "share_10", "share_clean_10", "patches_s", "view_s"}
+    assert keys | {"sam_network_rate", "sam_labels_s", "sam_labels_clean_s"} <= set(metrics)
     assert all(metrics[f"sam_masks_{level}"]["value"] > 0 for level in ("default", "s", "m", "l"))
     assert metrics["nms_10_s"]["error"] == 0
     assert metrics["encode_10_s"]["error"] < 1e-5 and metrics["patches_s"]["error"] < 1e-5

@@ -23,7 +23,6 @@ ALLOWED = {
         "PIL",
         "huggingface_hub",
         "torchvision",
-        "cv2",
         *(f"normlift_ns.{x}" for x in ("core", "encoders")),
     },
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},

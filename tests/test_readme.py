@@ -37,7 +37,11 @@ def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
 FRONT_ENDS = (ROOT / "docs" / "front_ends.md").read_text()
 
 
-@pytest.mark.parametrize("text", [README.split("## Options of ns-normlift")[1].split("## Limits")[0], FRONT_ENDS])
+COMMANDS = "".join(re.findall(r"^    ns-normlift(?:-query)? (?:.*\\\n)*.*\n", README, flags=re.MULTILINE))
+TABLE = README.split("## Options of ns-normlift")[1].split("## Limits")[0]
+
+
+@pytest.mark.parametrize("text", [TABLE, COMMANDS, FRONT_ENDS])
 def test_options_that_are_shown_exist(text):
     named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", text)} - {"help"}
     commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, NormLiftQuery)

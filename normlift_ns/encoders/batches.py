@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 from torch import Tensor
 
-from normlift_ns.core.gpu import in_parts
+from normlift_ns.core.gpu import Items, in_parts
 
 T = TypeVar("T")
+Item = TypeVar("Item")
 _ADVICE = (
     "close other programs that use the GPU, take a smaller model, or images of a fraction of the size "
     "(--lift-downscale 2), or lift on the CPU: --device cpu"
@@ -25,7 +27,7 @@ class Batches:
     size: int
     """Items per batch."""
 
-    def __call__(self, function: Callable[[Tensor], T], items: Tensor) -> Iterator[T]:
+    def __call__(self, function: Callable[[Items], T], items: Items) -> Iterator[T]:
         """The function's results on consecutive items.
 
         Raises:
@@ -39,3 +41,26 @@ class Batches:
                 self.size = -(-len(batch) // len(results))
             start += len(batch)
             yield from results
+
+    def across(
+        self, function: Callable[[Sequence[Item]], Tensor], parts: Iterable[Sequence[Item]]
+    ) -> Iterator[list[Tensor]]:
+        """The function's rows, one per item, of each part, where one batch may hold items of several parts.
+
+        A part is asked for when those before it leave room in a batch; its rows are given as soon as they are known.
+
+        Raises:
+            MemoryError: not even one item fits.
+        """
+        counts, waiting, rows = deque[int](), list[Item](), deque[Tensor]()
+        for part in parts:
+            counts.append(len(part))
+            waiting.extend(part)
+            while len(waiting) >= self.size:
+                batch, waiting = waiting[: self.size], waiting[self.size :]
+                rows.extend(row for result in self(function, batch) for row in result)
+            while len(counts) > 0 and counts[0] <= len(rows):
+                yield [rows.popleft() for _ in range(counts.popleft())]
+        rows.extend(row for result in self(function, waiting) for row in result)
+        for count in counts:
+            yield [rows.popleft() for _ in range(count)]

@@ -7,7 +7,8 @@ is computed again. The folders may be deleted at any time.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import blake2b
@@ -98,12 +99,28 @@ class CachedEncoder:
         return self.encoder.identity
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        path = self.path(image, labels)
-        found = _read(path, "features")
-        if found is None:
-            found = self.encoder.encode(image, labels)
-            _write(path, "features", found)
-        return found
+        return next(self.encode_each([(image, labels)]))
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        kept: deque[Tensor | None] = deque()  # of the views asked for and not given; None: the encoder has them
+        paths: deque[Path] = deque()  # of those that the encoder has
+
+        def new() -> Iterator[tuple[Tensor, Tensor]]:
+            for image, labels in views:
+                path = self.path(image, labels)
+                kept.append(_read(path, "features"))
+                if kept[-1] is None:
+                    paths.append(path)
+                    yield image, labels
+
+        for features in self.encoder.encode_each(new()):
+            _write(paths.popleft(), "features", features)
+            while (found := kept.popleft()) is not None:
+                yield found
+            yield features
+        yield from (found for found in kept if found is not None)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)

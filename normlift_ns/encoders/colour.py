@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -60,6 +60,11 @@ class ColourEncoder:
         pixels = torch.bincount(region)
         total = torch.zeros(len(pixels), 3, dtype=torch.float64).index_add_(0, region, lab.double())
         return embed(total / pixels[:, None]).float()
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        return (self.encode(image, labels) for image, labels in views)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """One unit row per prompt: the mean of the vectors of the colours it names, so that each of them answers.

@@ -1,13 +1,10 @@
-"""Rules on binary masks: boxes, small regions, LangSplat's suppression, and label maps of masks that overlap."""
+"""Rules on binary masks: boxes, LangSplat's suppression, and label maps of masks that overlap."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
@@ -91,28 +88,6 @@ def boxes_of(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
     return torch.stack([x0, y0, x1, y1], dim=1) * (x1 >= 0)[:, None]
 
 
-def clean_masks(
-    masks: Bool[Tensor, "m h w"], boxes: Int64[Tensor, "m 4"], least: int
-) -> tuple[Bool[Tensor, "m h w"], Bool[Tensor, " m"]]:
-    """Fills holes and drops pieces of fewer than `least` pixels, 8-connected; the largest piece stays in any case.
-
-    Args:
-        boxes: as `boxes_of` returns them.
-    Returns:
-        the masks, and which of them had such holes or pieces.
-    """
-    size = masks.shape[1:]
-    spans = [_around(box, size) for box in boxes.tolist()]
-    parts = (masks[i, y, x].cpu().numpy() for i, (y, x) in enumerate(spans))
-    with ThreadPoolExecutor() as pool:
-        found = list(pool.map(lambda part, span: _clean(part, span, size, least), parts, spans))
-    cleaned = masks.clone()
-    for i, mask in enumerate(found):
-        if mask is not None:
-            cleaned[i] = torch.from_numpy(mask).to(masks.device)
-    return cleaned, torch.tensor([mask is not None for mask in found], dtype=torch.bool, device=masks.device)
-
-
 def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     """Pixels that masks share, counted exactly: float32 sums of ones are exact below 2^24 pixels."""
     flat = masks.flatten(1)
@@ -126,41 +101,3 @@ def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
 def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
     step = min(2**24, max(1, _CHUNK // max(1, len(flat))))
     return (slice(start, start + step) for start in range(0, flat.shape[1], step))
-
-
-def _around(box: list[int], size: torch.Size) -> tuple[slice, slice]:
-    """Rows and columns of a box and of one pixel around it, as far as the image goes."""
-    x0, y0, x1, y1 = box
-    return slice(max(y0 - 1, 0), min(y1 + 2, size[0])), slice(max(x0 - 1, 0), min(x1 + 2, size[1]))
-
-
-def _clean(part: np.ndarray, span: tuple[slice, slice], size: torch.Size, least: int) -> np.ndarray | None:
-    """`clean_masks` of one mask, cut out with a pixel around it; None if nothing is small.
-
-    The outermost line stands for all that lies beyond it, none of which is in the mask, and is weighted accordingly.
-    """
-    weight = np.ones(part.shape)
-    for axis, line in enumerate(span):
-        along = np.ones(part.shape[axis])
-        along[0] += line.start
-        along[-1] += size[axis] - line.stop
-        weight *= along.reshape(-1, 1) if axis == 0 else along
-    holes, areas = _components(~part, weight)
-    small = areas < least
-    small[0] = False
-    filled = part | small[holes]
-    pieces, areas = _components(filled, weight)
-    stays = areas >= least
-    stays[0] = False
-    if not small.any() and stays[1:].all():
-        return None
-    if len(areas) > 1 and not stays.any():
-        stays[1 + areas[1:].argmax()] = True
-    rows, columns = (np.arange(n).clip(line.start, line.stop - 1) - line.start for n, line in zip(size, span))
-    return stays[pieces][rows][:, columns]
-
-
-def _components(mask: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """8-connected components, numbered from 1, 0 outside of the mask, and the sum of weights of each number."""
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    return labels, np.bincount(labels.ravel(), weights=weight.ravel(), minlength=count)

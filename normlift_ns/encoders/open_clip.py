@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import torch
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -74,15 +76,32 @@ class OpenClipEncoder:
             ValueError: a weight file that is damaged or of another architecture.
             MemoryError: the memory of the device does not hold a single crop.
         """
-        image, labels = image.to(self.device), labels.to(self.device)
-        boxes = region_boxes(labels)
-        if len(boxes) == 0:
-            return torch.empty(0, import_open_clip().get_model_config(self.model)["embed_dim"])
+        return next(self.encode_each([(image, labels)]))
 
-        def encode(regions: Tensor) -> Tensor:
-            return self._image_rows(masked_crops(image, labels, regions, boxes[regions], self.network.size, self.fill))
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        """As in `Encoder`: crops of several views fill a batch; raises as `encode`."""
+        seen: dict[int, _Seen] = {}
 
-        return torch.cat(list(self._crops(encode, torch.arange(len(boxes), device=self.device))))
+        def crops() -> Iterator[list[tuple[int, int]]]:
+            for number, (image, labels) in enumerate(views):
+                there = labels.to(self.device)
+                seen[number] = _Seen(image.to(self.device), there, region_boxes(there))
+                yield [(number, region) for region in range(len(seen[number].boxes))]
+
+        def encode(batch: Sequence[tuple[int, int]]) -> Tensor:
+            cut = []
+            for number, crops_of_view in groupby(batch, itemgetter(0)):
+                image, labels, boxes = seen[number]
+                regions = torch.tensor([region for _, region in crops_of_view], device=self.device)
+                cut.append(masked_crops(image, labels, regions, boxes[regions], self.network.size, self.fill))
+            return self._image_rows(torch.cat(cut))
+
+        for number, rows in enumerate(self._crops.across(encode, crops())):
+            del seen[number]
+            none = torch.empty(0, import_open_clip().get_model_config(self.model)["embed_dim"])
+            yield torch.stack(rows) if len(rows) > 0 else none
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """One unit row per prompt; raises as `encode`, and ValueError for an empty prompt or none."""
@@ -117,6 +136,14 @@ class OpenClipEncoder:
     @cached_property
     def _texts(self) -> Batches:
         return Batches(_BATCH[torch.device(self.device).type])
+
+
+class _Seen(NamedTuple):
+    """A view, on the device, whose regions wait for a batch."""
+
+    image: UInt8[Tensor, "h w 3"]
+    labels: Int32[Tensor, "depth h w"]
+    boxes: Int64[Tensor, "r 4"]
 
 
 def _templates(template: str) -> Sequence[Callable[[str], str]]:

@@ -28,9 +28,10 @@ from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import pad
 
-from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
+from normlift_ns.encoders.masks import Suppression, boxes_of, mask_nms, stack_masks
 from normlift_ns.encoders.sam_network import SamNetwork
 from normlift_ns.encoders.sam_weights import DEFAULT_SAM, check_sam, sam_identity
+from normlift_ns.encoders.small_regions import clean_masks
 
 Level = Literal["default", "s", "m", "l"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -150,7 +151,7 @@ class SamMasks:
         chosen = torch.cat(list(kept.values())).unique()
         found = found.at(chosen)
         masks = self._whole(found, crops, size)
-        masks, changed = clean_masks(masks, boxes_of(masks), rules.region_area)
+        masks, changed = clean_masks(masks, rules.region_area)
         boxes, score = boxes_of(masks), found.stability * found.predicted_iou
         result: dict[Level, Tensor] = {}
         for level, index in kept.items():

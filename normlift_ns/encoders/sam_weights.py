@@ -17,10 +17,18 @@ from normlift_ns.encoders.weights import content_identity, first_line, probe
 
 DEFAULT_SAM = "facebook/sam-vit-huge"
 REMEDY = (
-    "give --sam-model a folder with config.json and model.safetensors, or a file such as sam_vit_h_4b8939.pth; or cut "
-    "the images without SAM: --regions patches or --regions superpixel"
+    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
+    "as sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
 )
 _FILES = ("model.safetensors", "pytorch_model.bin")
+_FIRST = "the first SAM, ViT-B, -L or -H"
+_OTHERS = {
+    "image_encoder.trunk.": "SAM 2",
+    "image_encoder.layers.": "MobileSAM",
+    "mask_decoder.hf_token": "HQ-SAM",
+    "mask_decoder.compress_vit_feat": "HQ-SAM",
+}
+"""What the parameters of other networks begin with."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {
@@ -127,7 +135,9 @@ def _download(checkpoint: str) -> Path:
     hub = importlib.import_module("huggingface_hub")
     try:
         probe(hub.constants.ENDPOINT)
-        return Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json", _FILES[0]]))
+        folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
+        wanted = ["config.json", _FILES[0]] if _model_type(folder) == "sam" else ["config.json"]
+        return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
     except Exception as error:  # whatever a download makes its libraries raise
         raise FileNotFoundError(
             f"SAM checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
@@ -136,13 +146,17 @@ def _download(checkpoint: str) -> Path:
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
-    config = json.loads((folder / "config.json").read_text())
-    if config.get("model_type") != "sam":
-        raise ValueError(f"config.json is of model type {config.get('model_type')!r}, expected 'sam'")
+    if _model_type(folder) != "sam":
+        raise ValueError(f"config.json is of model type {_model_type(folder)!r}, expected 'sam', {_FIRST}")
     found = _weights(folder)
     if len(found) == 0:
         raise ValueError(f"the folder has no {_FILES[0]}")
+    config = json.loads((folder / "config.json").read_text())
     return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
+
+
+def _model_type(folder: Path) -> Any:
+    return json.loads((folder / "config.json").read_text()).get("model_type")
 
 
 def _weights(folder: Path) -> list[Path]:
@@ -151,10 +165,14 @@ def _weights(folder: Path) -> list[Path]:
 
 def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
     state = _read_tensors(path)
+    for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
+        for part, kind in _OTHERS.items():
+            if str(name).startswith(part):
+                raise ValueError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}")
     if "image_encoder.pos_embed" not in state:
         if (path.parent / "config.json").is_file():
             return _read_folder(path.parent)
-        raise ValueError("it has no image_encoder.pos_embed, which Meta's files have")
+        raise ValueError(f"it has no image_encoder.pos_embed, which Meta's files of {_FIRST} have")
     return published_config(state), {published_name(name): value for name, value in state.items()}
 
 

@@ -10,8 +10,10 @@ common (`joint_partition`), and added up to the regions of the level that counts
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -172,6 +174,13 @@ class Encoder(TextEncoder, Protocol):
         pixels that have its id at any depth."""
         ...
 
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        """`encode` of several views, in their order, but for rounding. A view is asked for when the features of those
+        before it are given, or can be found better together with its own."""
+        ...
+
 
 @dataclass(frozen=True)
 class RegionFeatures:
@@ -191,21 +200,48 @@ class RegionFeatures:
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        check_image(image, name)
-        image = image.cpu()
+        return next(self.views([(image, name)]))
+
+    def views(self, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
+        """As `each_view`."""
+        cut: deque[tuple[Tensor, Tensor]] = deque()  # cells, and their regions in the chosen levels
+
+        def levels() -> Iterator[tuple[Tensor, Tensor]]:
+            for image, name in images:
+                check_image(image, name)
+                maps = self._maps(image.cpu(), name)
+                chosen = list(self.regions.chosen or (0,))
+                cells, regions = joint_partition(maps[:, 0])
+                cut.append((cells, regions[chosen]))
+                for level in chosen:
+                    yield image.cpu(), maps[level]
+
+        encoded = self.encoder.encode_each(levels())
+        for rows in encoded:
+            cells, regions = cut.popleft()
+            features = [rows, *islice(encoded, len(regions) - 1)]
+            first = torch.tensor([0, *map(len, features)]).cumsum(0)[:-1, None].int()
+            yield ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + first, -1))
+
+    def _maps(self, image: Tensor, name: str) -> Int32[Tensor, "levels depth h w"]:
+        """The label maps, which have the chosen levels."""
         maps = self.regions.labels(image, name)
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
             found = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
             raise ValueError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
-        features = [self.encoder.encode(image, maps[level]) for level in chosen]
-        cells, regions = joint_partition(maps[:, 0])
-        first = torch.tensor([0, *(len(rows) for rows in features)]).cumsum(0)[:-1, None].int()
-        regions = regions[list(chosen)]
-        return ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + first, -1))
+        return maps
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
+
+
+def each_view(source: FeatureSource, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
+    """`source.view` of several images, in their order, but for rounding. Images are asked for as they are needed:
+    several where an encoder sees the regions of several at once."""
+    if isinstance(source, RegionFeatures):
+        return source.views(images)
+    return (source.view(image, name) for image, name in images)
 
 
 def check_image(image: Tensor, name: str) -> None:

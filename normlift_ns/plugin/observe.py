@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from hashlib import blake2b
 from pathlib import Path
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.encoders.source import FeatureSource, each_view
 from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.raster.settings import RasterSettings
 
@@ -67,12 +68,18 @@ def see_block(
         divisor: of the size of images and cameras.
         done: called after every view, with the view as the source saw it.
     """
+    waiting: deque[View] = deque()
+
+    def images() -> Iterator[tuple[Tensor, str]]:
+        for index in indices:
+            view = run.train[index]
+            view = view._replace(image=run.render(view.camera)) if rendered else view
+            waiting.append(_smaller(view, divisor) if divisor > 1 else view)
+            yield waiting[-1].image, view.name
+
     block = Block([], [], [], [])
-    for index in indices:
-        view = run.train[index]
-        view = view._replace(image=run.render(view.camera)) if rendered else view
-        view = _smaller(view, divisor) if divisor > 1 else view
-        found = source.view(view.image, view.name)
+    for found in each_view(source, images()):
+        view = waiting.popleft()
         block.cameras.append(view.camera)
         block.labels.append(found.labels if view.mask is None else found.labels.where(view.mask, MASKED))
         block.regions.append(found.region_of_cell)

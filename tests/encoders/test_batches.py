@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from normlift_ns.encoders.batches import Batches
 
@@ -27,6 +29,35 @@ def test_batches_shrink_until_they_fit_and_stay_so():
     del asked[:]
     assert torch.cat(list(batches(function, torch.arange(7)))).tolist() == list(range(0, 14, 2))
     assert asked == [3, 3, 1]
+
+
+@given(counts=st.lists(st.integers(0, 9), max_size=9), size=st.integers(1, 8))
+def test_batches_are_filled_from_several_parts(counts, size):
+    asked, sizes, first = [], [], [sum(counts[:i]) for i in range(len(counts))]
+
+    def parts():
+        for i, count in enumerate(counts):
+            asked.append(i)
+            yield list(range(first[i], first[i] + count))
+
+    def double(items):
+        sizes.append(len(items))
+        return torch.tensor(items)[:, None] * 2
+
+    for i, rows in enumerate(Batches(size).across(double, parts())):
+        assert [int(row) for row in rows] == list(range(2 * first[i], 2 * (first[i] + counts[i]), 2))
+        assert first[len(asked) - 1] < first[i] + counts[i] + size  # no part is asked for without need
+    assert asked == list(range(len(counts)))
+    assert sizes == [size] * (sum(counts) // size) + [sum(counts) % size] * (sum(counts) % size > 0)
+
+
+def test_batches_of_several_parts_shrink_too():
+    function, asked = narrow(3)
+    batches = Batches(8)
+    parts = ([torch.tensor(5)] * 4, [], [torch.tensor(6)] * 5)
+    rows = list(batches.across(lambda items: function(torch.stack(list(items))), parts))
+    assert [[int(row) for row in part] for part in rows] == [[10] * 4, [], [12] * 5]
+    assert asked == [8, 4, 2, 2, 4, 2, 2, 1] and batches.size == 2
 
 
 def test_one_item_that_does_not_fit_ends_it():

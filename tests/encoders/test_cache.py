@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
+from normlift_ns.encoders.batches import Batches
 from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, CachedTexts
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.open_clip import OpenClipEncoder
 from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles
+from normlift_ns.encoders.source import each_view
 from tests.encoders.tiny import CLIP, write_clip
 
 IMAGE = torch.randint(0, 256, (20, 30, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
@@ -35,6 +37,9 @@ class Counted:
     def encode(self, image, labels):
         self.asked.append("")
         return self.inner.encode(image, labels)
+
+    def encode_each(self, views):
+        return (self.encode(image, labels) for image, labels in views)
 
 
 @pytest.fixture
@@ -169,6 +174,54 @@ def clip(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clip")
     write_clip(folder)
     return OpenClipEncoder(CLIP, str(folder / "tiny.pt"))
+
+
+def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):
+    """Six regions in each of seven views, two of which are known; batches of eight crops."""
+    images = [(IMAGE + 30 * i, f"{i}.jpg") for i in range(7)]
+    expected = [RegionFeatures(Grid(6), clip).view(*image) for image in images]
+    encoder, sizes = batches_of(clip, 8)
+    source = cached(RegionFeatures(Grid(6), encoder), tmp_path)
+    for i in (0, 3):
+        source.view(*images[i])
+    del sizes[:]
+    for view, one in zip(each_view(source, iter(images)), expected, strict=True):
+        assert torch.equal(view.labels, one.labels) and torch.equal(view.regions, one.regions)
+        torch.testing.assert_close(view.features, one.features, rtol=0, atol=1e-5)
+    assert sizes == [8, 8, 8, 6]
+    again = each_view(cached(RegionFeatures(Grid(6), unusable(clip)), tmp_path), images)
+    assert all(torch.equal(view.labels, one.labels) for view, one in zip(again, expected, strict=True))
+
+
+def test_an_interruption_costs_the_views_of_one_batch(clip, tmp_path):
+    encoder, sizes = batches_of(clip, 8)
+    source = cached(RegionFeatures(Grid(6), encoder), tmp_path)
+    images = [(IMAGE + 30 * i, f"{i}.jpg") for i in range(6)]
+
+    def interrupted():
+        yield from images[:5]
+        raise KeyboardInterrupt
+
+    seen = []
+    with pytest.raises(KeyboardInterrupt):
+        seen.extend(len(view.features) for view in each_view(source, interrupted()))
+    assert sizes == [8, 8, 8]  # 24 of 30 crops: four views
+    assert len(list((tmp_path / "features").iterdir())) == 4 and len(list((tmp_path / "regions").iterdir())) == 5
+    del sizes[:]
+    assert len(list(each_view(source, images))) == 6
+    assert sizes == [8, 4]
+
+
+def batches_of(encoder: OpenClipEncoder, size: int) -> tuple[OpenClipEncoder, list[int]]:
+    """The encoder with batches of that size, and the number of crops of every call of its network."""
+    copy, sizes = replace(encoder), []
+
+    def counted(crops):
+        sizes.append(len(crops))
+        return OpenClipEncoder._image_rows(copy, crops)
+
+    vars(copy).update(network=encoder.network, _crops=Batches(size), _image_rows=counted)
+    return copy, sizes
 
 
 def unusable(encoder: OpenClipEncoder) -> OpenClipEncoder:

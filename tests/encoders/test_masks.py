@@ -1,4 +1,4 @@
-"""Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats, flood fill."""
+"""Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from normlift_ns.encoders.masks import Suppression, boxes_of, clean_masks, mask_nms, stack_masks
+from normlift_ns.encoders.masks import Suppression, boxes_of, mask_nms, stack_masks
+from tests.encoders.tiny import needs_cuda
 
 
 def nms_by_hand(masks: list[set], scores: list[float], rules: Suppression) -> list[bool]:
@@ -64,8 +65,8 @@ def test_suppression_is_that_of_the_protocol(masks, data, rules):
     assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores, rules)
 
 
-def test_suppression_of_overlaps_as_large_as_those_of_photographs():
-    """Many masks in chunks of pixels, with areas from specks to half of the image."""
+def discs() -> np.ndarray:
+    """Pairs of discs that nearly agree, of areas from specks to half of the image."""
     g = np.random.default_rng(0)
     y, x = np.mgrid[:120, :160]
     masks = []
@@ -73,8 +74,12 @@ def test_suppression_of_overlaps_as_large_as_those_of_photographs():
         cy, cx, r = g.uniform(0, 120), g.uniform(0, 160), np.exp(g.uniform(0.5, 4.2))
         masks.append((y - cy) ** 2 + (x - cx) ** 2 < r**2)
         masks.append((y - cy - g.normal()) ** 2 + (x - cx) ** 2 < (r * g.uniform(0.9, 1.1)) ** 2)
-    masks = np.array([mask for mask in masks if mask.any()])
-    scores = g.uniform(0.6, 1, len(masks))
+    return np.array([mask for mask in masks if mask.any()])
+
+
+def test_suppression_of_overlaps_as_large_as_those_of_photographs():
+    masks = discs()
+    scores = np.random.default_rng(1).uniform(0.6, 1, len(masks))
     found = mask_nms(torch.from_numpy(masks), torch.from_numpy(scores))
     assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores.tolist(), Suppression())
     assert 5 < int(found.sum()) < len(masks) // 2
@@ -92,6 +97,16 @@ def test_a_small_mask_inside_a_large_one_goes_whatever_its_score():
     small[0, 2:5, 2:5] = True
     for scores in ([0.8, 0.9], [0.9, 0.8]):
         assert mask_nms(torch.cat([large, small]), torch.tensor(scores)).tolist() == [True, False]
+
+
+@needs_cuda
+def test_a_gpu_finds_the_same():
+    masks = torch.from_numpy(discs())
+    scores = 0.6 + 0.4 * torch.rand(len(masks), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(mask_nms(masks.cuda(), scores.cuda()).cpu(), mask_nms(masks, scores))
+    assert torch.equal(stack_masks(masks.cuda()).cpu(), stack_masks(masks))
+    assert torch.equal(boxes_of(masks.cuda()).cpu(), boxes_of(masks))
+    assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
 
 
 @settings(max_examples=100, deadline=None)
@@ -118,62 +133,8 @@ def test_boxes(masks, empty):
         assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
 
 
-def components_by_hand(mask: np.ndarray) -> list[set]:
-    """8-connected components by flood fill, in the order of their first pixels."""
-    left, found = pixels(mask), []
-    for start in sorted(left):
-        if start not in left:
-            continue
-        left.remove(start)
-        piece, front = {start}, [start]
-        while front:
-            y, x = front.pop()
-            near = {(y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)} & left
-            left -= near
-            piece |= near
-            front.extend(near)
-        found.append(piece)
-    return found
-
-
-def clean_by_hand(mask: np.ndarray, least: int) -> tuple[list[np.ndarray], bool]:
-    """All right answers: several where the largest of small pieces has equals."""
-    mask, changed = mask.copy(), False
-    for hole in components_by_hand(~mask):
-        if len(hole) < least:
-            mask[tuple(np.array(sorted(hole)).T)] = True
-            changed = True
-    pieces = components_by_hand(mask)
-    stay = [piece for piece in pieces if len(piece) >= least]
-    largest = max(map(len, pieces))
-    answers = [set().union(*stay)] if len(stay) > 0 else [piece for piece in pieces if len(piece) == largest]
-    results = []
-    for answer in answers:
-        results.append(np.zeros_like(mask))
-        results[-1][tuple(np.array(sorted(answer)).T)] = True
-    return results, changed or len(stay) < len(pieces)
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    mask=arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))),
-    margin=st.tuples(*[st.integers(0, 3)] * 4),
-    least=st.integers(1, 12),
-)
-def test_small_regions(mask, margin, least):
-    mask = np.pad(mask, (margin[:2], margin[2:]))
-    mask[mask.shape[0] // 2, mask.shape[1] // 2] = True
-    masks = torch.from_numpy(mask)[None]
-    found, changed = clean_masks(masks, boxes_of(masks), least)
-    answers, different = clean_by_hand(mask, least)
-    assert any(np.array_equal(found[0].numpy(), answer) for answer in answers)
-    assert changed.tolist() == [different]
-
-
 @pytest.mark.parametrize("count", [0, 3])
 def test_no_masks_and_whole_images(count):
     masks = torch.ones(count, 4, 5, dtype=torch.bool)
-    cleaned, changed = clean_masks(masks, boxes_of(masks), 10)
-    assert torch.equal(cleaned, masks) and changed.tolist() == [False] * count
     assert mask_nms(masks, torch.ones(count)).tolist() == [True, False, False][:count]
     assert stack_masks(masks).shape == (max(1, count), 4, 5)

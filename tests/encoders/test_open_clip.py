@@ -12,6 +12,7 @@ import huggingface_hub
 import numpy as np
 import open_clip
 import pytest
+import timm
 import torch
 from safetensors.torch import save_file
 
@@ -19,7 +20,7 @@ from normlift_ns.encoders import SourceOptions, make_encoder
 from normlift_ns.encoders.crops import masked_crops, region_boxes
 from normlift_ns.encoders.open_clip import OpenClipEncoder
 from tests.encoders.tiny import CLIP as NAME
-from tests.encoders.tiny import write_clip
+from tests.encoders.tiny import DEVICES, needs_cuda, write_clip
 
 IMAGE = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 LABELS = torch.full((48, 64), -1, dtype=torch.int32)
@@ -154,6 +155,24 @@ def test_batches_change_nothing(encoder):
     torch.testing.assert_close(encoder.text(prompts)[64:65], encoder.text(prompts[64:65]), rtol=0, atol=1e-5)
 
 
+def test_crops_of_several_views_fill_batches(encoder, monkeypatch):
+    """Seven views of 0, 1, 3, 3, 0, 70 and 1 regions: 78 crops in two batches instead of six."""
+    many = (torch.arange(48 * 64).reshape(1, 48, 64) * 70 // (48 * 64)).int()
+    none, one = torch.full_like(many, -1), torch.where(MAPS == 1, 0, -1).int()
+    views = [(IMAGE + 10 * i, labels) for i, labels in enumerate((none, one, MAPS, MAPS, none, many, one))]
+    expected = [encoder.encode(*view) for view in views]
+    sizes, rows = [], OpenClipEncoder._image_rows
+    monkeypatch.setattr(
+        OpenClipEncoder, "_image_rows", lambda self, crops: (sizes.append(len(crops)), rows(self, crops))[1]
+    )
+    found = list(encoder.encode_each(iter(views)))
+    assert sizes == [64, 14]
+    assert [features.shape for features in found] == [features.shape for features in expected]
+    for features, alone in zip(found, expected):
+        torch.testing.assert_close(features, alone, rtol=0, atol=1e-5)
+    assert not torch.allclose(found[2], found[3], atol=1e-3)
+
+
 def test_no_region_needs_no_weights(weights):
     encoder = OpenClipEncoder(NAME, str(weights / "tiny.pt"))
     assert encoder.encode(IMAGE, torch.full((1, 48, 64), -1, dtype=torch.int32)).shape == (0, 24)
@@ -182,11 +201,23 @@ def test_a_weight_file_counts_by_its_content(encoder, weights, tmp_path):
     assert replace(encoder, pretrained=str(copy)).identity != encoder.identity
 
 
+@needs_cuda
+@pytest.mark.parametrize("fill", ["black", "white"])
+def test_crops_on_a_gpu_are_those_on_the_cpu(fill):
+    for size in ((32, 32), (60, 45)):
+        boxes, regions = region_boxes(MAPS), torch.arange(3)
+        crops = masked_crops(IMAGE, MAPS, regions, boxes, size, fill)
+        there = [x.cuda() for x in (IMAGE, MAPS, regions, boxes)]
+        assert torch.equal(region_boxes(there[1]).cpu(), boxes)
+        torch.testing.assert_close(masked_crops(*there, size, fill).cpu(), crops, rtol=0, atol=1e-3)
+
+
+@needs_cuda
 def test_half_precision_costs_little(encoder):
     """On a GPU the network runs in half precision."""
-    if not torch.cuda.is_available():
-        pytest.skip("needs a CUDA GPU")
     gpu = replace(encoder, device="cuda")
+    assert gpu.network.model.visual.conv1.weight.dtype == torch.float16
+    assert gpu.network.normalized(torch.zeros(1, 3, 32, 32, device="cuda")).dtype == torch.float16
     for on_gpu, on_cpu in (
         (gpu.encode(IMAGE, MAPS), encoder.encode(IMAGE, MAPS)),
         (gpu.text(["red"]), encoder.text(["red"])),
@@ -194,6 +225,24 @@ def test_half_precision_costs_little(encoder):
         assert on_gpu.dtype == torch.float32 and on_gpu.device.type == "cpu"
         assert (on_gpu * on_cpu).sum(dim=1).min() > 0.999
         assert torch.linalg.vector_norm(on_gpu, dim=1).tolist() == pytest.approx([1] * len(on_gpu), abs=1e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_batches_of_several_views_shrink_until_they_fit(encoder, monkeypatch, device):
+    there, rows, sizes = replace(encoder, device=device), OpenClipEncoder._image_rows, []
+    expected = encoder.encode(IMAGE, MAPS)
+
+    def narrow(self, crops):
+        sizes.append(len(crops))
+        if len(crops) > 4:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.")
+        return rows(self, crops)
+
+    monkeypatch.setattr(OpenClipEncoder, "_image_rows", narrow)
+    found = list(there.encode_each((IMAGE, MAPS) for _ in range(4)))
+    assert sizes == [12, 6, 3, 3, 6, 3, 3]
+    for features in found:
+        assert (features * expected).sum(dim=1).min() > 0.999
 
 
 class Bomb:
@@ -273,7 +322,6 @@ def test_downloads_use_the_activation_they_were_trained_with(offline, weights, m
         ({"encoder_pretrained": "my/clip"}, FileNotFoundError, "weight file my/clip does not exist"),
         ({"encoder_pretrained": "clip.safetensors"}, FileNotFoundError, r"clip\.safetensors does not exist.*colour"),
         ({"text_template": "a photo"}, ValueError, "template 'a photo' has no {} where the text belongs"),
-        ({"encoder_model": "ViT-B-16-SigLIP"}, ValueError, r"needs vit_base_patch16_siglip_224 of timm.*timm [\d.]+"),
         (
             {"encoder": "colour", "text_template": "a {}"},
             ValueError,
@@ -285,6 +333,18 @@ def test_downloads_use_the_activation_they_were_trained_with(offline, weights, m
 def test_unknown_names_are_refused_before_loading(options, error, message):
     with pytest.raises(error, match=message):
         make_encoder(SourceOptions(**options))
+
+
+def test_models_that_the_installed_timm_does_not_have_are_refused(monkeypatch):
+    """As nerfstudio's timm 0.6.7 does not have SigLIP's."""
+    if timm.__version__ != "0.6.7":
+        monkeypatch.setattr(timm, "is_model", lambda name: name != "vit_base_patch16_siglip_224")
+    message = (
+        r"OpenCLIP model ViT-B-16-SigLIP \(--encoder-model\) needs vit_base_patch16_siglip_224 of timm, which the "
+        rf"installed timm {timm.__version__} does not have .*such as ViT-B-16 or ViT-L-14"
+    )
+    with pytest.raises(ValueError, match=message):
+        make_encoder(SourceOptions(encoder_model="ViT-B-16-SigLIP"))
 
 
 @pytest.mark.parametrize("prompts", [[], [" "], "red"])

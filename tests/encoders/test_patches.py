@@ -12,7 +12,7 @@ from normlift_ns.encoders.images import read_image
 from normlift_ns.encoders.open_clip import OpenClipEncoder
 from normlift_ns.encoders.patches import PatchFeatures, dense_tokens, patch_grid
 from tests.captures import needs_shared
-from tests.encoders.tiny import CLIP, write_clip
+from tests.encoders.tiny import CLIP, needs_cuda, write_clip
 
 IMAGE = torch.randint(0, 256, (48, 80, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
@@ -106,6 +106,15 @@ def test_models_without_a_value_path_are_refused(encoder, model, reason):
 def test_no_patches(encoder):
     with pytest.raises(ValueError, match="regions per image must be at least 1, got 0"):
         PatchFeatures(encoder, 0)
+
+
+@needs_cuda
+def test_a_gpu_sees_what_the_cpu_sees(encoder):
+    expected = PatchFeatures(encoder, 15).view(IMAGE, "a.jpg")
+    found = PatchFeatures(replace(encoder, device="cuda"), 15).view(IMAGE, "a.jpg")
+    assert torch.equal(found.labels, expected.labels)
+    assert found.features.dtype == torch.float32 and found.features.device.type == "cpu"
+    assert (found.features * expected.features).sum(dim=1).min() > 0.999
 
 
 @needs_shared

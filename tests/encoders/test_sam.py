@@ -22,7 +22,7 @@ from normlift_ns.encoders.sam_network import SamNetwork
 from normlift_ns.encoders.sam_weights import load_sam, published_config, published_name
 from tests.captures import needs_shared
 from tests.encoders.test_masks import nms_by_hand, pixels
-from tests.encoders.tiny import SIDE, tiny_sam, write_sam
+from tests.encoders.tiny import SIDE, needs_cuda, tiny_sam, write_sam
 
 EVERYTHING = Suppression(iou=1.0, score=-1.0, outer=0.0, inner=2.0)
 LOOSE = MaskRules(points_per_side=6, predicted_iou=0.5, stability=0.3, suppression=Suppression(score=0.1))
@@ -131,12 +131,19 @@ def test_the_masks_are_those_of_metas_generator(weights, monkeypatch, size):
         assert 0 < sum(stay) < len(stay)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+@needs_cuda
 def test_a_gpu_finds_what_the_cpu_finds(weights, monkeypatch):
     image, path = noise(160, 120), str(weights / "tiny")
     networks = [SamNetwork.load(path, device) for device in ("cpu", "cuda")]
     exact, half = (network.embed(network.pixels([image]))[0].cpu() for network in networks)
-    assert float((half - exact).norm() / exact.norm()) < 0.01
+    assert 0 < float((half - exact).norm() / exact.norm()) < 0.01 and half.dtype == torch.float32
+    points = point_grid(5) * torch.tensor([120, 160])
+    (logits, ious), (there, scores) = (
+        map(torch.cat, zip(*network.prompt(exact.to(device), points, (160, 120))))
+        for network, device in zip(networks, ("cpu", "cuda"))
+    )
+    torch.testing.assert_close(there.cpu(), logits, rtol=0, atol=5e-3 * float(logits.abs().max()))  # TF32
+    torch.testing.assert_close(scores.cpu(), ious, rtol=0, atol=1e-3)
     monkeypatch.setattr(SamNetwork, "decode", lambda self, _, points: tuple(x.to(self._device) for x in blobs(points)))
     rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, region_area=15)
     cpu, gpu = (SamMasks(path, device=device, rules=rules).masks(image) for device in ("cpu", "cuda"))
@@ -241,6 +248,51 @@ def damage(folder: Path, kind: str) -> Path:
         torch.save({"image_encoder.pos_embed": torch.zeros(1, 8, 8, 32)}, folder / "bad.pth")
         return folder / "bad.pth"
     return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ({"model": {"image_encoder.trunk.pos_embed": torch.zeros(2)}}, "it is of SAM 2, as its .*trunk.pos_embed says"),
+        ({"image_encoder.layers.0.x": torch.zeros(2)}, "it is of MobileSAM, as its parameter image_encoder.layers.0.x"),
+        ("hq", "it is of HQ-SAM, as its parameter mask_decoder.hf_token.weight says"),
+        ("sam2", "config.json is of model type 'sam2', expected 'sam', the first SAM"),
+        ("sam2_video", "config.json is of model type 'sam2_video', expected 'sam', the first SAM"),
+        ({"weight": torch.zeros(2)}, "it has no image_encoder.pos_embed, which Meta's files of the first SAM"),
+    ],
+)
+def test_other_kinds_of_sam_are_named(weights, tmp_path, kind, message):
+    path = tmp_path / "weights.pt"
+    if kind == "hq":
+        kind = {**tiny_sam().state_dict(), "mask_decoder.hf_token.weight": torch.zeros(1, 8)}
+    if isinstance(kind, dict):
+        torch.save(kind, path)
+    elif kind == "sam2":
+        path = tmp_path
+        transformers.Sam2Config().save_pretrained(tmp_path)
+    else:
+        path = tmp_path
+        (tmp_path / "config.json").write_text(json.dumps({"model_type": kind}))
+    with pytest.raises(ValueError, match=message) as info:
+        SamMasks(str(path)).masks(noise(30, 40))
+    for part in (str(path), "the first SAM, ViT-B, -L or -H", "facebook/sam-vit-huge", "sam_vit_h_4b8939.pth"):
+        assert part in str(info.value)
+
+
+def test_weights_of_another_network_are_not_downloaded(monkeypatch, tmp_path):
+    asked = []
+
+    def download(name, allow_patterns):
+        asked.append((name, allow_patterns))
+        (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2_video"}))
+        return str(tmp_path)
+
+    monkeypatch.setattr("normlift_ns.encoders.sam_weights.probe", lambda address: None)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(ValueError, match="of model type 'sam2_video', expected 'sam', the first SAM"):
+        SamMasks("facebook/sam2-hiera-large").masks(noise(30, 40))
+    assert all(patterns == ["config.json"] for _, patterns in asked)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,145 @@
+"""Small holes and pieces, against the same rules mask by mask with SciPy's labelling of pixels."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import ndimage
+
+from normlift_ns.encoders import small_regions
+from normlift_ns.encoders.small_regions import clean_masks
+from tests.encoders.tiny import DEVICES
+
+EIGHT = np.ones((3, 3))
+
+
+def areas(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Component of every pixel, 0 outside, and the pixels of each, [0] apart."""
+    labels, count = ndimage.label(mask, EIGHT)
+    return labels, np.bincount(labels[mask], minlength=count + 1)
+
+
+def clean_by_hand(mask: np.ndarray, least: int) -> tuple[list[np.ndarray], bool]:
+    """All right answers, several where the largest of small pieces has equals; and whether anything is small."""
+    holes, hole = areas(~mask)
+    filled = mask | ((hole < least)[holes] & ~mask)
+    pieces, piece = areas(filled)
+    small = bool((hole[1:] < least).any() or (piece[1:] < least).any())
+    if len(piece) == 1:
+        return [filled], small
+    stay = piece >= least
+    stay[0] = False
+    if stay.any():
+        return [stay[pieces]], small
+    return [pieces == i for i in range(1, len(piece)) if piece[i] == piece[1:].max()], small
+
+
+def assert_right(masks: np.ndarray, least: int, device: str = "cpu") -> tuple[np.ndarray, list[bool]]:
+    given = torch.from_numpy(masks).to(device)
+    cleaned, changed = clean_masks(given, least)
+    assert torch.equal(given.cpu(), torch.from_numpy(masks))  # is left alone
+    assert cleaned.dtype == changed.dtype == torch.bool and cleaned.shape == masks.shape
+    assert cleaned.device == changed.device == given.device
+    for mask, found, different in zip(masks, cleaned.cpu().numpy(), changed.tolist(), strict=True):
+        answers, expected = clean_by_hand(mask, least)
+        assert any(np.array_equal(found, answer) for answer in answers)
+        assert different == expected
+    return cleaned.cpu().numpy(), changed.tolist()
+
+
+def picture(*rows: str) -> np.ndarray:
+    return np.array([[pixel == "#" for pixel in row] for row in rows])
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    masks=arrays(bool, st.tuples(st.integers(1, 4), st.integers(1, 9), st.integers(1, 18))), least=st.integers(0, 30)
+)
+@example(masks=np.zeros((2, 3, 4), dtype=bool), least=100)  # all of the image is a small hole
+@example(masks=np.zeros((2, 3, 4), dtype=bool), least=12)
+@example(masks=np.ones((2, 3, 4), dtype=bool), least=100)
+@example(masks=np.ones((1, 1, 1), dtype=bool), least=2)
+@example(masks=np.indices((3, 8, 8)).sum(axis=0) % 2 == 0, least=5)
+def test_any_masks(masks, least):
+    assert_right(masks, least)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    blobs=st.lists(st.tuples(*[st.integers(0, 29)] * 2, st.integers(0, 7), st.booleans()), max_size=12),
+    least=st.integers(2, 60),
+)
+def test_blobs_and_holes_in_them(blobs, least):
+    y, x = np.mgrid[:30, :30]
+    mask = np.zeros((30, 30), dtype=bool)
+    for row, column, radius, value in blobs:
+        mask[(y - row) ** 2 + (x - column) ** 2 <= radius**2] = value
+    assert_right(np.stack([mask, ~mask, mask.T]), least)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("share", [0.002, 0.1, 0.4, 0.5, 0.6, 0.9, 0.998])
+def test_noise(share, device):
+    g = np.random.default_rng(3)
+    _, changed = assert_right(g.random((6, 90, 131)) < share, 20, device)
+    assert all(changed)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_stripes_checkerboards_and_plain_masks(device):
+    y, x = np.mgrid[:40, :47]
+    masks = [y % 2 == 0, x % 2 == 0, (x + y) % 2 == 0, y > 50, y >= 0, (y == 7) & (x == 9), (y == 39) & (x == 46)]
+    masks += [(y == 0) & (x == 0), (x + y) % 5 == 0, (x // 4 + y // 4) % 2 == 0, (y < 20) ^ ((y == 3) & (x > 44))]
+    for least in (2, 17, 41, 48, 100):
+        assert_right(np.stack(masks), least, device)
+
+
+@pytest.mark.parametrize(
+    ("mask", "least", "expected", "different"),
+    [
+        (picture("#..", ".#.", "..#"), 3, picture("#..", ".#.", "..#"), False),
+        (picture("#...", ".#..", "....", "...#"), 2, picture("#...", ".#..", "....", "...."), True),  # diagonals touch
+        (picture("..#", "#.."), 2, picture("..#", "..."), True),  # an end of a row and the start of the next do not
+        (picture("...", "..#", "#..", "..."), 2, picture("...", "..#", "...", "..."), True),
+        (picture("###.", "####", ".###"), 2, picture("####", "####", "####"), True),  # nor do holes
+        (picture("####", "#.##", "##.#", "####"), 3, picture("####", "####", "####", "####"), True),
+        (picture("####", "#.##", "##.#", "####"), 2, picture("####", "#.##", "##.#", "####"), False),
+        (picture("#####", "#.#.#", "##.##", "#.#.#", "#####"), 6, np.ones((5, 5), dtype=bool), True),
+        # A piece that is large only once its hole is filled stays: holes come first.
+        (picture("###.....", "#.#.....", "###.....", "........"), 9, picture(*["###....."] * 3, "........"), True),
+        (picture("##......", "##....#.", "........"), 5, picture("##......", "##......", "........"), True),
+    ],
+)
+def test_edge_cases_of_neighbourhood_and_order(mask, least, expected, different):
+    cleaned, changed = clean_masks(torch.from_numpy(mask)[None], least)
+    assert np.array_equal(cleaned[0].numpy(), expected)
+    assert changed.tolist() == [different]
+
+
+def test_masks_do_not_touch_one_another():
+    """The last row of a mask and the first of the next, in memory side by side."""
+    masks = np.zeros((3, 5, 8), dtype=bool)
+    masks[0, 4], masks[1, 0, :3], masks[1, 4, 7], masks[2, 0, 0] = True, True, True, True
+    cleaned, changed = assert_right(masks, 4)
+    assert changed == [False, True, True] and cleaned.sum() == 8 + 3 + 1
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_no_masks_and_whole_images(count):
+    masks = torch.ones(count, 4, 5, dtype=torch.bool)
+    cleaned, changed = clean_masks(masks, 10)
+    assert torch.equal(cleaned, masks) and changed.tolist() == [False] * count
+
+
+def test_chunks_change_nothing(monkeypatch):
+    masks = torch.from_numpy(ndimage.uniform_filter(np.random.default_rng(0).random((7, 60, 45)), (0, 5, 5)) > 0.5)
+    expected = clean_masks(masks, 40)
+    assert expected[1].all() and not torch.equal(expected[0], masks)
+    for chunk in (1, 3 * 60 * 45):
+        monkeypatch.setattr(small_regions, "_CHUNK", chunk)
+        assert all(map(torch.equal, clean_masks(masks, 40), expected))
+    monkeypatch.undo()
+    turned = clean_masks(masks.permute(0, 2, 1), 40)  # another order in memory
+    assert torch.equal(turned[0], expected[0].permute(0, 2, 1)) and torch.equal(turned[1], expected[1])
