@@ -24,6 +24,7 @@ from benchmarks.captures import SHARED, trained_scene, trained_state, training_c
 from benchmarks.cpu import clip_like_table, grid_labels
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, SemanticField, lift, rasterize_evidence
+from normlift_ns.core.forms import Form
 from normlift_ns.core.query import CANONICAL_NEGATIVES, relevancy
 from normlift_ns.plugin.asking import Answer, judge, respond
 from normlift_ns.plugin.display import make_display
@@ -112,7 +113,8 @@ def main(quick: bool, device: str, output: Path) -> None:
     source = torch.arange(len(scene))
     moved = torch.randperm(len(scene), generator=g)[: len(scene) // 5]  # about the share that the vote replaces
     source[moved] = torch.randint(0, len(scene), (len(moved),), generator=g)
-    for form, features in (("evidence", mixed), ("float16", mixed), ("low_rank", classes)):
+    forms: tuple[tuple[Form, torch.Tensor], ...] = (("evidence", mixed), ("float16", mixed), ("low_rank", classes))
+    for form, features in forms:
         field = SemanticField.build(lift(evidence, features), scene.means, source, form=form)
         directions = lift(evidence, features.double()).directions(source[some])
         exact = true_relevancy(directions, questions()).where(field.valid()[some, None], 0.0)
