@@ -57,7 +57,7 @@ def questions() -> Question:
 def true_relevancy(exact_directions: torch.Tensor, question: Question) -> torch.Tensor:
     """[M, 1] in float64, from directions in float64."""
     positive, negative = (
-        exact_directions @ torch.nn.functional.normalize(vectors.double(), dim=1).T
+        exact_directions @ torch.nn.functional.normalize(vectors.to(exact_directions), dim=1).T
         for vectors in (question.vectors, question.negative_vectors)
         if vectors is not None
     )
@@ -69,9 +69,9 @@ def fox_model(device: str) -> NormLiftModel:
     state = trained_state("fox")
     degree = math.isqrt(1 + state["gauss_params.features_rest"].shape[1]) - 1
     config = NormLiftModelConfig(num_random=20, sh_degree=degree)
-    model = NormLiftModel(config, scene_box=None, num_train_data=1)  # type: ignore[arg-type]
+    model = NormLiftModel(config, scene_box=None, num_train_data=1).to(device)  # type: ignore[arg-type]
     model.load_state_dict(state, strict=False)
-    return model.eval().to(device)
+    return model.eval()
 
 
 def viewer_camera(camera: Camera) -> Cameras:
@@ -84,12 +84,15 @@ def viewer_camera(camera: Camera) -> Cameras:
 def measure(
     report: Report, name: str, field: SemanticField, exact: torch.Tensor, some: torch.Tensor, model: NormLiftModel
 ) -> None:
-    """Adds fox_NAME_*: the parts of an answer, and all of it as the panel does it."""
+    """Adds fox_NAME_*: the parts of an answer, and all of it as the panel does it.
+
+    Args:
+        exact: relevancy in float64 of some Gaussians.
+    """
     device, question = model.device.type, questions()
     model.attach(field)
-    field = model.field or field
     answer: Answer = respond(field, question)
-    error = (answer.relevancy.cpu()[some].double() - exact).abs().max()
+    error = (answer.relevancy[some].double() - exact).abs().max()
 
     def whole() -> None:
         model.normlift._answer_to(question, "")
@@ -103,16 +106,16 @@ def measure(
 
 def main(quick: bool, device: str, output: Path) -> None:
     report = Report("latency" if device == "cpu" else "latency_gpu")
-    scene, cameras = trained_scene("fox"), training_cameras("fox")
+    scene, cameras = trained_scene("fox").to(device), training_cameras("fox")
     cameras = cameras[:4] if quick else cameras
     evidence = rasterize_evidence(scene, cameras, [grid_labels(camera) for camera in cameras])
-    mixed, model = clip_like_table(evidence.num_regions), fox_model(device)
+    mixed, model = clip_like_table(evidence.num_regions).to(device), fox_model(device)
     g = torch.Generator().manual_seed(0)
-    classes = mixed[torch.randint(0, CLASSES, (len(mixed),), generator=g)]
-    some = torch.randperm(len(scene), generator=g)[:SAMPLE]
-    source = torch.arange(len(scene))
+    classes = mixed[torch.randint(0, CLASSES, (len(mixed),), generator=g).to(device)]
+    some = torch.randperm(len(scene), generator=g)[:SAMPLE].to(device)
+    source = torch.arange(len(scene)).to(device)
     moved = torch.randperm(len(scene), generator=g)[: len(scene) // 5]  # about the share that the vote replaces
-    source[moved] = torch.randint(0, len(scene), (len(moved),), generator=g)
+    source[moved] = torch.randint(0, len(scene), (len(moved),), generator=g).to(device)
     forms: tuple[tuple[Form, torch.Tensor], ...] = (("evidence", mixed), ("float16", mixed), ("low_rank", classes))
     for form, features in forms:
         field = SemanticField.build(lift(evidence, features), scene.means, source, form=form)
