@@ -18,13 +18,19 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 STEPS = {"fox": 11999, "tabletop": 6999}
 
 
-def trained_scene(name: str) -> GaussianScene:
-    """The activated Gaussians of a splatfacto checkpoint."""
+def trained_state(name: str) -> dict[str, torch.Tensor]:
+    """The model's tensors in a splatfacto checkpoint."""
     run = SHARED / "captures" / "outputs" / name / "splatfacto" / "run"
     path = run / "nerfstudio_models" / f"step-{STEPS[name]:09d}.ckpt"
     state = torch.load(path, map_location="cpu", weights_only=True)["pipeline"]
+    return {key.removeprefix("_model."): value for key, value in state.items() if key.startswith("_model.")}
+
+
+def trained_scene(name: str) -> GaussianScene:
+    """The activated Gaussians of a splatfacto checkpoint."""
+    state = trained_state(name)
     means, quats, scales, opacities = (
-        state[f"_model.gauss_params.{key}"] for key in ("means", "quats", "scales", "opacities")
+        state[f"gauss_params.{key}"] for key in ("means", "quats", "scales", "opacities")
     )
     return GaussianScene(means, quats, scales.exp(), opacities.sigmoid().squeeze(-1))
 

@@ -15,6 +15,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.plugin.model import NormLiftModelConfig
 from normlift_ns.plugin.pipeline import NormLiftPipelineConfig
 
@@ -24,12 +25,14 @@ def trainer_config(
     dataparser: DataParserConfig,
     model: NormLiftModelConfig,
     *,
+    source: SourceOptions | None = None,
     image_scale: float = 1.0,
     **optimizers: Any,
 ) -> TrainerConfig:
     """splatfacto's training with a lift at its end; the viewer listens on this machine only.
 
     Args:
+        source: what to see in the images; None: as ns-normlift.
         image_scale: size of the images used, as a share of that on disk.
         optimizers: in place of splatfacto's, by the name of the parameters.
     """
@@ -46,6 +49,7 @@ def trainer_config(
                 dataparser=dataparser, cache_images_type="uint8", camera_res_scale_factor=image_scale
             ),
             model=model,
+            source=source or SourceOptions(),
         ),
         optimizers={**_splatfacto_optimizers(), **optimizers},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),

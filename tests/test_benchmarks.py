@@ -32,6 +32,21 @@ def test_quick_cpu_benchmark(tmp_path):
 
 
 @pytest.mark.slow
+@needs_shared
+def test_quick_latency_benchmark(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.latency", "--quick", "--device", "cpu", "--output", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    print(done.stdout)
+    metrics = {metric["key"]: metric for metric in json.loads((tmp_path / "latency.json").read_text())["metrics"]}
+    for form, most in (("evidence", 1e-6), ("float16", 2e-3), ("low_rank", 4e-3)):
+        assert metrics[f"fox_{form}_answer_ms"]["value"] > 0  # other work may take all cores: no more is asked
+        assert metrics[f"fox_{form}_answer_ms"]["error"] < most
+    assert metrics["fox_stock_ms"]["value"] > 0
+    assert metrics["fox_overlay_ms"]["value"] > 0
+
+
+@pytest.mark.slow
 def test_quick_front_ends_benchmark(tmp_path):
     command = [sys.executable, "-m", "benchmarks.front_ends", "--quick", "--device", "cpu", "--output", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

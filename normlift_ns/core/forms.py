@@ -16,6 +16,8 @@ from normlift_ns.core.lowrank import Basis, half_precision_error
 
 Form = Literal["evidence", "float16", "low_rank"]
 _QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
+_CPU_BLOCK, _GPU_BLOCK = 2**21, 2**25
+"""Elements converted to float32 at once for a query; few stay in a processor's cache, which is four times as fast."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class DirectionForm:
         """Cosines to unit vectors, 0 without evidence."""
         projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
         out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
-        out[scalars.norm > 0] = torch.cat([block.float() @ projected.T for block in self.coordinates.split(2**16)])
+        step = max(1, (_GPU_BLOCK if self.coordinates.is_cuda else _CPU_BLOCK) // projected.shape[1])
+        out[scalars.norm > 0] = torch.cat([block.float() @ projected.T for block in self.coordinates.split(step)])
         return out
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:

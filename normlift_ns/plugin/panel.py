@@ -1,8 +1,9 @@
 """The panel in nerfstudio's viewer: what is asked, what is shown of the answer, and what is written.
 
 nerfstudio finds the elements by walking the attributes of the model, in alphabetical order, once when the viewer
-starts. It calls their hooks under its render lock. Rendering happens in other threads, which read nothing of this but
-the `Display` that the model got last.
+starts. It calls their hooks under its render lock; only a query, which may have to load a text encoder, runs without
+and takes the lock to show its answer. Rendering happens in other threads, which read nothing of this but the `Display`
+that the model got last.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
+from threading import Lock
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -21,19 +23,19 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerControl,
     ViewerDropdown,
     ViewerElement,
-    ViewerParameter,
     ViewerSlider,
-    ViewerText,
 )
 
 from normlift_ns.core.files import file_name, free_path
 from normlift_ns.plugin.asking import THRESHOLDS, Answer, default_negatives, encoder_of, judge, pose, respond
 from normlift_ns.plugin.display import COLORMAPS, PARTS, make_display, selection
+from normlift_ns.plugin.elements import FreeButton, Markdown, TextBox, set_value
 from normlift_ns.plugin.ply import write_splats
 from normlift_ns.plugin.queries import Question, save_question
 from normlift_ns.plugin.status import as_text, clipped, report
 
 if TYPE_CHECKING:
+    from normlift_ns.core.field import SemanticField
     from normlift_ns.encoders.source import TextEncoder
     from normlift_ns.plugin.model import NormLiftModel
 
@@ -41,34 +43,10 @@ MOST_PROMPTS = 64
 _ALL = "all prompts"
 _CLICKED = "like what was clicked"
 _ALIKE = 0.9
+_READING = (
+    "Reading the prompts. The first time the text encoder is loaded, which takes a while; the picture stays live."
+)
 _WAITING = "No semantics yet. They are lifted at the end of the training."
-
-
-class _Text(ViewerText):
-    """A text box that does nothing while one types: nerfstudio would render again at every key."""
-
-    def install(self, viser_server: Any) -> None:
-        self._create_gui_handle(viser_server)
-
-
-class _Markdown(ViewerElement[str]):
-    """Text in the panel, which changes as the program likes. It is compiled as MDX: see `status.as_text`."""
-
-    def __init__(self, content: str) -> None:
-        super().__init__("")
-        self.content = content
-
-    def _create_gui_handle(self, viser_server: Any) -> None:
-        self.gui_handle = viser_server.gui.add_markdown(self.content)
-
-    def install(self, viser_server: Any) -> None:
-        self._create_gui_handle(viser_server)
-
-    def set(self, content: str) -> None:
-        """Replaces the text."""
-        self.content = content
-        if self.gui_handle is not None:
-            self.gui_handle.content = content  # type: ignore[attr-defined]
 
 
 def _reported(action: Callable[[Panel], None]) -> Callable[[Panel, Any], None]:
@@ -93,16 +71,18 @@ class Panel(torch.nn.Module):
         self._encoder: list[TextEncoder] = []
         self._answer: Answer | None = None
         self._rendered: tuple[int | None, str, str] | None = None
+        self._turn = object()  # of the last query, clear or click: what was asked before it comes too late
+        self._encoding, self._busy = Lock(), ""
         self.control = ViewerControl()
-        self.ask_1_prompts = _Text("Prompts", "", hint="What to look for; several are separated by ;")
-        self.ask_2_negatives = _Text("Negatives", "", hint="What to compare with; several are separated by ;")
+        self.ask_1_prompts = TextBox("Prompts", "", hint="What to look for; several are separated by ;")
+        self.ask_2_negatives = TextBox("Negatives", "", hint="What to compare with; several are separated by ;")
         forms = ["auto", *THRESHOLDS]
         self.ask_3_relevancy = ViewerDropdown("Relevancy", "auto", forms, hint="lerf and margin use negatives")
         self.ask_4_refined = ViewerCheckbox("Refined", True, cb_hook=self._ask_again, hint="Ask voted directions")
-        self.ask_5_query = ViewerButton("Query", self._query)
+        self.ask_5_query = FreeButton("Query", self._query)
         self.ask_6_clear = ViewerButton("Clear", self._clear)
         self.ask_7_click = ViewerButton("Click: more like this", self._arm)
-        self.ask_8_status = _Markdown(_WAITING)
+        self.ask_8_status = Markdown(_WAITING)
         self.show_1_prompt = ViewerDropdown(
             "Prompt shown", _ALL, [_ALL], cb_hook=self._show, hint="In overlay and selection"
         )
@@ -144,9 +124,9 @@ class Panel(torch.nn.Module):
             self.ask_2_negatives.value = "; ".join(question.negatives)
             usual = "cosine" if len(question.negatives) == 0 else "lerf"
             self.ask_3_relevancy.value = "auto" if question.form == usual else question.form
-            _set(self.show_2_threshold, question.threshold)
-            _set(self.show_3_reliability, question.min_reliability)
-            _set(self.ask_4_refined, question.refined)
+            set_value(self.show_2_threshold, question.threshold)
+            set_value(self.show_3_reliability, question.min_reliability)
+            set_value(self.ask_4_refined, question.refined)
         self._replace(answer)
 
     def _elements(self) -> list[ViewerElement[Any]]:
@@ -158,34 +138,69 @@ class Panel(torch.nn.Module):
         """Shows a message, and below it what is shown now."""
         self._report(clipped(text, 400))
 
-    @_reported
-    def _query(self) -> None:
-        """Asks what the text boxes say; nothing of an earlier answer stays, whatever happens."""
-        before, field = self._answer, self._model[0].field
-        self._replace(None)
+    def _query(self, _: Any = None) -> None:
+        """Asks what the text boxes say; nothing of an earlier answer stays, whatever happens.
+
+        Called without the render lock, which it takes once the texts are vectors.
+        """
+        self._turn = turn = object()
+        question, message = None, ""
+        try:
+            question = self._posed()
+        except (ValueError, OSError, MemoryError, RuntimeError) as error:
+            message = str(error)
+        viewer = self.control.viewer
+        assert viewer.train_lock is not None
+        with viewer.train_lock:
+            if self._turn is turn:
+                self._answer_to(question, message)
+            else:
+                self._report("")
+        viewer._trigger_rerender()
+
+    def _posed(self) -> Question:
+        """What the text boxes say, as vectors."""
+        field, form = self._model[0].field, cast(Any, self.ask_3_relevancy.value)
+        prompts, negatives = _parts(self.ask_1_prompts.value), _parts(self.ask_2_negatives.value)
         if field is None:
             raise ValueError(_WAITING)
-        prompts, negatives = _parts(self.ask_1_prompts.value), _parts(self.ask_2_negatives.value)
         if len(prompts) == 0:
             raise ValueError("Type what to look for, then press Query.")
         if len(prompts) > MOST_PROMPTS:
             raise ValueError(f"{len(prompts)} prompts; ask for {MOST_PROMPTS} at most at a time.")
+        with self._encoding:  # an encoder is loaded at its first text, and must not be loaded twice
+            self._busy = _READING
+            self._report("")
+            try:
+                return pose(field, self._encoder_of(field), prompts, negatives=negatives, form=form)
+            finally:
+                self._busy = ""
+
+    def _answer_to(self, question: Question | None, message: str) -> None:
+        """Shows the answer to a question, judged as the elements say, or none and a message."""
+        before, field, answer = self._answer, self._model[0].field, None
+        if question is not None and field is not None:
+            rule = {"min_reliability": self.show_3_reliability.value, "refined": self.ask_4_refined.value}
+            if before is not None and before.question.form == question.form and before.texts != (_CLICKED,):
+                rule["threshold"] = self.show_2_threshold.value  # as the user left it
+            try:
+                answer = respond(field, replace(question, **rule))
+            except ValueError as error:
+                message = str(error)
+        self._replace(answer)
+        if message:
+            self.note(message)
+
+    def _encoder_of(self, field: SemanticField) -> TextEncoder:
         if len(self._encoder) == 0:
-            self.ask_8_status.set("Loading the text encoder.")
             folder = self._model[0].config.semantics
             cache = None if folder is None else folder.parents[1] / ".cache" / "texts"
             self._encoder.append(encoder_of(field, str(self._model[0].device), cache))
-        form, refined = cast(Any, self.ask_3_relevancy.value), self.ask_4_refined.value
-        sure = self.show_3_reliability.value
-        question = pose(
-            field, self._encoder[0], prompts, negatives=negatives, form=form, min_reliability=sure, refined=refined
-        )
-        if before is not None and before.question.form == question.form and before.question.texts != (_CLICKED,):
-            question = replace(question, threshold=self.show_2_threshold.value)  # as the user left it
-        self._replace(respond(field, question))
+        return self._encoder[0]
 
     @_reported
     def _clear(self) -> None:
+        self._turn = object()
         self._replace(None)  # the prompts stay: this waits for a picture, and the user may type meanwhile
 
     @_reported
@@ -230,6 +245,7 @@ class Panel(torch.nn.Module):
         model, refined = self._model[0], self.ask_4_refined.value
         field = model.field
         assert field is not None
+        self._turn = object()
         weights = model.in_sight(origin.to(model.device), direction.to(model.device))
         weights = weights.where(field.valid(refined=refined), 0.0)
         chosen = int(weights.argmax())
@@ -286,10 +302,10 @@ class Panel(torch.nn.Module):
         self._answer = answer
         if not keep:
             texts = () if answer is None else answer.texts
-            _set(self.show_1_prompt, _ALL)
+            set_value(self.show_1_prompt, _ALL)
             self.show_1_prompt.set_options([_ALL, *(f"{i}: {clipped(t, 40)}" for i, t in enumerate(texts))])
         if answer is not None:
-            _set(self.show_2_threshold, answer.question.threshold)
+            set_value(self.show_2_threshold, answer.question.threshold)
         self._render()
 
     def _render(self) -> None:
@@ -302,15 +318,10 @@ class Panel(torch.nn.Module):
         self._report("")
 
     def _report(self, message: str) -> None:
-        self.ask_8_status.set("\n\n".join(filter(None, (as_text(message), report(self._answer, self._shown())))))
+        lines = (as_text(self._busy), as_text(message), report(self._answer, self._shown()))
+        self.ask_8_status.set("\n\n".join(filter(None, lines)))
 
 
 def _parts(text: str) -> list[str]:
     """What stands between semicolons, without blanks around it."""
     return [part for part in (p.strip() for p in text.split(";")) if part]
-
-
-def _set(element: ViewerParameter[Any], value: Any) -> None:
-    """Sets an element, which calls its hook in another thread, only where that changes it."""
-    if element.value != value:
-        element.value = value

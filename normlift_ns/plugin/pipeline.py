@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import traceback
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,16 +16,18 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.core.files import atomic_path
 from normlift_ns.encoders.build import SourceOptions, make_source
+from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.plugin.adapters import load_run
 from normlift_ns.plugin.asking import encoder_settings, pose
 from normlift_ns.plugin.checkpoint import numpy_numbers
-from normlift_ns.plugin.config import FIELD_FOLDER
+from normlift_ns.plugin.config import FIELD_FOLDER, stored_data
 from normlift_ns.plugin.lifting import LiftOptions, lift_run
 from normlift_ns.plugin.model import NormLiftModel
 from normlift_ns.plugin.queries import save_question
+from normlift_ns.plugin.views import image_name
 
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 
 @dataclass
@@ -62,12 +64,41 @@ class NormLiftPipeline(VanillaPipeline):
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
         model.detach()  # of a lifted checkpoint that is trained further
         if trainer is not None and trainer.local_rank == 0:
-            source = make_source(self.config.source)
+            source = source_of(trainer.config)
+            folder = dataset_folder(trainer.config)
+            files = self.datamanager.train_dataset.image_filenames  # type: ignore[union-attr]
+            source.available([image_name(file, folder) for file in files])
             if len(self.config.queries) > 0:
                 source.text(self.config.queries)
             after = [TrainingCallbackLocation.AFTER_TRAIN]
             callbacks.append(TrainingCallback(after, _lift_at_the_end, args=[trainer]))
         return callbacks
+
+
+def dataset_folder(config: TrainerConfig) -> Path:
+    """The folder of the dataset, as the config names it."""
+    data = stored_data(config)
+    return data.parent if data.suffix == ".json" else data
+
+
+def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
+    """What the config says to see in the images; LangSplat's features lie in the dataset if no folder is named.
+
+    Raises:
+        ValueError, FileNotFoundError: as `make_source`; the message names the flags of ns-train.
+    """
+    options: SourceOptions = config.pipeline.source  # type: ignore[attr-defined]
+    if options.features == "langsplat" and options.features_dir is None:
+        options = replace(options, features_dir=dataset_folder(config))
+    try:
+        return make_source(options, device)
+    except FileNotFoundError as error:
+        if options.features != "langsplat":
+            raise
+        raise FileNotFoundError(
+            f"{error}. Write them there with LangSplat's preprocessing, name their folder with "
+            "--pipeline.source.features-dir, or look at the photographs instead: --pipeline.source.features none"
+        ) from error
 
 
 def _lift_at_the_end(trainer: Trainer, step: int) -> None:
@@ -97,7 +128,7 @@ def lift_trained(trainer: Trainer) -> Path:
     options, path = pipeline.config, trainer.base_dir / "config.yml"
     CONSOLE.print("Lifting the trained scene")
     run = load_run(path)
-    source = make_source(options.source, str(pipeline.device))
+    source = source_of(trainer.config, str(pipeline.device))
     encoder = encoder_settings(options.source)
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"
     result = lift_run(run, source, options.lift, trainer.base_dir.parent / ".cache", device=device, encoder=encoder)

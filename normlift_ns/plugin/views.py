@@ -67,7 +67,7 @@ class Views:
         self._background = background
         self.files = list(dataset.image_filenames)
         """Image files, absolute."""
-        self.names = [_relative(file, folder) for file in self.files]
+        self.names = [image_name(file, folder) for file in self.files]
         """Image files relative to the dataset, with forward slashes."""
 
     def __len__(self) -> int:
@@ -145,5 +145,6 @@ def _undistorted(
     return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
 
 
-def _relative(file: Path, folder: Path) -> str:
+def image_name(file: Path, folder: Path) -> str:
+    """The file relative to the folder of its dataset, with forward slashes."""
     return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()

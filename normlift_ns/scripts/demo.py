@@ -71,7 +71,8 @@ class Demo:
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
         (self.folder / "miou.json").write_text(json.dumps(means, indent=2) + "\n")
-        CONSOLE.print(f"Pictures are in {pictures}. See it in the viewer: ns-viewer --load-config {config}")
+        viewer = f"ns-viewer --load-config {config} --viewer.websocket-host 127.0.0.1"
+        CONSOLE.print(f"Pictures are in {pictures}. See it in the viewer: {viewer}", soft_wrap=True)
         return means
 
 

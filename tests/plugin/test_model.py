@@ -186,6 +186,37 @@ def test_hidden_gaussians_are_not_drawn_at_all(pipeline, stock: StockRun, monkey
         assert float(_outputs(pipeline)["accumulation"].sum()) > float(alpha.sum())
 
 
+@pytest.mark.parametrize("prompts", [0, 1, 20])
+@pytest.mark.parametrize("on_cpu", [True, False])
+def test_an_overlay_costs_one_pass_of_scalars(pipeline, monkeypatch, on_cpu: bool, prompts: int) -> None:
+    """None at all on the CPU, where they go with the colours; without semantics nothing is added."""
+    model, passes = pipeline.model, []
+
+    def counted(name: str, rasterizer, channels):
+        def call(*args, **options):
+            passes.append((name, channels(args)))
+            return rasterizer(*args, **options)
+
+        return call
+
+    if not on_cpu:
+        _by_cuda(pipeline, monkeypatch)
+    ours = counted("scalars", rasterization, lambda args: args[4].shape[1])
+    monkeypatch.setattr("normlift_ns.plugin.model.rasterization", ours)
+    monkeypatch.setattr("normlift_ns.plugin.model.render", counted("cpu", render, lambda args: args[2].shape[1]))
+    question = Question(("left",) * prompts, torch.eye(8)[:1].expand(prompts, 8))
+    with splatfacto_on_cpu():
+        stock = counted("stock", rasterization, lambda _: 0)
+        monkeypatch.setattr("nerfstudio.models.splatfacto.rasterization", stock)
+        model.show(make_display(model.field, None if prompts == 0 else respond(model.field, question)))
+        _outputs(pipeline)
+        assert passes == ([("cpu", 4 + prompts + 5)] if on_cpu else [("stock", 0), ("scalars", prompts + 5)])
+        passes.clear()
+        model.show(None)
+        _outputs(pipeline)
+        assert passes == ([("cpu", 4)] if on_cpu else [("stock", 0)])
+
+
 def _rows(scene, rows):
     return type(scene)(scene.means[rows], scene.quats[rows], scene.scales[rows], scene.opacities[rows])
 

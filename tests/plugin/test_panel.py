@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,13 @@ def panel(pipeline: Any) -> Any:
 
 def ask(panel: Any, prompts: str, negatives: str = "") -> None:
     panel.ask_1_prompts.value, panel.ask_2_negatives.value = prompts, negatives
-    panel.ask_5_query.cb_hook(panel.ask_5_query)
+    press(panel.ask_5_query)
+
+
+def press(button: Any) -> None:
+    """What viser does when the button is pressed."""
+    for action in button.gui_handle._impl.update_cb:
+        action(None)
 
 
 def outputs(pipeline: Any, index: int = 0) -> dict[str, torch.Tensor]:
@@ -238,6 +244,88 @@ def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
     text = row.split(" | ")[1]
     assert not set(re.sub(r"&#\d+;", "", text)) & set("{}<>|`![]()#\n=&")
     assert row.count("|") == 5
+
+
+class Slow(Words):
+    """Reads texts once it is let."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reading, self.go_on = Event(), Event()
+
+    def text(self, prompts: Any) -> torch.Tensor:
+        self.reading.set()
+        assert self.go_on.wait(20)
+        return super().text(prompts)
+
+
+@pytest.fixture
+def slow(pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Slow, list[str]]]:
+    """An encoder that takes its time, loaded at the first query, and the devices it was loaded on."""
+    encoder, loaded = Slow(), []
+    monkeypatch.setattr("normlift_ns.plugin.panel.encoder_of", lambda _, device, __: loaded.append(device) or encoder)
+    yield encoder, loaded
+    encoder.go_on.set()
+
+
+def test_the_picture_stays_live_while_the_encoder_loads(
+    pipeline: Any, opened: tuple[Any, Viewer], slow: tuple[Slow, list[str]]
+) -> None:
+    panel, lock, (encoder, loaded) = pipeline.model.normlift, opened[1].train_lock, slow
+    before = chosen(pipeline)
+    panel.ask_1_prompts.value = "right"
+    asking = Thread(target=press, args=[panel.ask_5_query])
+    asking.start()
+    assert encoder.reading.wait(20)
+    assert lock is not None
+    assert lock.acquire(timeout=1)  # as the viewer does to render
+    assert torch.equal(chosen(pipeline), before)
+    assert "relevancy_0" in outputs(pipeline)
+    lock.release()
+    assert "Reading the prompts" in panel.ask_8_status.content
+    panel.show_2_threshold.value = 0.6  # the panel can be used, and still says what it waits for
+    panel.show_2_threshold.cb_hook(panel.show_2_threshold)
+    assert panel.answer.texts == ("left",)
+    assert "Reading the prompts" in panel.ask_8_status.content
+    lock.acquire()
+    encoder.go_on.set()
+    time.sleep(0.2)
+    assert panel.answer.texts == ("left",)  # the answer waits for the picture
+    lock.release()
+    asking.join(20)
+    assert panel.answer.texts == ("right",)
+    assert panel.answer.question.threshold == 0.6
+    assert not torch.equal(chosen(pipeline), before)
+    assert "Reading the prompts" not in panel.ask_8_status.content
+    assert loaded == ["cpu"]
+
+
+def test_an_answer_that_comes_too_late_is_not_shown(pipeline: Any, slow: tuple[Slow, list[str]]) -> None:
+    panel, (encoder, loaded) = pipeline.model.normlift, slow
+    threads = []
+    for prompts in ("right", "banana", "left; up"):
+        panel.ask_1_prompts.value = prompts
+        threads.append(Thread(target=press, args=[panel.ask_5_query]))
+        threads[-1].start()
+        assert encoder.reading.wait(20)
+        time.sleep(0.1)
+    encoder.go_on.set()
+    for thread in threads:
+        thread.join(20)
+    assert panel.answer.texts == ("left", "up")
+    assert "banana" not in panel.ask_8_status.content
+    assert len(loaded) == 1
+    encoder.go_on.clear()
+    encoder.reading.clear()
+    panel.ask_1_prompts.value = "right"
+    asking = Thread(target=press, args=[panel.ask_5_query])
+    asking.start()
+    assert encoder.reading.wait(20)
+    panel.ask_6_clear.cb_hook(panel.ask_6_clear)
+    encoder.go_on.set()
+    asking.join(20)
+    assert panel.answer is None
+    assert panel.ask_8_status.content == "Nothing is asked."
 
 
 @pytest.mark.parametrize("part", ["without the selection", "the selection alone"])

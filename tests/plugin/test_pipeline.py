@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -14,6 +17,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.method_configs.scannet import scannet_method
 from normlift_ns.plugin import pipeline as module
@@ -23,7 +27,7 @@ from normlift_ns.plugin.config import rerooted
 from normlift_ns.plugin.lifting import LiftOptions
 from normlift_ns.plugin.queries import load_question
 from normlift_ns.plugin.run_dir import load_field
-from tests.plugin.stock_run import StockRun, train_splatfacto
+from tests.plugin.stock_run import HEIGHT, WIDTH, StockRun, train_splatfacto
 
 LIFT = LiftOptions(vote=RefineConfig(k=6))
 
@@ -40,9 +44,13 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
         method: str = "normlift",
         checkpoint: Path | None = None,
         prepare: Any = lambda trainer: None,
+        steps: int = 2,
+        model: Mapping[str, Any] | None = None,
         **pipeline: Any,
     ) -> StockRun:
         def configure(config: TrainerConfig) -> None:
+            for name, value in (model or {}).items():
+                setattr(config.pipeline.model, name, value)
             config.output_dir = Path("trained")
             config.pipeline.model.num_random = 60  # type: ignore[attr-defined]
             config.load_checkpoint = checkpoint
@@ -51,7 +59,13 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
                 setattr(config.pipeline, name, value)
 
         return train_splatfacto(
-            workspace, Path("scene"), method=method, timestamp=timestamp, steps=2, configure=configure, prepare=prepare
+            workspace,
+            Path("scene"),
+            method=method,
+            timestamp=timestamp,
+            steps=steps,
+            configure=configure,
+            prepare=prepare,
         )
 
     return train
@@ -118,6 +132,45 @@ def test_mistakes_show_before_the_training(train: Callable[..., StockRun]) -> No
         train("regions", source=SourceOptions(encoder="colour", regions="files"))
 
 
+@pytest.fixture
+def langsplat_options() -> SourceOptions:
+    """Those of `ns-train normlift-lerf-ovs`."""
+    pipeline: Any = lerf_ovs_method.config.pipeline
+    return pipeline.source
+
+
+def test_the_features_of_lerf_ovs_lie_in_the_scene(
+    train: Callable[..., StockRun], workspace: Path, langsplat_options: SourceOptions, tmp_path: Path
+) -> None:
+    assert langsplat_options == SourceOptions(features="langsplat")
+    with pytest.raises(FileNotFoundError) as caught:
+        train("nothing", source=langsplat_options)
+    for part in ("scene holds no features", "--pipeline.source.features-dir", "--pipeline.source.features none"):
+        assert part in str(caught.value)
+
+    folder = workspace / "scene" / "language_features"
+    folder.mkdir()
+    vectors = tmp_path / "texts.npz"
+    np.savez(vectors, thing=np.eye(16)[0], wall=np.eye(16)[1])
+    images = sorted((workspace / "scene" / "images").iterdir())
+    try:
+        for image in images:
+            labels = np.zeros((HEIGHT - 1, WIDTH - 1), np.int32)
+            labels[:, WIDTH // 2 :] = 1
+            np.save(folder / f"{image.stem}_s.npy", labels)
+            np.save(folder / f"{image.stem}_f.npy", np.eye(16, dtype=np.float32)[:2])
+        given = replace(langsplat_options, text_vectors=vectors)
+        trained = train("features", source=given, queries=("thing", "wall"))
+        field = load_field(load_run(trained.config))
+        assert field.dimension == 16
+        assert field.manifest["features"]["kind"] == "langsplat"
+        (folder / f"{images[0].stem}_s.npy").unlink()
+        with pytest.raises(FileNotFoundError, match=r"1 of \d+ images have no features"):
+            train("one missing", source=given)
+    finally:
+        shutil.rmtree(folder)
+
+
 def test_training_a_lifted_checkpoint_further_forgets_its_field(train: Callable[..., StockRun]) -> None:
     first = train("first")
     field = first.trainer.pipeline.model.field
@@ -138,7 +191,10 @@ def test_frozen_points_stay_where_they_are(train: Callable[..., StockRun]) -> No
     def remember(trainer: Any) -> None:
         before.update({name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()})
 
-    trained = train("frozen", method="normlift-scannet", prepare=remember)
+    model: Any = scannet_method.config.pipeline.model
+    eager = {"warmup_length": 0, "refine_every": 1, "densify_grad_thresh": 0.0, "cull_alpha_thresh": 0.9}
+    eager["stop_split_at"] = model.stop_split_at  # the method's own; all else would split and cull at once
+    trained = train("frozen", method="normlift-scannet", prepare=remember, steps=5, model=eager)
     after = trained.trainer.pipeline.model.gauss_params
     assert torch.equal(before["means"], after["means"])
     assert all(not torch.equal(before[name], after[name]) for name in ("scales", "opacities", "features_dc"))

@@ -1,0 +1,138 @@
+"""How long the viewer's panel takes to answer a prompt on the fox capture once the text is a vector, beside its error.
+
+    python -m benchmarks.latency            45 views; on the GPU if there is one, which --device cpu leaves alone
+    python -m benchmarks.latency --quick    4 views
+
+The field has 144 grid regions per view and D = 512, in each of its forms: CLIP-like features that differ in every view
+(evidence, float16), and those of 32 classes without noise, which have a basis of rank 32 (low_rank). The question is
+one prompt against four negatives. Times are the least of 20: the machine may be doing other things.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+
+from benchmarks.captures import SHARED, trained_scene, trained_state, training_cameras
+from benchmarks.cpu import clip_like_table, grid_labels
+from benchmarks.report import RESULTS, Report
+from normlift_ns import Camera, SemanticField, lift, rasterize_evidence
+from normlift_ns.core.forms import Form
+from normlift_ns.core.query import CANONICAL_NEGATIVES, relevancy
+from normlift_ns.plugin.asking import Answer, judge, respond
+from normlift_ns.plugin.display import make_display
+from normlift_ns.plugin.model import NormLiftModel, NormLiftModelConfig
+from normlift_ns.plugin.queries import Question
+from normlift_ns.plugin.status import report as status
+
+REPEATS, CLASSES, SAMPLE = 20, 32, 20_000
+
+
+def least(device: str, action: Callable[[], object]) -> float:
+    """Milliseconds of the fastest of 20 runs after a first one, the GPU waited for on both sides."""
+    wait = torch.cuda.synchronize if device == "cuda" else lambda: None
+    seconds = []
+    for _ in range(REPEATS + 1):
+        wait()
+        start = time.perf_counter()
+        action()
+        wait()
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * min(seconds[1:])
+
+
+def questions() -> Question:
+    """A prompt that a class of the features has, against four others."""
+    names = torch.from_numpy(np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float32))
+    return Question(("thing",), names[:1], CANONICAL_NEGATIVES, names[10:14], "lerf")
+
+
+def true_relevancy(exact_directions: torch.Tensor, question: Question) -> torch.Tensor:
+    """[M, 1] in float64, from directions in float64."""
+    positive, negative = (
+        exact_directions @ torch.nn.functional.normalize(vectors.to(exact_directions), dim=1).T
+        for vectors in (question.vectors, question.negative_vectors)
+        if vectors is not None
+    )
+    return relevancy(positive, negative, form="lerf")
+
+
+def fox_model(device: str) -> NormLiftModel:
+    """The trained Gaussians as ns-viewer has them, panel included."""
+    state = trained_state("fox")
+    degree = math.isqrt(1 + state["gauss_params.features_rest"].shape[1]) - 1
+    config = NormLiftModelConfig(num_random=20, sh_degree=degree)
+    model = NormLiftModel(config, scene_box=None, num_train_data=1).to(device)  # type: ignore[arg-type]
+    model.load_state_dict(state, strict=False)
+    return model.eval()
+
+
+def viewer_camera(camera: Camera) -> Cameras:
+    """The camera as the viewer gives it."""
+    pose = camera.world_to_camera.inverse()[:3] * torch.tensor([1.0, -1, -1, 1])
+    K = camera.K
+    return Cameras(pose[None], K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
+
+
+def measure(
+    report: Report, name: str, field: SemanticField, exact: torch.Tensor, some: torch.Tensor, model: NormLiftModel
+) -> None:
+    """Adds fox_NAME_*: the parts of an answer, and all of it as the panel does it.
+
+    Args:
+        exact: relevancy in float64 of some Gaussians.
+    """
+    device, question = model.device.type, questions()
+    model.attach(field)
+    answer: Answer = respond(field, question)
+    error = (answer.relevancy[some].double() - exact).abs().max()
+
+    def whole() -> None:
+        model.normlift._answer_to(question, "")
+
+    report.add(f"fox_{name}_relevancy_ms", least(device, lambda: respond(field, question)), "ms", error)
+    report.add(f"fox_{name}_threshold_ms", least(device, lambda: judge(field, answer, 0.55, 0.1)), "ms")
+    report.add(f"fox_{name}_display_ms", least(device, lambda: make_display(field, answer)), "ms")
+    report.add(f"fox_{name}_status_ms", least(device, lambda: status(answer, None)), "ms")
+    report.add(f"fox_{name}_answer_ms", least(device, whole), "ms", error)
+
+
+def main(quick: bool, device: str, output: Path) -> None:
+    report = Report("latency" if device == "cpu" else "latency_gpu")
+    scene, cameras = trained_scene("fox").to(device), training_cameras("fox")
+    cameras = cameras[:4] if quick else cameras
+    evidence = rasterize_evidence(scene, cameras, [grid_labels(camera) for camera in cameras])
+    mixed, model = clip_like_table(evidence.num_regions).to(device), fox_model(device)
+    g = torch.Generator().manual_seed(0)
+    classes = mixed[torch.randint(0, CLASSES, (len(mixed),), generator=g).to(device)]
+    some = torch.randperm(len(scene), generator=g)[:SAMPLE].to(device)
+    source = torch.arange(len(scene)).to(device)
+    moved = torch.randperm(len(scene), generator=g)[: len(scene) // 5]  # about the share that the vote replaces
+    source[moved] = torch.randint(0, len(scene), (len(moved),), generator=g).to(device)
+    forms: tuple[tuple[Form, torch.Tensor], ...] = (("evidence", mixed), ("float16", mixed), ("low_rank", classes))
+    for form, features in forms:
+        field = SemanticField.build(lift(evidence, features), scene.means, source, form=form)
+        directions = lift(evidence, features.double()).directions(source[some])
+        exact = true_relevancy(directions, questions()).where(field.valid()[some, None], 0.0)
+        measure(report, form, field, exact, some, model)
+    camera = viewer_camera(cameras[0]).to(device)
+    report.add("fox_overlay_ms", least(device, lambda: model.get_outputs_for_camera(camera)), "ms per frame")
+    model.show(None)
+    report.add("fox_stock_ms", least(device, lambda: model.get_outputs_for_camera(camera)), "ms per frame")
+    report.write(output)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="4 views")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    arguments = parser.parse_args()
+    main(arguments.quick, arguments.device, arguments.output)
