@@ -1,59 +1,25 @@
-"""docs/speed_and_error.md and docs/accuracy.svg from the JSON files of the benchmarks; files that are absent are named.
+"""docs/speed_and_error.md, docs/accuracy.md and plots from the JSON files of the benchmarks; absent ones are named.
 
 python -m benchmarks.pages
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from benchmarks.accuracy import OTHERS
+from benchmarks.documents import TITLES, Document, documents, table
+from benchmarks.findings import STEP, findings, steps
 from benchmarks.plots import DOCS, NAMES
-from benchmarks.report import RESULTS
+from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
 
-TITLES = {
-    "none": "without refinement",
-    "plain_knn": "plain KNN voting",
-    "linear": "linear averaging",
-    "norm_only": "norm only",
-    "support_only": "support only",
-    "full": "full",
-}
 PRESET_FLAGS = {
     "exact": "`--precision double`", "float32": "default", "half_resolution": "`--lift-downscale 2`",
     "every_second_view": "`--max-views` half", "low_rank": "`--form low_rank --tolerance 0.05`",
 }  # fmt: skip
-
-
-class Document:
-    """One results file; values by key."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.found = path, path.exists()
-        self.content: dict[str, Any] = json.loads(path.read_text()) if self.found else {"metrics": []}
-        self.values = {m["key"]: m["value"] for m in self.content["metrics"]}
-        self.errors = {m["key"]: m["error"] for m in self.content["metrics"]}
-
-    @property
-    def origin(self) -> str:
-        """Where the figures come from."""
-        if not self.found:
-            return f"*`results/{self.path.name}` is absent: run its benchmark first.*"
-        return f"`{self.content['command']}` on {self.content['hardware']}."
-
-
-def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
-    """A Markdown table."""
-    yield "| " + " | ".join(header) + " |"
-    yield "|" + "---|" * len(header)
-    yield from ("| " + " | ".join(row) + " |" for row in rows)
-    yield ""
 
 
 def presets(document: Document, accuracy: Document) -> Iterator[str]:
@@ -65,7 +31,7 @@ def presets(document: Document, accuracy: Document) -> Iterator[str]:
             seconds, memory = f"{v[f'{name}.s']:.3g} s", f"{v[f'{name}.peak_gib']:.2f} GiB"
             error, other = f"{v[f'{name}.rms_error']:.2g}", f"{100 * v[f'{name}.other_share']:.2g} %"
             key = "ablation.full.miou" if name == "float32" else f"preset.{name}.miou"
-            miou = _interval(accuracy.values, key) or "not measured"
+            miou = accuracy.interval(key) or "not measured"
             rows.append((label, PRESET_FLAGS.get(name, "benchmark only"), seconds, memory, error, other, miou))
     if len(rows) == 0:
         return
@@ -93,43 +59,33 @@ def every_metric(title: str, document: Document, keep: str = "") -> Iterator[str
         yield from table(("what", "value", "relative error against float64"), rows)
 
 
-def accuracy(document: Document) -> Iterator[str]:
-    """mIoU of the refinement's variants and of other methods, means over the ladder of damage."""
-    yield from ("## Task accuracy", "", document.origin, "")
-    v = document.values
-    if not document.found:
-        return
-    scenes = ["", *(["demo."] if "demo.ablation.full.miou" in v else [])]
-    columns = ["miou", "macc", *(["miou_2d"] if "ablation.full.miou_2d" in v else [])]
-    for scene in scenes:
-        rows = []
-        for group, names in (("ablation", TITLES), ("baseline", OTHERS)):
-            for name, label in names.items():
-                if f"{scene}{group}.{name}.miou" in v:
-                    cells = (_interval(v, f"{scene}{group}.{name}.{c}") for c in columns)
-                    rows.append((label if group == "ablation" else f"{label} (our implementation of the idea)", *cells))
-        if len(rows) > 0:
-            yield from table(("demo room" if scene else "tabletop", *columns), rows)
-    yield f"Means over the ladder of damage and {v['seeds']:.0f} seeds, in points, with 95 % intervals over seeds."
+def timing(document: Document) -> Iterator[str]:
+    """The stages, in the columns of the paper's table."""
+    yield from ("## Where the time goes on a GPU", "", document.origin, "")
+    v, rows = document.values, []
+    for case in [k.removesuffix(".total_s") for k in v if k.endswith(".total_s")]:
+        size = f"{v[f'{case}.gaussians'] / 1e6:.2f} M, {v[f'{case}.views']:.0f}"
+        post = v[f"{case}.reliability_s"] + v[f"{case}.neighbors_s"] + v[f"{case}.vote_s"]
+        times = (v[f"{case}.evidence_lift_s"], post, v[f"{case}.total_s"])
+        rows.append((case, size, *(f"{t:.3f} s" for t in times), f"{v[f'{case}.peak_gib']:.1f} GiB"))
+    header = ("", "Gaussians, views", "lift", "reliability, neighbours, vote", "total", "peak memory")
+    yield from table(header, rows)
+    yield "Lift: evidence, reliability and directions, which share their sums; 512 channels. 2D features are not in it."
     yield ""
 
 
-def _interval(values: dict[str, float], key: str) -> str:
-    return f"{values[key]:.1f} ± {values[f'{key}_ci95']:.1f}" if key in values else ""
-
-
 def plot_accuracy(document: Document, target: Path) -> None:
-    """mIoU of every variant on every step of the ladder."""
-    steps = [k.split(".")[1] for k in document.values if k.startswith("ladder.") and k.endswith(".full.miou")]
+    """mIoU of every variant on every step of the ladder, tabletop."""
+    names = steps(document)
     mpl.rcParams["svg.hashsalt"] = "accuracy"  # the same file for the same figures
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     axes = figure.subplots()
     for i, name in enumerate(TITLES):
-        values = [document.values[f"ladder.{step}.{name}.miou"] for step in steps]
-        bars = [document.values[f"ladder.{step}.{name}.miou_ci95"] for step in steps]
-        places = [x + 0.13 * (i - 2.5) for x in range(len(steps))]
+        values = [document.values[f"ladder.{step}.{name}.miou"] for step in names]
+        bars = [document.values[f"ladder.{step}.{name}.miou_ci95"] for step in names]
+        places = [x + 0.13 * (i - 2.5) for x in range(len(names))]
         axes.bar(places, values, 0.13, yerr=bars, label=TITLES[name], error_kw={"linewidth": 0.6})
-    axes.set_xticks(range(len(steps)), steps, rotation=30, ha="right")
+    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_ylabel("mIoU over Gaussians, points")
     axes.legend(fontsize=8, ncols=3)
     axes.grid(axis="y", alpha=0.3)
@@ -145,7 +101,7 @@ def page(documents: dict[str, Document]) -> str:
         "the result that took it.",
         "",
         *presets(documents["presets"], documents["accuracy"]),
-        *accuracy(documents["accuracy"]),
+        *timing(documents["h100"]),
         *every_metric("The core on a GPU", documents["h100"]),
         *every_metric("The core on a CPU", documents["cpu"]),
         *every_metric("Forms on disk, tolerance 0.01", documents["forms"], keep="tol0.01"),
@@ -153,18 +109,29 @@ def page(documents: dict[str, Document]) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def documents() -> dict[str, Document]:
-    """All results files that the page speaks of."""
-    return {name: Document(RESULTS / f"{name}.json") for name in ("cpu", "forms", "presets", "h100", "accuracy")}
+def plots(found: dict[str, Document]) -> Iterator[Path]:
+    """Pictures of what was measured."""
+    accuracy, fit, signals = (found[name] for name in ("accuracy", "fit", "signals"))
+    if accuracy.found:
+        plot_accuracy(accuracy, DOCS / "accuracy.svg")
+        yield DOCS / "accuracy.svg"
+    if fit.found:
+        curves = ((key.split(".", 2)[1:], value) for key, value in fit.values.items() if key.startswith("curve."))
+        rows = [{"parameter": name, "value": float(at), "miou": value} for (name, at), value in curves]
+        plot_sweeps(rows, "miou", "mIoU on held-out damage, points", DOCS / "sensitivity.svg")
+        yield DOCS / "sensitivity.svg"
+    if signals.found:
+        start = f"tabletop.{STEP}."
+        one = {k.removeprefix(start): value for k, value in signals.values.items() if k.startswith(start)}
+        plot_signals({k: value for k, value in one.items() if not k.endswith("_ci95")}, DOCS / "reliability.svg")
+        yield DOCS / "reliability.svg"
 
 
 def main() -> None:
     found = documents()
     (DOCS / "speed_and_error.md").write_text(page(found))
-    written = [DOCS / "speed_and_error.md"]
-    if found["accuracy"].found:
-        plot_accuracy(found["accuracy"], DOCS / "accuracy.svg")
-        written.append(DOCS / "accuracy.svg")
+    (DOCS / "accuracy.md").write_text(findings(found))
+    written = [DOCS / "speed_and_error.md", DOCS / "accuracy.md", *plots(found)]
     print("Written: " + ", ".join(map(str, written)))
 
 

@@ -11,8 +11,10 @@ import torch
 
 from benchmarks.accuracy import KEYS, Bench, summarize
 from benchmarks.damage import LADDER, Damage, Lengths, observe
+from benchmarks.documents import documents
+from benchmarks.findings import findings
 from benchmarks.fit import MOST, observation
-from benchmarks.pages import documents, page
+from benchmarks.pages import page
 from benchmarks.report import Report
 from benchmarks.variants import (
     VARIANTS,
@@ -181,9 +183,10 @@ def test_rows_and_their_summary(world):
     assert values["preset.half.miou"] == pytest.approx(values["ablation.full.miou"], abs=1)
 
 
-def test_the_page_is_made_of_the_committed_results():
-    written = ROOT / "docs" / "speed_and_error.md"
-    assert written.read_text() == page(documents()), "write it again: python -m benchmarks.pages"
+@pytest.mark.parametrize(("name", "made"), [("speed_and_error", page), ("accuracy", findings)])
+def test_pages_are_made_of_the_committed_results(name, made):
+    written = ROOT / "docs" / f"{name}.md"
+    assert written.read_text() == made(documents()), "write it again: python -m benchmarks.pages"
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ def plot_sweeps(rows: Sequence[Mapping[str, Any]], metric: str, label: str, path
     figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
     for one, parameter in zip(axes, parameters):
         points = sorted((row["value"], row[metric]) for row in rows if row["parameter"] == parameter)
-        one.plot([str(x) for x, _ in points], [y for _, y in points], marker="o", markersize=4)
+        one.plot([f"{x:g}" for x, _ in points], [y for _, y in points], marker="o", markersize=4)
         one.set_xlabel(parameter)
         one.grid(alpha=0.3)
     axes[0].set_ylabel(label)
