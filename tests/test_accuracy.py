@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,7 @@ from benchmarks.findings import findings
 from benchmarks.fit import MOST, observation
 from benchmarks.pages import page
 from benchmarks.report import Report
+from benchmarks.signals import mistakes
 from benchmarks.variants import (
     VARIANTS,
     centre_evidence,
@@ -25,8 +26,17 @@ from benchmarks.variants import (
     refined_scores,
     top_evidence,
 )
-from benchmarks.worlds import World, cell_evidence, made_words, truth_of
-from normlift_ns import RefineConfig, lift, nearest_neighbors, rasterize_evidence, refine, refine_variant
+from benchmarks.worlds import World, cell_evidence, made_words, truth_of, with_floaters
+from normlift_ns import (
+    GaussianScene,
+    RefineConfig,
+    lift,
+    nearest_neighbors,
+    rasterize_evidence,
+    refine,
+    refine_variant,
+    render,
+)
 from tests.scenes import dense, generator, orbit, random_scene
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -142,6 +152,27 @@ def test_votes_of_the_fit_are_those_of_refine(world):
         expected = refine(world.scene.means, lifted.directions, lifted.reliability, config)[voters]
         same = (one.sources(config, one.reliability(1.0)) == expected).float().mean()
         assert same > 0.97  # cosines are kept in half precision
+
+
+def test_floaters_take_about_a_quarter_of_the_light(world):
+    crowded = with_floaters(world, share=0.2)
+    n = len(world.scene)
+    assert (len(crowded.scene), crowded.truth[n:].tolist()) == (n + 60, [-1] * 60)
+    parts = {f.name: getattr(crowded.scene, f.name) for f in fields(crowded.scene)}
+    assert all(torch.equal(value[:n], getattr(world.scene, name)) for name, value in parts.items())
+    floaters = GaussianScene(**{name: value[n:] for name, value in parts.items()})
+    taken = [float(render(floaters, camera, torch.ones(60, 1))[1].mean()) for camera in world.cameras]
+    assert 0.1 < sorted(taken)[len(taken) // 2] < 0.4
+    assert len(crowded.evidence.rows) == n + 60
+
+
+def test_mistakes_of_the_middle_tenths():
+    reliability = torch.linspace(0.01, 1, 100)
+    truth, answer = torch.zeros(100, dtype=torch.int64), torch.zeros(100, dtype=torch.int64)
+    truth[55:60], answer[:50] = 1, 2  # five of the sixth tenth are called 0, the largest class; low ones do not count
+    truth[99] = -1
+    found = mistakes(reliability, truth, answer)
+    assert found == {"middle.wrong": pytest.approx(1 / 6, abs=0.01), "middle.wrong_largest": 1.0}
 
 
 def test_other_methods(world):
