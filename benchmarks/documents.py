@@ -42,7 +42,7 @@ class Document:
 
 def documents() -> dict[str, Document]:
     """All results files that the pages speak of."""
-    names = ("cpu", "forms", "presets", "h100", "accuracy", "fit", "signals")
+    names = ("cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses")
     return {name: Document(RESULTS / f"{name}.json") for name in names}
 
 

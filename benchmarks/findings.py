@@ -166,7 +166,8 @@ def drift(signals: Document) -> Iterator[str]:
     s = signals.values
     keys = [k for k in s if k.startswith("tabletop.drift.") and k.endswith("mix0.5")]
     noise = [k.split("noise")[1].split(".mix")[0] for k in keys]
-    yield from ("## What averaging does", "", "Pairs of classes mixed half and half that are nearest to a third.", "")
+    yield from ("## What averaging does", "", "![drift](drift.svg)", "")
+    yield from ("Pairs of classes mixed half and half that are nearest to a third:", "")
     rows = [(scene, *(f"{s[f'{scene}.drift.noise{x}.mix0.5']:.1f} %" for x in noise)) for scene in SCENES.values()]
     yield from table(("length of the noise", *noise), rows)
     yield (

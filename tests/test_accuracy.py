@@ -14,6 +14,7 @@ from benchmarks.damage import LADDER, Damage, Lengths, observe
 from benchmarks.documents import documents
 from benchmarks.findings import findings
 from benchmarks.fit import MOST, observation
+from benchmarks.losses import coarse_evidence
 from benchmarks.pages import page
 from benchmarks.report import Report
 from benchmarks.signals import mistakes
@@ -164,6 +165,18 @@ def test_floaters_take_about_a_quarter_of_the_light(world):
     taken = [float(render(floaters, camera, torch.ones(60, 1))[1].mean()) for camera in world.cameras]
     assert 0.1 < sorted(taken)[len(taken) // 2] < 0.4
     assert len(crowded.evidence.rows) == n + 60
+
+
+def test_coarse_evidence_is_that_of_smaller_images(world):
+    observed = observe(world, WORDS, Damage(dropped=0.3), 1)
+    same = coarse_evidence(world, observed, step=1)
+    assert torch.allclose(
+        dense(same.rows, same.num_regions), dense(observed.evidence.rows, same.num_regions), atol=1e-4
+    )
+    coarse = coarse_evidence(world, observed)
+    shares = [evidence.rows.row_sums().sum() / observed.evidence.rows.row_sums().sum() for evidence in (same, coarse)]
+    assert float(shares[0]) == pytest.approx(1, abs=1e-4)
+    assert 0.2 < float(shares[1]) < 0.4  # a quarter of the pixels; small Gaussians are widened to a pixel
 
 
 def test_mistakes_of_the_middle_tenths():
