@@ -118,7 +118,7 @@ def plot_drift(document: Document, target: Path) -> None:
         axes.plot(list(map(float, mixes)), rates, marker="o", markersize=3, label=f"noise {noise}")
     axes.set_xlabel("share of one of two features")
     axes.set_ylabel("pairs nearest to a third, %")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     axes.grid(alpha=0.3)
     figure.savefig(target, metadata={"Date": None})
 
