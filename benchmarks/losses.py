@@ -38,16 +38,19 @@ TOLERANCE = 0.05
 
 
 def coarse_evidence(world: World, observed: Observed, step: int = 2) -> Evidence:
-    """Evidence of the masks of an observation of all views, in images of a fraction of the size."""
+    """Evidence of the masks of an observation of all views, in images of a fraction of the size: of the pixels that
+    become one, the most frequent mask counts.
+    """
     view, labels, cameras = observed.evidence.region_view, [], []
     count = torch.bincount(view, minlength=len(world.cameras))
     first = count.cumsum(0) - count
     for v, camera in enumerate(world.cameras):
-        column = observed.columns[0][world.cells.of_pixel[v, ::step, ::step].long()]
-        labels.append(torch.where(column >= 0, column - first[v], -1).int())
+        column = observed.columns[0][world.cells.of_pixel[v].long()]
+        local = torch.where(column >= 0, column - first[v], -1)
+        blocks = local.unfold(0, step, step).unfold(1, step, step).flatten(2)
+        labels.append(blocks.mode(dim=2).values.int())
         height, width = labels[-1].shape
         K = camera.K.clone()
-        K[:2, 2] += (step - 1) / 2  # the pixels that were kept stand in the middle of the new ones
         K[:2] /= step
         cameras.append(Camera(K, camera.world_to_camera, width, height))
     return rasterize_evidence(world.scene, cameras, labels, num_regions=count.tolist())
