@@ -8,7 +8,8 @@ that nobody but the Gaussian itself has a say; the curves go further. Every comb
 (damages, all scenes, seeds from 100 on); the highest mean mIoU wins. Then `START` and the winner are compared on
 `HELD_OUT` (other damages, seeds from 200 on), with 95 % intervals of the paired difference, the curve of every
 parameter around the winner, and the other readings of unlabelled pixels and of the weights. Plain voting has its own
-best combination, which tells parameters from method. Writes results/fit.json.
+best combination, which tells parameters from method. Two earlier searches with wider grids went to their ends, K = 60
+and sigma_d = 0.25, before these bounds were set. Writes results/fit.json.
 """
 
 from __future__ import annotations
