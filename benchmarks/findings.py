@@ -207,8 +207,8 @@ def parameters(fit: Document) -> Iterator[str]:
     yield (
         "Two earlier searches, on the same damages, went to the ends of their grids, K = 60 and sigma_d = 0.25; K was "
         "then left at 36 for its cost, and sigma_d kept at 1 or more for its meaning, so the held-out damage was seen "
-        "before. `weight_power` stays 1 and `--unlabeled` stays `ignore`. The curves, beside the paper's: tau and sigma_d "
-        f"are flat, as there. K rises to the end: 60 gains {k60 - k36:.1f} points over 36 at 2.7 times the products, "
+        "before. `weight_power` stays 1 and `--unlabeled` stays `ignore`. The curves, beside the paper's: tau and "
+        f"sigma_d are flat, as there. K rises to the end: 60 gains {k60 - k36:.1f} points over 36 at 2.7 times the products, "
         f"24 loses {k36 - k24:.1f}; the paper's curve is flat above 30. beta has one peak, at 1; gamma is best at "
         f"0.4, below 0.1 the vote loses 3 points. Delta is the difference: the paper finds no effect up to 0.3, "
         f"here 0.1 costs {v['curve.delta.0.0'] - v['curve.delta.0.1']:.1f} points, because with sigma_d = 1 a vote is "
