@@ -28,12 +28,12 @@ from torch.nn.functional import normalize
 
 from benchmarks.report import RESULTS, Report
 from normlift_ns.encoders import sam as sam_module
-from normlift_ns.encoders.masks import Suppression, mask_nms, stack_masks
-from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.sam import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
-from normlift_ns.encoders.sam_network import SamNetwork
-from normlift_ns.encoders.small_regions import clean_masks
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
+from normlift_ns.encoders.sam.network import SamNetwork
+from normlift_ns.encoders.sam.rules import Suppression, mask_nms, stack_masks
+from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.source import RegionFeatures
 
 _REPEATS = 3

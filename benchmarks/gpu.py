@@ -34,7 +34,7 @@ from normlift_ns import (
     rasterize_evidence,
     refine,
 )
-from normlift_ns.core.forms import EvidenceForm
+from normlift_ns.core.storage import StoredEvidence
 from normlift_ns.raster.gsplat import project_views
 from normlift_ns.raster.settings import RasterSettings
 
@@ -184,10 +184,10 @@ def measure(report: Report, case: Case) -> None:
 
 def query_field(lifted: Lifted, source: torch.Tensor) -> SemanticField:
     """A field of the exact form without its costly facts (bytes and bounds of the other forms)."""
-    from normlift_ns.core.forms import Scalars  # noqa: PLC0415
+    from normlift_ns.core.storage import Scalars  # noqa: PLC0415
 
     scalars = Scalars(*(getattr(lifted, name) for name in Scalars.__dataclass_fields__))
-    return SemanticField(scalars, source, EvidenceForm(lifted.evidence, lifted.features), {"dimension": DIMENSION})
+    return SemanticField(scalars, source, StoredEvidence(lifted.evidence, lifted.features), {"dimension": DIMENSION})
 
 
 def evidence_error(case: Case, evidence: Evidence) -> float:

@@ -24,13 +24,13 @@ from benchmarks.captures import SHARED, trained_scene, trained_state, training_c
 from benchmarks.cpu import clip_like_table, grid_labels
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, SemanticField, lift, rasterize_evidence
-from normlift_ns.core.forms import Form
+from normlift_ns.asking import Answer, answer, reselect
 from normlift_ns.core.query import CANONICAL_NEGATIVES, relevancy
-from normlift_ns.plugin.asking import Answer, judge, respond
-from normlift_ns.plugin.display import make_display
-from normlift_ns.plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.plugin.queries import Question
-from normlift_ns.plugin.status import report as status
+from normlift_ns.core.storage import Form
+from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
+from normlift_ns.runs.question import Question
+from normlift_ns.viewer.display import make_display
+from normlift_ns.viewer.status import report as status
 
 REPEATS, CLASSES, SAMPLE = 20, 32, 20_000
 
@@ -91,14 +91,14 @@ def measure(
     """
     device, question = model.device.type, questions()
     model.attach(field)
-    answer: Answer = respond(field, question)
+    answer: Answer = answer(field, question)
     error = (answer.relevancy[some].double() - exact).abs().max()
 
     def whole() -> None:
         model.normlift._answer_to(question, "")
 
-    report.add(f"fox_{name}_relevancy_ms", least(device, lambda: respond(field, question)), "ms", error)
-    report.add(f"fox_{name}_threshold_ms", least(device, lambda: judge(field, answer, 0.55, 0.1)), "ms")
+    report.add(f"fox_{name}_relevancy_ms", least(device, lambda: answer(field, question)), "ms", error)
+    report.add(f"fox_{name}_threshold_ms", least(device, lambda: reselect(field, answer, 0.55, 0.1)), "ms")
     report.add(f"fox_{name}_display_ms", least(device, lambda: make_display(field, answer)), "ms")
     report.add(f"fox_{name}_status_ms", least(device, lambda: status(answer, None)), "ms")
     report.add(f"fox_{name}_answer_ms", least(device, whole), "ms", error)

@@ -23,7 +23,7 @@ from normlift_ns.core.evidence import MASKED
 from normlift_ns.core.metrics import NO_CLASS
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.demo import demo_cameras, demo_room, held_out_cameras, view_labels
-from normlift_ns.encoders.levels import joint_partition
+from normlift_ns.encoders.source import joint_partition
 
 BLOCKS = 40
 """Blocks across an image."""

@@ -1,35 +1,72 @@
-"""Training-free open-vocabulary semantics for trained Gaussian splats. See README.md and docs/method.md."""
+"""Training-free open-vocabulary semantics for trained Gaussian splats. See README.md and docs/method.md.
 
-from normlift_ns.core.ablations import refine_variant
-from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.field import SemanticField
-from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.lift import Lifted, lift
-from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
-from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
-from normlift_ns.core.refine import RefineConfig, refine, unsupported
-from normlift_ns.raster.rasterize import rasterize_evidence, render
-from normlift_ns.raster.settings import RasterSettings
+The names below are loaded when they are first used: importing the package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from normlift_ns.asking import Answer as Answer
+    from normlift_ns.asking import Finding as Finding
+    from normlift_ns.core.ablations import refine_variant as refine_variant
+    from normlift_ns.core.evidence import Evidence as Evidence
+    from normlift_ns.core.field import SemanticField as SemanticField
+    from normlift_ns.core.gaussians import Camera as Camera
+    from normlift_ns.core.gaussians import GaussianScene as GaussianScene
+    from normlift_ns.core.lift import Lifted as Lifted
+    from normlift_ns.core.lift import Scalars as Scalars
+    from normlift_ns.core.lift import lift as lift
+    from normlift_ns.core.neighbors import Neighbors as Neighbors
+    from normlift_ns.core.neighbors import nearest_neighbors as nearest_neighbors
+    from normlift_ns.core.query import BACKGROUND_WORDS as BACKGROUND_WORDS
+    from normlift_ns.core.query import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
+    from normlift_ns.core.query import relevancy as relevancy
+    from normlift_ns.core.refine import refine as refine
+    from normlift_ns.core.refine import unsupported as unsupported
+    from normlift_ns.core.scene import Scene as Scene
+    from normlift_ns.core.scene import View as View
+    from normlift_ns.lifted_run import LiftedRun as LiftedRun
+    from normlift_ns.lifted_run import lift_run as lift_run
+    from normlift_ns.lifted_run import open_run as open_run
+    from normlift_ns.lifted_run import open_scene as open_scene
+    from normlift_ns.options import LiftOptions as LiftOptions
+    from normlift_ns.options import RefineConfig as RefineConfig
+    from normlift_ns.options import SourceOptions as SourceOptions
+    from normlift_ns.raster.rasterize import rasterize_evidence as rasterize_evidence
+    from normlift_ns.raster.rasterize import render as render
+    from normlift_ns.raster.settings import RasterSettings as RasterSettings
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "BACKGROUND_WORDS",
-    "CANONICAL_NEGATIVES",
-    "Camera",
-    "Evidence",
-    "GaussianScene",
-    "Lifted",
-    "Neighbors",
-    "RasterSettings",
-    "RefineConfig",
-    "SemanticField",
-    "lift",
-    "nearest_neighbors",
-    "rasterize_evidence",
-    "refine",
-    "refine_variant",
-    "relevancy",
-    "render",
-    "unsupported",
-]
+_HOMES = {
+    "asking": ("Answer", "Finding"),
+    "core.ablations": ("refine_variant",),
+    "core.evidence": ("Evidence",),
+    "core.field": ("SemanticField",),
+    "core.gaussians": ("Camera", "GaussianScene"),
+    "core.lift": ("Lifted", "Scalars", "lift"),
+    "core.neighbors": ("Neighbors", "nearest_neighbors"),
+    "core.query": ("BACKGROUND_WORDS", "CANONICAL_NEGATIVES", "relevancy"),
+    "core.refine": ("refine", "unsupported"),
+    "core.scene": ("Scene", "View"),
+    "lifted_run": ("LiftedRun", "lift_run", "open_run", "open_scene"),
+    "options": ("LiftOptions", "RefineConfig", "SourceOptions"),
+    "raster.rasterize": ("rasterize_evidence", "render"),
+    "raster.settings": ("RasterSettings",),
+}
+"""Modules by the public names that they define."""
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'normlift_ns' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"normlift_ns.{_HOME[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

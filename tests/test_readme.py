@@ -8,7 +8,7 @@ import pytest
 
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
-from normlift_ns.plugin.lifting import LiftOptions
+from normlift_ns.lifting import LiftOptions
 from normlift_ns.scripts import lift
 from normlift_ns.scripts.query import NormLiftQuery
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.forms import Scalars
-from normlift_ns.core.lift import Lifted
+from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
-from normlift_ns.core.refine import RefineConfig, decay_width, refine, voting_weights
+from normlift_ns.core.refine import decay_width, refine, voting_weights
+from normlift_ns.options import RefineConfig
 
 Variant = Literal["none", "knn", "linear", "norm", "support", "full"]
 
@@ -35,7 +35,7 @@ def refine_variant(
         ValueError: an unknown variant.
     """
     config = config or RefineConfig()
-    reliability, directions = variant_reliability(variant, lifted, beta), lifted.directions()
+    reliability, directions = variant_reliability(variant, lifted.scalars, beta), lifted.directions()
     if variant == "none":
         return directions
     neighbors = neighbors or nearest_neighbors(means, config.k)
@@ -44,7 +44,7 @@ def refine_variant(
     return directions[refine(means, directions, reliability, config, neighbors=neighbors).long()]
 
 
-def variant_reliability(variant: Variant, lifted: Lifted | Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
+def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
     """R that a variant votes with.
 
     "knn": plain voting, 1 for every Gaussian with a direction. "norm": ||f||. "support": N_eff / (N_eff + beta). Any
@@ -56,11 +56,11 @@ def variant_reliability(variant: Variant, lifted: Lifted | Scalars, beta: float 
     if variant not in get_args(Variant):
         raise ValueError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
     if variant == "knn":
-        return (lifted.norm > 0).to(lifted.norm.dtype)
+        return (scalars.norm > 0).to(scalars.norm.dtype)
     if variant == "norm":
-        return lifted.norm
-    support = torch.where(lifted.n_eff > 0, lifted.n_eff / (lifted.n_eff + beta), 0.0)
-    return support if variant == "support" else lifted.norm * support
+        return scalars.norm
+    support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + beta), 0.0)
+    return support if variant == "support" else scalars.norm * support
 
 
 def linear_average(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
@@ -45,12 +45,8 @@ class Evidence:
     order is the same on every run. Raises ValueError on construction if the arrays do not fit each other.
     """
 
-    offsets: Int64[Tensor, " n_plus_1"]
-    """Row j holds the entries offsets[j]:offsets[j + 1]."""
-    region: Int32[Tensor, " nnz"]
-    """Column s of every entry."""
-    weight: Float[Tensor, " nnz"]
-    """E_js > 0 of every entry (sum of A_ij ** weight_power)."""
+    rows: SparseRows
+    """E, [N, S]: E_js > 0 of every entry, the sum of A_ij ** weight_power."""
     region_view: Int32[Tensor, " s"]
     """View of every column, non-decreasing."""
     unlabeled: SparseRows
@@ -63,23 +59,20 @@ class Evidence:
     """Gaussians that were not drawn because a parameter was not finite."""
 
     def __post_init__(self) -> None:
-        if (
-            self.offsets.numel() < 1
-            or int(self.offsets[-1]) != self.region.numel()
-            or self.region.numel() != self.weight.numel()
-        ):
+        offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
+        if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
             raise ValueError(
-                f"Evidence arrays disagree: offsets end at {self.offsets[-1:].tolist()}, {self.region.numel()} "
-                f"regions, {self.weight.numel()} weights"
+                f"Evidence arrays disagree: offsets end at {offsets[-1:].tolist()}, {column.numel()} columns, "
+                f"{weight.numel()} weights"
             )
         if len(self.unlabeled) != self.num_gaussians:
             raise ValueError(
                 f"Evidence.unlabeled has {len(self.unlabeled)} rows, expected one per Gaussian: {self.num_gaussians}"
             )
-        if self.region.numel() > 0 and not (int(self.region.min()) >= 0 and int(self.region.max()) < self.num_regions):
+        if column.numel() > 0 and not (int(column.min()) >= 0 and int(column.max()) < self.num_regions):
             raise ValueError(
-                f"Evidence.region must be in 0..{self.num_regions - 1}, found "
-                f"{int(self.region.min())}..{int(self.region.max())}"
+                f"Evidence.rows.column must be in 0..{self.num_regions - 1}, found "
+                f"{int(column.min())}..{int(column.max())}"
             )
         if self.num_regions > 0 and (
             bool((self.region_view.diff() < 0).any())
@@ -90,7 +83,7 @@ class Evidence:
     @property
     def num_gaussians(self) -> int:
         """N, those without evidence included."""
-        return self.offsets.numel() - 1
+        return len(self.rows)
 
     @property
     def num_regions(self) -> int:
@@ -100,12 +93,7 @@ class Evidence:
     @property
     def nnz(self) -> int:
         """Number of entries."""
-        return self.weight.numel()
-
-    @property
-    def rows(self) -> SparseRows:
-        """E as a sparse [N, S] matrix, without a copy."""
-        return SparseRows(self.offsets, self.region, self.weight)
+        return self.rows.weight.numel()
 
     @staticmethod
     def from_entries(
@@ -124,28 +112,25 @@ class Evidence:
             first, view = first + sum(part.num_regions), view + len(part.num_regions)
         rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
         region_view = torch.tensor([v for v, count in enumerate(counts) for _ in range(count)], dtype=torch.int32)
-        return Evidence(
-            rows.offsets, rows.column, rows.weight, region_view.to(device), unlabeled, view, weight_power,
-            num_excluded,
-        )  # fmt: skip
+        return Evidence(rows, region_view.to(device), unlabeled, view, weight_power, num_excluded)
 
     @cached_property
     def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
         """Entry offsets of the (Gaussian, view) groups: entries of a row that share a view stand next to each other."""
-        view = self.region_view[self.region.long()]
+        offsets, view = self.rows.offsets, self.region_view[self.rows.column.long()]
         starts = torch.ones(self.nnz, dtype=torch.bool, device=view.device)
         if self.nnz > 0:
             starts[1:] = view[1:] != view[:-1]
-            starts[self.offsets[:-1][self.offsets.diff() > 0]] = True
-        return torch.cat([starts.nonzero().squeeze(1), self.offsets[-1:]])
+            starts[offsets[:-1][offsets.diff() > 0]] = True
+        return torch.cat([starts.nonzero().squeeze(1), offsets[-1:]])
 
     def view_weights(self) -> SparseRows:
         """W_jv: weight of Gaussian j in the labelled pixels of view v, [N, views], one entry per pair with evidence,
         float64.
         """
         groups = self.view_group_offsets
-        view = self.region_view[self.region[groups[:-1]].long()]
-        return SparseRows(torch.searchsorted(groups, self.offsets), view, segment_sum(self.weight, groups))
+        view = self.region_view[self.rows.column[groups[:-1]].long()]
+        return SparseRows(torch.searchsorted(groups, self.rows.offsets), view, segment_sum(self.rows.weight, groups))
 
     def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
         """Columns of the given views, in their order: features[evidence.columns_of(v)] is the table of
@@ -176,7 +161,7 @@ class Evidence:
         new_view = torch.full((self.num_views,), -1, dtype=torch.int32, device=columns.device)
         new_view[chosen] = torch.arange(chosen.numel(), dtype=torch.int32, device=columns.device)
         region_view = new_view[self.region_view[columns].long()]
-        return self._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
+        return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
 
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
         """The evidence of coarser regions, without rasterizing: E'_jt = sum over levels and the columns s of t of E_js.
@@ -203,10 +188,10 @@ class Evidence:
             raise ValueError("a new column must be of the same view as the columns that it joins")
         if torch.equal(columns, torch.arange(len(region_view), device=columns.device)[None]):
             return self
-        old = self.region.long()
+        old = self.rows.column.long()
         new = columns[:, old]
         kept = new >= 0
-        row, view, weight = (x.expand_as(new) for x in (self.rows.row_index(), self.region_view[old], self.weight))
+        row, view, weight = (x.expand_as(new) for x in (self.rows.row_index(), self.region_view[old], self.rows.weight))
         rows = SparseRows.from_coo(row[kept], new[kept], weight[kept], self.num_gaussians)
         blank = self.unlabeled
         unlabeled = SparseRows.from_coo(
@@ -215,10 +200,7 @@ class Evidence:
             torch.cat([blank.weight * len(columns), weight[~kept]]),
             self.num_gaussians,
         )
-        return self._with(rows, region_view=region_view, unlabeled=unlabeled)
-
-    def _with(self, rows: SparseRows, **changes: Any) -> Evidence:
-        return replace(self, offsets=rows.offsets, region=rows.column, weight=rows.weight, **changes)
+        return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled)
 
     @staticmethod
     def merge(*parts: Evidence) -> Evidence:
@@ -238,7 +220,7 @@ class Evidence:
         rows = SparseRows.append_columns([part.rows for part in parts], regions)
         unlabeled = SparseRows.append_columns([part.unlabeled for part in parts], views)
         region_view = torch.cat([part.region_view + first for part, first in zip(parts, views)])
-        return parts[0]._with(rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
+        return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
     def prune(self, *, relative: float) -> tuple[Evidence, Float64[Tensor, " n"]]:
         """Drops entries below `relative` times the largest entry of their Gaussian, and says what that can cost.
@@ -256,36 +238,37 @@ class Evidence:
         """
         if not 0 <= relative <= 1:
             raise ValueError(f"relative must be in 0..1, got {relative}")
-        row = self.rows.row_index()
-        largest = self.weight.new_zeros(self.num_gaussians).scatter_reduce_(
-            0, row, self.weight, "amax", include_self=False
-        )
-        keep = self.weight >= relative * largest[row]
+        weight, row = self.rows.weight, self.rows.row_index()
+        largest = weight.new_zeros(self.num_gaussians).scatter_reduce_(0, row, weight, "amax", include_self=False)
+        keep = weight >= relative * largest[row]
         total = self.rows.row_sums()
-        dropped = segment_sum(torch.where(keep, 0.0, self.weight.double()), self.offsets)
+        dropped = segment_sum(torch.where(keep, 0.0, weight.double()), self.rows.offsets)
         bound = torch.where(total > 0, 2 * dropped / total, 0.0)
-        row = row[keep]
-        kept = SparseRows(row_offsets(row, self.num_gaussians), self.region[keep], self.weight[keep])
-        return self._with(kept), bound
+        kept = SparseRows(row_offsets(row[keep], self.num_gaussians), self.rows.column[keep], weight[keep])
+        return replace(self, rows=kept), bound
 
     def to(self, device: torch.device | str) -> Evidence:
         """A copy on another device."""
-        return self._with(
-            self.rows.to(device), region_view=self.region_view.to(device), unlabeled=self.unlabeled.to(device)
+        return replace(
+            self,
+            rows=self.rows.to(device),
+            region_view=self.region_view.to(device),
+            unlabeled=self.unlabeled.to(device),
         )
 
     def save(self, path: str | Path) -> None:
         """Writes a safetensors file, complete or not at all."""
-        tensors = {
-            name: getattr(self, name).contiguous().cpu() for name in ("offsets", "region", "weight", "region_view")
-        }
-        tensors |= {
-            f"unlabeled_{name}": getattr(self.unlabeled, name).contiguous().cpu()
-            for name in ("offsets", "column", "weight")
-        }
+        rows, blank = self.rows, self.unlabeled
+        tensors = {"offsets": rows.offsets, "region": rows.column, "weight": rows.weight}
+        tensors |= {f"unlabeled_{name}": getattr(blank, name) for name in ("offsets", "column", "weight")}
+        tensors["region_view"] = self.region_view
         metadata = {name: str(getattr(self, name)) for name in ("num_views", "weight_power", "num_excluded")}
         with atomic_path(Path(path)) as temporary:
-            save_file(tensors, temporary, metadata={"format": _FORMAT, **metadata})
+            save_file(
+                {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
+                temporary,
+                metadata={"format": _FORMAT, **metadata},
+            )
 
     @staticmethod
     def load(path: str | Path) -> Evidence:
@@ -306,13 +289,10 @@ class Evidence:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (safe_open is no mapping)
         except SafetensorError as error:
             raise ValueError(f"{path} is damaged or no safetensors file ({error}); rasterize again") from error
-        unlabeled = SparseRows(*(tensors.pop(f"unlabeled_{name}") for name in ("offsets", "column", "weight")))
-        num_views, weight_power, num_excluded = (
-            int(metadata[name]) for name in ("num_views", "weight_power", "num_excluded")
-        )
-        return Evidence(
-            **tensors, unlabeled=unlabeled, num_views=num_views, weight_power=weight_power, num_excluded=num_excluded
-        )
+        rows = SparseRows(tensors["offsets"], tensors["region"], tensors["weight"])
+        unlabeled = SparseRows(*(tensors[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
+        counts = (int(metadata[name]) for name in ("num_views", "weight_power", "num_excluded"))
+        return Evidence(rows, tensors["region_view"], unlabeled, *counts)
 
 
 def _column_table(

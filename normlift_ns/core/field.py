@@ -1,4 +1,4 @@
-"""`SemanticField`: what a lift leaves on disk, in the smallest form that meets the asked tolerance, and how it
+"""`SemanticField`: what a lift leaves on disk, in the smallest storage that meets the asked tolerance, and how it
 answers text.
 """
 
@@ -19,25 +19,26 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.files import atomic_path
-from normlift_ns.core.forms import DirectionForm, EvidenceForm, Form, Scalars, direction_form, sizes_and_bounds
-from normlift_ns.core.lift import Lifted
+from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import smallest_basis
-from normlift_ns.core.query import RelevancyForm, relevancy
+from normlift_ns.core.query import relevancy
+from normlift_ns.core.storage import StoredDirections, StoredEvidence, sizes_and_bounds, store_directions
+from normlift_ns.options import Rule, Storage
 
 SCHEMA_VERSION = 1
 
 
 @dataclass(frozen=True)
 class SemanticField:
-    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three forms."""
+    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three ways of storage."""
 
     scalars: Scalars
     source: Int32[Tensor, " n"]
     """The refined direction of Gaussian i is that of source[i]; source[i] = i where nothing was refined."""
-    store: EvidenceForm | DirectionForm
+    store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    """What is known of the field: form, sizes and bounds of all three forms, fingerprint of the means, provenance.
-    JSON types only.
+    """What is known of the field: its storage (key `form`), sizes and bounds of all three ways (key `forms`),
+    fingerprint of the means, provenance. JSON types only.
     """
 
     def __len__(self) -> int:
@@ -45,7 +46,7 @@ class SemanticField:
 
     def to(self, device: torch.device | str) -> SemanticField:
         """A copy on another device."""
-        scalars = Scalars(**{f.name: getattr(self.scalars, f.name).to(device) for f in fields(Scalars)})
+        scalars = self.scalars.map(lambda x: x.to(device))
         return SemanticField(scalars, self.source.to(device), self.store.to(device), self.manifest)
 
     @property
@@ -60,21 +61,21 @@ class SemanticField:
         source: Int[Tensor, " n"] | None = None,
         *,
         tolerance: float = 1e-3,
-        form: Form | Literal["auto"] = "auto",
+        storage: Storage | Literal["auto"] = "auto",
         provenance: Mapping[str, Any] | None = None,
     ) -> SemanticField:
-        """Chooses the form and reports the size in bytes and the error bound of all three.
+        """Chooses the storage and reports the size in bytes and the error bound of all three.
 
         Args:
             source: result of `refine`; none: unrefined.
             tolerance: largest error of any cosine of any Gaussian to any unit vector, > 0.
-            form: "auto" takes the smallest form whose bound is within the tolerance.
+            storage: "auto" takes the smallest whose bound is within the tolerance.
             provenance: JSON-ready facts for the manifest: source config and step, encoder, regions, hyper-parameters.
         Raises:
-            ValueError: `means` or `source` of another length, a tolerance <= 0, an unknown form, or "low_rank" where
+            ValueError: `means` or `source` of another length, a tolerance <= 0, an unknown storage, or "low_rank" where
                 no rank meets the tolerance.
         """
-        n, dimension = lifted.norm.numel(), lifted.features.shape[1]
+        n, dimension = len(lifted.scalars.norm), lifted.features.shape[1]
         if len(means) != n or (source is not None and len(source) != n):
             raise ValueError(
                 f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
@@ -82,36 +83,36 @@ class SemanticField:
             )
         if not tolerance > 0:
             raise ValueError(f"tolerance must be positive, got {tolerance}")
-        if form not in (*get_args(Form), "auto"):
-            raise ValueError(f"form must be auto, {', '.join(get_args(Form))}; got {form!r}")
+        if storage not in (*get_args(Storage), "auto"):
+            raise ValueError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
         basis = smallest_basis(lifted, tolerance)
-        forms = sizes_and_bounds(lifted, basis)
-        if form == "auto":
-            form = min(
-                (name for name, facts in forms.items() if facts["bound"] <= tolerance),
-                key=lambda name: forms[name]["bytes"],
+        ways = sizes_and_bounds(lifted, basis)
+        if storage == "auto":
+            storage = min(
+                (name for name, facts in ways.items() if facts["bound"] <= tolerance),
+                key=lambda name: ways[name]["bytes"],
             )  # type: ignore[assignment]
-        if form not in forms:
+        if storage not in ways:
             raise ValueError(
-                f"no basis keeps every Gaussian within tolerance {tolerance}; raise it, or take form float16 or "
+                f"no basis keeps every Gaussian within tolerance {tolerance}; raise it, or take storage float16 or "
                 "evidence"
             )
-        if form == "evidence":
-            store = EvidenceForm(lifted.evidence, lifted.features.float())
+        if storage == "evidence":
+            store = StoredEvidence(lifted.evidence, lifted.features.float())
         else:
-            store = direction_form(lifted, basis.rows if form == "low_rank" and basis is not None else None)
+            store = store_directions(lifted, basis.rows if storage == "low_rank" and basis is not None else None)
         manifest = {
             **(provenance or {}),
             "schema_version": SCHEMA_VERSION,
             "num_gaussians": n,
             "dimension": dimension,
             "means_fingerprint": fingerprint(means),
-            "form": form,
+            "form": storage,
             "tolerance": tolerance,
-            "forms": forms,
+            "forms": ways,
         }
-        scalars = Scalars(**{f.name: _single(getattr(lifted, f.name)) for f in fields(Scalars)})
-        identity = torch.arange(n, dtype=torch.int32, device=lifted.norm.device)
+        scalars = lifted.scalars.map(_single)
+        identity = torch.arange(n, dtype=torch.int32, device=scalars.norm.device)
         return SemanticField(scalars, identity if source is None else source.int(), store, manifest)
 
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
@@ -142,18 +143,18 @@ class SemanticField:
         text_vectors: Float[Tensor, "q d"],
         negatives: Float[Tensor, "b d"] | None = None,
         *,
-        form: RelevancyForm = "cosine",
+        rule: Rule = "cosine",
         refined: bool = True,
     ) -> Float[Tensor, "n q"]:
-        """`query` followed by `relevancy` of module query; a Gaussian without a direction gets 0 (form "margin": -2),
+        """`query` followed by `relevancy` of module query; a Gaussian without a direction gets 0 (rule "margin": -2),
         never a find.
         """
         count = len(text_vectors)
         cosine = self.query(
             text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined
         )
-        values = relevancy(cosine[:, :count], cosine[:, count:], form=form)
-        return torch.where(self.valid(refined=refined)[:, None], values, -2.0 if form == "margin" else 0.0)
+        values = relevancy(cosine[:, :count], cosine[:, count:], rule=rule)
+        return torch.where(self.valid(refined=refined)[:, None], values, -2.0 if rule == "margin" else 0.0)
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Unit directions of all or some Gaussians, 0 where `valid` is False."""
@@ -162,7 +163,7 @@ class SemanticField:
         return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
-        """Writes field.safetensors, evidence.safetensors (form "evidence") and, last, manifest.json.
+        """Writes field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
 
         A folder with a manifest is complete.
 
@@ -177,7 +178,7 @@ class SemanticField:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "manifest.json").unlink(missing_ok=True)
         tensors = dict(_tensors(self))
-        if isinstance(self.store, EvidenceForm):
+        if isinstance(self.store, StoredEvidence):
             self.store.evidence.save(folder / "evidence.safetensors")
         else:
             (folder / "evidence.safetensors").unlink(missing_ok=True)
@@ -216,9 +217,9 @@ class SemanticField:
             tensors = load_file(folder / "field.safetensors")
             scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
             if manifest["form"] == "evidence":
-                store = EvidenceForm(Evidence.load(folder / "evidence.safetensors"), tensors["features"])
+                store = StoredEvidence(Evidence.load(folder / "evidence.safetensors"), tensors["features"])
             else:
-                store = DirectionForm(tensors["coordinates"], tensors.get("basis"))
+                store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
             return SemanticField(scalars, tensors["source"], store, manifest)
         except (SafetensorError, json.JSONDecodeError, KeyError) as error:
             raise ValueError(
@@ -241,7 +242,7 @@ def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
     for f in fields(Scalars):
         yield f.name, getattr(semantic_field.scalars, f.name)
     store = semantic_field.store
-    if isinstance(store, EvidenceForm):
+    if isinstance(store, StoredEvidence):
         yield "features", store.features
     else:
         yield "coordinates", store.coordinates

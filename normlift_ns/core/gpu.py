@@ -39,3 +39,18 @@ def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[
     torch.cuda.empty_cache()
     half = len(items) // 2
     return in_parts(run, items[:half], advice) + in_parts(run, items[half:], advice)
+
+
+def choose_device(device: str) -> str:
+    """The device to work on; auto: cuda if there is one.
+
+    Raises:
+        ValueError: an unknown device, or one that this machine lacks.
+    """
+    if device not in ("auto", "cpu") and not device.startswith("cuda"):
+        raise ValueError(f"--device must be auto, cpu or cuda, got {device!r}")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"--device {device}: this machine has no CUDA device; use --device cpu")
+    if device != "auto":
+        return device
+    return "cuda" if torch.cuda.is_available() else "cpu"

@@ -13,9 +13,9 @@ For Gaussian j, with E_js the evidence and F_s the unit feature of region s (equ
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int, Int32
@@ -24,15 +24,12 @@ from torch import Tensor
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, SparseRows, segment_sum
-
-Unlabeled = Literal["ignore", "dilute"]
+from normlift_ns.options import Unlabeled
 
 
 @dataclass(frozen=True)
-class Lifted:
-    """What a lift knows of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all is 0 but `view_count` and
-    `weight`.
-    """
+class Scalars:
+    """The numbers of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all are 0 but `view_count` and `weight`."""
 
     norm: Float[Tensor, " n"]
     """||f_j||, in 0..1."""
@@ -44,10 +41,21 @@ class Lifted:
     """Effective number of views, in 1..view_count (0 without evidence)."""
     reliability: Float[Tensor, " n"]
     """R_j, in 0..1."""
-    view_count: Int32[Tensor, " n"]
-    """Number of views in which the Gaussian has weight."""
     weight: Float[Tensor, " n"]
     """W_j, the denominator of f_j."""
+    view_count: Int32[Tensor, " n"]
+    """Number of views in which the Gaussian has weight."""
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Scalars:
+        """The same numbers, each array changed."""
+        return Scalars(**{f.name: change(getattr(self, f.name)) for f in fields(Scalars)})
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """What a lift knows of every Gaussian: its numbers, and all that its direction is made of."""
+
+    scalars: Scalars
     evidence: Evidence
     features: Float[Tensor, "s d"]
     """The feature table, normalised, in the precision of the lift."""
@@ -86,11 +94,11 @@ class Lifted:
         if _has_kernel(table):
             from normlift_ns.kernels.sums import unit_sums  # noqa: PLC0415 (needs triton)
 
-            arrays = (rows.offsets, rows.column, rows.weight, table, self.norm)
+            arrays = (rows.offsets, rows.column, rows.weight, table, self.scalars.norm)
             return unit_sums(gaussians.long(), *arrays, dtype, CANCELLED)
         sums = rows.select_rows(gaussians).sums_of_unit_rows(table)
         length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
-        return torch.where((self.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
+        return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
 
 
 class _Sums(NamedTuple):
@@ -143,12 +151,8 @@ def lift(
         "reliability": _ratio(norm * n_eff, n_eff + beta, found),
         "weight": weight,
     }
-    return Lifted(
-        **{name: value.to(table.dtype) for name, value in values.items()},
-        view_count=view_count.int(),
-        evidence=evidence,
-        features=table,
-    )
+    scalars = Scalars(**{name: x.to(table.dtype) for name, x in values.items()}, view_count=view_count.int())
+    return Lifted(scalars, evidence, table)
 
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
@@ -199,10 +203,11 @@ def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
     ||S_jv|| = E_js.
     """
     groups = evidence.view_group_offsets
-    norms = segment_sum(evidence.weight, groups)
+    rows = evidence.rows
+    norms = segment_sum(rows.weight, groups)
     several = (groups.diff() > 1).nonzero().squeeze(1)
-    norms[several] = _row_norms(SparseRows(groups, evidence.region, evidence.weight).select_rows(several), table)
-    return segment_sum(norms, torch.searchsorted(groups, evidence.offsets))
+    norms[several] = _row_norms(SparseRows(groups, rows.column, rows.weight).select_rows(several), table)
+    return segment_sum(norms, torch.searchsorted(groups, rows.offsets))
 
 
 def _has_kernel(table: Tensor) -> bool:

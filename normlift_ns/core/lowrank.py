@@ -60,8 +60,8 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
     """
     residual = table.residual[:, rank : rank + 1].contiguous()
     lost = lifted.evidence.rows.matmul(residual).squeeze(1)
-    length = lifted.weight.double() * lifted.norm.double()
-    x = torch.where(length > 0, lost / length, 0.0) + _ROUNDING * (lifted.norm > 0)
+    length = lifted.scalars.weight.double() * lifted.scalars.norm.double()
+    x = torch.where(length > 0, lost / length, 0.0) + _ROUNDING * (lifted.scalars.norm > 0)
     bound = (2 - 2 * (1 - x.clamp(max=1) ** 2).sqrt()).clamp(min=0).sqrt()
     return Basis(table.vectors[:, :rank].T.contiguous(), torch.where(x > 1, 2.0, bound))
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64
 from scipy import stats
 from torch import Tensor
 
+from normlift_ns.options import WithoutDirection
+
 NO_CLASS = -1
 """Truth of a point that does not count; answer of a Gaussian that has none."""
-
-WithoutDirection = Literal["none", "first"]
 
 
 class ClassScores(NamedTuple):

@@ -1,14 +1,12 @@
-"""Relevancy of Gaussians or pixels to text, in the three forms that people use."""
+"""Relevancy of Gaussians or pixels to text, by the three rules that people use."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-RelevancyForm = Literal["cosine", "lerf", "margin"]
+from normlift_ns.options import Rule
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 """Negative prompts of LERF."""
@@ -20,37 +18,37 @@ def relevancy(
     positive: Float[Tensor, "*n q"],
     negative: Float[Tensor, "*n b"] | None = None,
     *,
-    form: RelevancyForm = "cosine",
+    rule: Rule = "cosine",
     temperature: float = 10.0,
 ) -> Float[Tensor, "*n q"]:
     """Relevancy of Q prompts from cosines.
 
     Args:
         positive: cosine to each prompt.
-        negative: cosine to each negative (form "lerf") or background (form "margin") prompt.
-        form: "cosine": the cosine itself, in -1..1. "lerf": softmax of prompt against one negative, the least over
+        negative: cosine to each negative (rule "lerf") or background (rule "margin") prompt.
+        rule: "cosine": the cosine itself, in -1..1. "lerf": softmax of prompt against one negative, the least over
             the negatives, in 0..1;
             0.5 is a draw (LERF, section 3.4). "margin": cosine minus the largest background cosine, in -2..2.
         temperature: factor of the cosines inside the softmax.
     Raises:
-        ValueError: an unknown form, or no negatives where the form needs them.
+        ValueError: an unknown rule, or no negatives where the rule needs them.
 
-    >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), form="margin")
+    >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), rule="margin")
     tensor([[0.1000]])
     """
-    if form == "cosine":
+    if rule == "cosine":
         return positive
-    if form not in ("lerf", "margin"):
-        raise ValueError(f'form must be "cosine", "lerf" or "margin", got {form!r}')
+    if rule not in ("lerf", "margin"):
+        raise ValueError(f'rule must be "cosine", "lerf" or "margin", got {rule!r}')
     if negative is None or negative.shape[-1] == 0:
         raise ValueError(
-            f'relevancy form "{form}" compares with negative prompts; '
+            f'rule "{rule}" compares with negative prompts; '
             f"give at least one, for example {', '.join(CANONICAL_NEGATIVES)}"
         )
     rival = negative.max(dim=-1, keepdim=True).values
     # A softmax over two is a sigmoid of the difference; it falls as the negative rises, so the minimum is at the
     # largest negative.
-    return positive - rival if form == "margin" else torch.sigmoid(temperature * (positive - rival))
+    return positive - rival if rule == "margin" else torch.sigmoid(temperature * (positive - rival))
 
 
 def strongest(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
@@ -11,48 +10,13 @@ from torch import Tensor
 
 from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = 2**24
 _BLOCK = (2**14, 2**17)
 """Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
 _MOST_NEIGHBORS = 63
 """Of `kernels.vote`."""
-
-
-@dataclass(frozen=True)
-class RefineConfig:
-    """Parameters of the vote.
-
-    The paper publishes no values. These were fitted where the truth is known, and hold on other damage than they were
-    fitted on: docs/evaluation.md.
-
-    Raises:
-        ValueError: a value outside its range.
-    """
-
-    k: int = 36
-    """K, number of neighbours, >= 1."""
-    sigma_d: float = 1.0
-    """Width of the spatial decay, > 0, in units of the scene's median distance to the nearest Gaussian at another
-    place (scenes are rescaled).
-    """
-    tau: float = 0.95
-    """Cosine at which two directions half agree, in -1..1."""
-    gamma: float = 0.4
-    """Softness of that agreement, > 0."""
-    delta: float = 0.0
-    """Delta, margin by which the best neighbour must win, >= 0."""
-
-    def __post_init__(self) -> None:
-        for name, valid, expected in (
-            ("k", self.k >= 1, "at least 1"),
-            ("sigma_d", self.sigma_d > 0, "positive"),
-            ("tau", -1 <= self.tau <= 1, "in -1..1"),
-            ("gamma", self.gamma > 0, "positive"),
-            ("delta", self.delta >= 0, "not negative"),
-        ):
-            if not valid:
-                raise ValueError(f"RefineConfig.{name} must be {expected}, got {getattr(self, name)}")
 
 
 def refine(

@@ -1,72 +1,21 @@
-"""A feature source from flat options, as command lines and configs hold them."""
+"""A feature source from `SourceOptions`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-from normlift_ns.encoders.clip_weights import DEFAULT_MODEL, DEFAULT_PRETRAINED
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.patches import PatchFeatures, why_not_dense
 from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.crops import Fill
-from normlift_ns.encoders.langsplat import LangSplat, Missing
-from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures, why_not_dense
+from normlift_ns.encoders.langsplat.source import LangSplat
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.sam import SamMasks
-from normlift_ns.encoders.sam_weights import DEFAULT_SAM, local_sam
+from normlift_ns.encoders.sam.masks import SamMasks
+from normlift_ns.encoders.sam.weights import local_sam
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
 from normlift_ns.encoders.text_vectors import TextVectors
-
-EncoderName = Literal["open_clip", "colour"]
-RegionsName = Literal["auto", "sam", "patches", "superpixel", "grid", "files"]
-FeaturesName = Literal["none", "langsplat"]
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """What to see in the images: an encoder, and the regions that it looks at."""
-
-    encoder: EncoderName = "open_clip"
-    """open_clip: CLIP features of masked crops, or of patches. colour: mean colours against colour names, without
-    learned weights."""
-    encoder_model: str = DEFAULT_MODEL
-    """Architecture of the open_clip encoder."""
-    encoder_pretrained: str = DEFAULT_PRETRAINED
-    """Weights of the open_clip encoder: a tag to download, or a local file of that architecture."""
-    crop_fill: Fill = "black"
-    """What the open_clip encoder sees around a region."""
-    text_template: str = "{}"
-    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
-    seven. The default is the bare text."""
-    regions: RegionsName = "auto"
-    """sam: SAM's masks. patches: the patches of a CLIP vision transformer, each with a feature of its own. superpixel,
-    grid. files: label maps from regions_dir. auto: files if regions_dir is given, sam if sam_model is; else, for
-    open_clip, sam on a GPU if its weights are on this machine, or else patches; superpixel for encoders without."""
-    region_count: int | None = None
-    """Regions per image, about: of superpixel and grid 256 by default, of patches 1024."""
-    sam_model: str | None = None
-    """Weights of sam: a folder as transformers writes it, a file as Meta publishes it, or a name to download. By
-    default facebook/sam-vit-huge, LangSplat's."""
-    regions_dir: Path | None = None
-    """Folder with one label map per image, PNG or NPY of the same stem."""
-    regions_background: int = 0
-    """The value in label maps that means no region; negative values never mean one."""
-    regions_resample: bool = False
-    """Bring label maps of another size to the image's by nearest neighbour, instead of refusing them."""
-    level: str | None = None
-    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. sam and langsplat: s, m, l
-    (subparts, parts, wholes; l by default) or default (all of SAM's masks in one map); langsplat also sum (the vectors
-    of all levels added up)."""
-    features: FeaturesName = "none"
-    """Take regions and features from features_dir instead of looking at images. langsplat: its preprocessing."""
-    features_dir: Path | None = None
-    """Folder of the features."""
-    features_missing: Missing = "error"
-    """Images without features: error, or skip to leave them out of the lift."""
-    text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look texts up in instead of encoding them, for imported features."""
+from normlift_ns.options import DEFAULT_SAM, EncoderName, FeaturesName, RegionsName, SourceOptions
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
@@ -83,7 +32,9 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
         raise ValueError(f"unknown features {options.features!r}; --features is one of {known}")
     if options.features == "none":
         if options.features_dir is not None:
-            raise ValueError(f"--features-dir {options.features_dir} is without use; add --features langsplat")
+            raise ValueError(
+                f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
+            )
         if options.text_vectors is not None:
             raise ValueError(
                 f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat"

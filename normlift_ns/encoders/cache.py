@@ -22,8 +22,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from normlift_ns.core.files import atomic_path
-from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, ViewFeatures, check_prompts
 
 _FORMAT = "normlift_ns.encoders/2"

@@ -1,4 +1,4 @@
-"""Reading picture files, with an error that says which file is at fault."""
+"""Reading pictures and arrays that others wrote, with errors that name the file, without running what may be in it."""
 
 from __future__ import annotations
 
@@ -34,3 +34,20 @@ def read_pixels(path: Path, mode: str | None = None) -> np.ndarray:
             f"image {path} is damaged or no picture ({error}); expected a file that Pillow can decode, such as PNG "
             "or JPEG: replace it"
         ) from error
+
+
+def read_npy(path: Path, what: str) -> np.ndarray:
+    """The array of an NPY file, of any type but objects, mapped into memory and read-only.
+
+    Args:
+        what: what the file is, for the message.
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file that is truncated, no NPY file or holds pickled objects.
+    """
+    try:
+        return np.lib.format.open_memmap(path, mode="r")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{what} {path} does not exist; check the folder") from None
+    except Exception as error:  # whatever a foreign header makes NumPy's parser raise
+        raise ValueError(f"{what} {path} is damaged or no NPY file ({error}); write it again with numpy.save") from None

@@ -13,8 +13,7 @@ from jaxtyping import Int32, UInt8
 from skimage.segmentation import slic
 from torch import Tensor
 
-from normlift_ns.encoders.images import read_pixels
-from normlift_ns.encoders.npy import read_npy
+from normlift_ns.encoders.images import read_npy, read_pixels
 
 _SUFFIXES = (".png", ".npy")
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
@@ -16,6 +17,7 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.files import atomic_path
 from normlift_ns.encoders.source import check_prompts
 
 
@@ -57,14 +59,7 @@ class TextVectors:
             ValueError: no prompt, an empty one, or one that is not in the file; a file as in `names`.
         """
         check_prompts(prompts)
-        for prompt in prompts:
-            if prompt not in self._vectors:
-                near = difflib.get_close_matches(prompt, self.names) or self.names[:5]
-                raise ValueError(
-                    f"text {prompt!r} has no vector in {self.file}, which holds {len(self.names)}; near names: "
-                    f"{', '.join(near)}"
-                )
-        return torch.stack([self._vectors[prompt] for prompt in prompts])
+        return look_up(prompts, self._vectors, str(self.file))
 
     @cached_property
     def _vectors(self) -> dict[str, Tensor]:
@@ -85,6 +80,29 @@ class TextVectors:
                 )
             if not np.isfinite(array).all() or not array.any():
                 raise ValueError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the text again")
-        return {
-            name: normalize(torch.tensor(array, dtype=torch.float64), dim=0).float() for name, array in arrays.items()
-        }
+        return {name: torch.tensor(array, dtype=torch.float64) for name, array in arrays.items()}
+
+
+def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -> Float32[Tensor, "q d"]:
+    """One unit row per prompt.
+
+    Args:
+        where: the vectors come from, for the message.
+    Raises:
+        ValueError: a prompt without a vector.
+    """
+    for prompt in prompts:
+        if prompt not in vectors:
+            near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
+            raise ValueError(
+                f"text {prompt!r} has no vector in {where}, which holds {len(vectors)}; near names: {', '.join(near)}"
+            )
+    return torch.stack([normalize(vectors[prompt].double().cpu(), dim=0).float() for prompt in prompts])
+
+
+def write_text_vectors(file: Path, vectors: Mapping[str, Tensor]) -> None:
+    """Writes what `TextVectors` reads, complete or not at all."""
+    with atomic_path(file) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for text, vector in vectors.items():  # numpy.savez takes no text that is called "file"
+            with archive.open(f"{text}.npy", "w") as entry:
+                np.lib.format.write_array(entry, vector.detach().float().cpu().numpy(), allow_pickle=False)

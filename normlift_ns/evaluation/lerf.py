@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,12 +14,9 @@ from torch import Tensor
 
 from normlift_ns.core.metrics import localized, mask_iou, mask_recall
 from normlift_ns.evaluation.lerf_labels import LabeledFrame
+from normlift_ns.evaluation.options import Average, Masking
 from normlift_ns.evaluation.results import Evaluation, mean
 
-Rule = Literal["background", "auto", "langsplat"]
-Average = Literal["frames", "pairs", "categories"]
-MARGIN = 0.02
-"""By which a score must exceed every background word (section "Mask thresholding" of the paper; SFS's code has 0)."""
 _HISTOGRAM_BINS, _LEAST_PEAK = 40, 600
 _BOX, _THRESHOLD, _MAJORITY = 30, 0.4, 7
 
@@ -31,22 +28,22 @@ class FrameScores(NamedTuple):
     prompts: Float[Tensor, "h w q"]
     """Of the frame's categories, in the order of `frame.masks`."""
     background: Float[Tensor, "h w b"]
-    """Rule "background": of `BACKGROUND_WORDS`. Rule "langsplat": relevancies are in `prompts` already; empty."""
+    """Masking "background": of `BACKGROUND_WORDS`. Masking "langsplat": relevancies are in `prompts` already; empty."""
 
 
 def found_mask(
-    score: Float[Tensor, "h w"], background: Float[Tensor, "h w b"], rule: Rule, *, margin: float, instances: int
+    score: Float[Tensor, "h w"], background: Float[Tensor, "h w b"], masking: Masking, *, margin: float, instances: int
 ) -> Bool[Tensor, "h w"]:
     """The pixels that a prompt is found in.
 
     Args:
-        rule: "background": score above every background word by the margin. "auto": SFS's threshold from the histogram
+        masking: "background": score above every background word by the margin. "auto": SFS's threshold from the histogram
             of the scores; it is told the number of true instances. "langsplat": the relevancy, scaled to 0..1 over the
             image, must exceed 0.7 (0.4 after 2 x - 1), by the majority in 7 x 7 pixels.
     """
-    if rule == "background":
+    if masking == "background":
         return score > background.max(dim=2).values + margin
-    if rule == "auto":
+    if masking == "auto":
         return score > histogram_threshold(score, instances)
     low, high = score.min(), score.max()
     scaled = (2 * (score - low) / (high - low + 1e-9) - 1).clamp(0, 1)
@@ -97,18 +94,18 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
     return average, (average + relevancy) / 2
 
 
-def frame_rows(scores: FrameScores, rule: Rule, *, margin: float, clean: bool) -> list[dict[str, Any]]:
-    """IoU, recall and whether the peak is in the mask (rule "langsplat": any peak, in any box), per category."""
+def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: bool) -> list[dict[str, Any]]:
+    """IoU, recall and whether the peak is in the mask (masking "langsplat": any peak, in any box), per category."""
     rows = []
     frame = scores.frame
     for q, (category, truth) in enumerate(frame.masks.items()):
         score, inside = scores.prompts[:, :, q], truth
         peaks = score
-        if rule == "langsplat":
+        if masking == "langsplat":
             peaks, score = box_filtered(score)
             inside = in_boxes(frame.boxes[category], *truth.shape)
         instances = len(frame.boxes[category])
-        found = found_mask(score, scores.background, rule, margin=margin, instances=instances)
+        found = found_mask(score, scores.background, masking, margin=margin, instances=instances)
         found = cleaned(found) if clean else found
         rows.append(
             {
@@ -116,7 +113,7 @@ def frame_rows(scores: FrameScores, rule: Rule, *, margin: float, clean: bool) -
                 "category": category,
                 "iou": mask_iou(found, truth),
                 "accuracy": mask_recall(found, truth),
-                "localized": float(localized(peaks, inside, any_peak=rule == "langsplat")),
+                "localized": float(localized(peaks, inside, any_peak=masking == "langsplat")),
             }
         )
     return rows

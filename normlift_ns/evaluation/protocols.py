@@ -5,82 +5,40 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from normlift_ns.core.evidence import UNLABELED
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.metrics import WithoutDirection, classify
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.metrics import classify
 from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
+from normlift_ns.core.scene import Scene, Views
 from normlift_ns.encoders.regions import LabelFiles
 from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.evaluation.instance_masks import evaluate_masks, gaussian_truth, read_classes, read_names
-from normlift_ns.evaluation.lerf import MARGIN, Average, FrameScores, Rule, frame_rows, summarize_lerf
+from normlift_ns.evaluation.lerf import FrameScores, frame_rows, summarize_lerf
 from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
+from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.evaluation.results import Evaluation
 from normlift_ns.evaluation.scannet import NYU40, SceneLabels, check_identity, evaluate_scannet, read_labels
 from normlift_ns.raster.rasterize import rasterize_evidence, render
 
-if TYPE_CHECKING:  # nerfstudio takes 20 s, and --help should not wait for it
-    from normlift_ns.core.gaussians import Camera
-    from normlift_ns.plugin.adapters import SourceRun, Views
-
 
 @dataclass(frozen=True)
-class ScannetOptions:
-    """Protocol scannet; --labels gives one *_vh_clean_2.labels.ply per run."""
+class EvaluatedRun:
+    """A lifted run, and which of its features are scored."""
 
-    min_opacity: float = 0.1
-    """Truth of fainter Gaussians does not count; 0: all count."""
-    without_direction: WithoutDirection = "first"
-    """Gaussians without direction are wall (first, as in published scripts) or of no class (none); the other is
-    reported beside it."""
-
-
-@dataclass(frozen=True)
-class LerfOptions:
-    """Protocol lerf; --labels gives one folder of label files per run."""
-
-    rule: Rule = "background"
-    """background: above all background words by the margin; auto: SFS's threshold from the histogram; langsplat: the
-    relevancy of LERF, scaled."""
-    margin: float = MARGIN
-    """Of rule background; SFS's code has 0."""
-    average: Average = "frames"
-    """frames: categories of a frame, then frames; pairs: all frames and categories alike; categories: frames of a
-    category, then categories."""
-    clean: bool = False
-    """Open, close, keep the largest component and fill its holes, as SFS's code does and the paper does not say."""
-    scale: Literal["unit", "norm"] = "unit"
-    """What is composited: cosines, or cosines times ||f||, the length of features as SFS lifts them."""
-
-
-@dataclass(frozen=True)
-class MaskOptions:
-    """Protocol masks; --labels gives a folder of instance masks, PNG or NPY, named as the images."""
-
-    names: Path | None = None
-    """JSON file with the name of every value of the masks; by default labels.json beside their folder."""
-    purity: float = 0.75
-    """Least share of one class in the weight of a Gaussian that has a truth."""
-    min_weight: float = 1.0
-    """Least weight of a Gaussian that has a truth, in pixels over all training views."""
-
-
-@dataclass(frozen=True)
-class LiftedRun:
-    """A run and its semantics."""
-
-    run: SourceRun
+    scene: Scene
     field: SemanticField
-    encoder: TextEncoder
+    texts: TextEncoder
     refined: bool
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
         """Of every Gaussian's direction to the texts, 0 without direction."""
-        return self.field.query(self.encoder.text(names), refined=self.refined).float()
+        return self.field.query(self.texts.text(names), refined=self.refined).float()
 
     @property
     def valid(self) -> Bool[Tensor, " n"]:
@@ -89,27 +47,27 @@ class LiftedRun:
 
     def composited(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
         """[H, W, Q] and alpha [H, W]."""
-        return render(self.run.scene, camera, values, rasterize_mode=self.run.rasterize_mode)
+        return render(self.scene.gaussians, camera, values, rasterize_mode=self.scene.rasterize_mode)
 
     def cameras(self) -> dict[str, Camera]:
         """Of all photographs, trained and held out, by the stem of the image."""
-        views = (self.run.train, self.run.held_out)
+        views = (self.scene.train, self.scene.held_out)
         return {Path(name).stem: camera for some in views for name, camera in zip(some.names, some.cameras)}
 
 
-def label_scene(lifted: LiftedRun, path: Path, nyu40: Int64[Tensor, " n"]) -> SceneLabels:
+def label_scene(lifted: EvaluatedRun, path: Path, nyu40: Int64[Tensor, " n"]) -> SceneLabels:
     """What protocol scannet needs of a run.
 
     Raises:
         ValueError: another number of vertices than Gaussians.
     """
     name = path.name.split("_vh_clean")[0]
-    check_identity(name, len(lifted.run.scene), nyu40, path)
+    check_identity(name, len(lifted.scene.gaussians), nyu40, path)
     cosine = lifted.cosine(tuple(NYU40.values()))
-    return SceneLabels(name, cosine, lifted.valid, lifted.run.scene.opacities, nyu40)
+    return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
 
 
-def run_scannet(runs: Iterable[LiftedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
+def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
     """Protocol scannet over one run per scene.
 
     Raises:
@@ -120,7 +78,7 @@ def run_scannet(runs: Iterable[LiftedRun], labels: Sequence[Path], options: Scan
     return evaluate_scannet(scenes, min_opacity=options.min_opacity, without_direction=options.without_direction)
 
 
-def run_lerf(runs: Iterable[LiftedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
+def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
     """Protocol lerf over one run per scene; all frames of all scenes count alike in `average`.
 
     Raises:
@@ -138,20 +96,20 @@ def run_lerf(runs: Iterable[LiftedRun], labels: Sequence[Path], options: LerfOpt
             scores = _frame_scores(lifted, camera, frame, options)
             rows += [
                 {"scene": folder.name, **row, "frame": f"{folder.name}/{frame.stem}"}
-                for row in frame_rows(scores, options.rule, margin=options.margin, clean=options.clean)
+                for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
             ]
     settings = {**asdict(options), "labels_without_image": missing}
     return summarize_lerf(rows, options.average, settings)
 
 
-def _frame_scores(lifted: LiftedRun, camera: Camera, frame: LabeledFrame, options: LerfOptions) -> FrameScores:
-    prompts, langsplat = tuple(frame.masks), options.rule == "langsplat"
+def _frame_scores(lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, options: LerfOptions) -> FrameScores:
+    prompts, langsplat = tuple(frame.masks), options.masking == "langsplat"
     cosine = lifted.cosine((*prompts, *(CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS)))
     if options.scale == "norm":
         cosine = cosine * lifted.field.scalars.norm[:, None].to(cosine)
     values, _ = lifted.composited(camera, cosine)
     values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
-    return FrameScores(frame, relevancy(values, background, form="lerf") if langsplat else values, background)
+    return FrameScores(frame, relevancy(values, background, rule="lerf") if langsplat else values, background)
 
 
 @dataclass(frozen=True)
@@ -166,7 +124,7 @@ class MaskTruth:
     settings: Mapping[str, Any]
 
 
-def mask_truth(run: SourceRun, folder: Path, options: MaskOptions) -> MaskTruth:
+def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
     """The truth of Gaussians from the masks of the training views, and that of pixels in held-out views.
 
     Raises:
@@ -180,21 +138,21 @@ def mask_truth(run: SourceRun, folder: Path, options: MaskOptions) -> MaskTruth:
 
     count = len(names.classes)
     evidence = rasterize_evidence(
-        run.scene,
-        run.train.cameras,
-        (found.int().clamp(min=UNLABELED) for found in classes(run.train)),
-        num_regions=[count] * len(run.train),
-        rasterize_mode=run.rasterize_mode,
+        scene.gaussians,
+        scene.train.cameras,
+        (found.int().clamp(min=UNLABELED) for found in classes(scene.train)),
+        num_regions=[count] * len(scene.train),
+        rasterize_mode=scene.rasterize_mode,
     )
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
-    settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(run.held_out)}
-    return MaskTruth(names.classes, truth, list(classes(run.held_out)), settings)
+    settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
+    return MaskTruth(names.classes, truth, list(classes(scene.held_out)), settings)
 
 
-def run_masks(lifted: LiftedRun, truth: MaskTruth) -> Evaluation:
+def run_masks(lifted: EvaluatedRun, truth: MaskTruth) -> Evaluation:
     """Protocol masks on one run: 3D over Gaussians, 2D in held-out views."""
     cosine, pixels = lifted.cosine(truth.classes), []
-    for camera, exact in zip(lifted.run.held_out.cameras, truth.held_out):
+    for camera, exact in zip(lifted.scene.held_out.cameras, truth.held_out):
         values, alpha = lifted.composited(camera, cosine)
         pixels.append((exact, classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)))
     found, reliability = classify(cosine, lifted.valid), lifted.field.scalars.reliability

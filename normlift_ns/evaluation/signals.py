@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from normlift_ns.core.forms import Scalars
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.metrics import NO_CLASS, bin_means, kendall, lowest_jaccard, spearman
+from normlift_ns.core.storage import Scalars
 
 SAMPLE = 20_000
 """Gaussians of which Kendall's tau is taken, which is slow."""

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from normlift_ns.core.ablations import Variant, linear_average, variant_reliability
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.forms import DirectionForm
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
-from normlift_ns.core.refine import RefineConfig, refine
+from normlift_ns.core.refine import refine
+from normlift_ns.core.storage import StoredDirections
+from normlift_ns.options import RefineConfig
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "beta": (0.25, 0.5, 1.0, 2.0, 4.0),
@@ -84,7 +85,7 @@ def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Cal
             has = (found != 0).any(dim=1)
             norm = torch.where(has & (there.scalars.norm <= 0), 1.0, there.scalars.norm)
             scalars = replace(field.scalars, norm=norm.to(field.scalars.norm))
-            return replace(field, scalars=scalars, source=own, store=DirectionForm(found[has].half().cpu(), None))
+            return replace(field, scalars=scalars, source=own, store=StoredDirections(found[has].half().cpu(), None))
         return replace(field, source=refine(places, unrefined, r, vote.config, neighbors=near).cpu())
 
     return voted

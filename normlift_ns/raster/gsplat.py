@@ -17,8 +17,9 @@ from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
+from normlift_ns.raster.backend import Job
 from normlift_ns.raster.settings import RasterSettings
 
 _CHANNELS = 32
@@ -38,42 +39,38 @@ class Projections(NamedTuple):
     """Where each tile starts in `members`."""
 
 
-def project_views(
-    scene: GaussianScene, cameras: Sequence[Camera], antialiased: bool, settings: RasterSettings
-) -> Projections:
-    """gsplat's projection and tile lists for cameras of one size.
-
-    Raises:
-        ValueError: a scene that is not float32 on a GPU, another gsplat than 1.4, constants that gsplat has compiled.
-    """
-    check_usable(scene, settings)
+def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
+    """gsplat's projection and tile lists for cameras of one size."""
     from gsplat.cuda._wrapper import (  # noqa: PLC0415 (needs a GPU)
         fully_fused_projection,
         isect_offset_encode,
         isect_tiles,
     )
 
+    scene, settings = job.scene, job.settings
     device, (width, height) = scene.means.device, (cameras[0].width, cameras[0].height)
     poses = torch.stack([camera.world_to_camera.float() for camera in cameras]).to(device)
     intrinsics = torch.stack([camera.K.float() for camera in cameras]).to(device)
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         scene.means, None, scene.quats, scene.scales, poses, intrinsics, width, height,
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
-        calc_compensations=antialiased,
+        calc_compensations=job.antialiased,
     )  # fmt: skip
     opacities = scene.opacities.expand(len(cameras), -1)
-    opacities = opacities * compensations if antialiased else opacities.contiguous()
+    opacities = opacities * compensations if job.antialiased else opacities.contiguous()
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
     _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down, n_cameras=len(cameras))
     return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
 
 
-def check_usable(scene: GaussianScene, settings: RasterSettings) -> None:
-    """Raises ValueError where gsplat cannot draw the scene as it was trained."""
-    if scene.means.dtype != torch.float32 or scene.means.device.type != "cuda":
+def check(job: Job) -> None:
+    """Raises ValueError for a scene that is not float32 on a GPU, another gsplat than 1.4, or other constants than
+    those that gsplat has compiled."""
+    means = job.scene.means
+    if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
         raise ValueError(
-            f"gsplat draws float32 on a GPU, this scene is {scene.means.dtype} on {scene.means.device}; move it "
-            '(scene.to("cuda")), or use backend="torch", which knows every device and precision'
+            f"gsplat draws float32 on a GPU, this is a {means.dtype} scene on {means.device}, to be computed in "
+            f'{job.dtype}; move it (scene.to("cuda")), or use backend="torch", which knows every device and precision'
         )
     if not _gsplat_version().startswith("1.4."):
         raise ValueError(
@@ -81,7 +78,7 @@ def check_usable(scene: GaussianScene, settings: RasterSettings) -> None:
             'differently; install it (pip install "gsplat==1.4.0"), or use backend="torch"'
         )
     ours = RasterSettings()
-    other = [name for name in _COMPILED if getattr(settings, name) != getattr(ours, name)]
+    other = [name for name in _COMPILED if getattr(job.settings, name) != getattr(ours, name)]
     if len(other) > 0:
         raise ValueError(f'gsplat has compiled its {", ".join(other)}; to change them use backend="torch"')
 
@@ -92,18 +89,16 @@ def _gsplat_version() -> str:
 
 
 def views_evidence(
-    scene: GaussianScene,
+    job: Job,
     cameras: Sequence[Camera],
     labels: Sequence[Int32[Tensor, "h w"]],
     num_regions: Sequence[int],
-    antialiased: bool,
     weight_power: int,
-    settings: RasterSettings,
 ) -> Entries:
     """Entries of some views, from gsplat's forward and backward pass alone.
 
     Raises:
-        ValueError: weight_power other than 1, which a gradient cannot give; and as `project_views`.
+        ValueError: weight_power other than 1, which a gradient cannot give.
     """
     if weight_power != 1:
         raise ValueError(
@@ -111,24 +106,49 @@ def views_evidence(
         )
     parts, before = [], 0
     for camera, label_map, count in zip(cameras, labels, num_regions):
-        for first, gradient in _gradients(scene, camera, label_map, count, antialiased, settings):
+        for first, gradient in _gradients(job, camera, label_map, count):
             gaussian, column = gradient.nonzero(as_tuple=True)
             parts.append((gaussian, before + first + column, gradient[gaussian, column]))
         before += count + 1
     return Entries(*sum_duplicates(*(torch.cat(part) for part in zip(*parts))), tuple(num_regions))
 
 
-def _gradients(
-    scene: GaussianScene, camera: Camera, labels: Tensor, count: int, antialiased: bool, settings: RasterSettings
-) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:
+def composite(
+    job: Job, camera: Camera, values: Float32[Tensor, "n c"]
+) -> tuple[Float32[Tensor, "h w c"], Float32[Tensor, "h w"]]:
+    """sum_j A_ij values_j and sum_j A_ij of every pixel, by gsplat's own renderer."""
+    from gsplat.rendering import rasterization  # noqa: PLC0415 (needs a GPU)
+
+    scene, settings = job.scene, job.settings
+    if len(scene) == 0 or values.shape[1] == 0:
+        return values.new_zeros(camera.height, camera.width, values.shape[1]), values.new_zeros(
+            camera.height, camera.width
+        )
+    image, alpha, _ = rasterization(
+        *(scene.means, scene.quats, scene.scales, scene.opacities, values.to(scene.means)),
+        camera.world_to_camera.to(scene.means)[None],
+        camera.K.to(scene.means)[None],
+        camera.width,
+        camera.height,
+        near_plane=settings.near_plane,
+        far_plane=settings.far_plane,
+        eps2d=settings.eps2d,
+        tile_size=settings.tile_size,
+        packed=False,
+        rasterize_mode="antialiased" if job.antialiased else "classic",
+    )
+    return image[0], alpha[0, :, :, 0]
+
+
+def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:
     """(first column, sums of A_ij by column) of 32 columns at once; column 0 holds the unlabelled pixels.
 
     The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py).
     """
-    seen = project_views(scene, [camera], antialiased, settings)
+    seen, settings = project_views(job, [camera]), job.settings
     from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
 
-    colors = torch.zeros(1, len(scene), _CHANNELS, device=scene.means.device)
+    colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
     drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
     lists = (settings.tile_size, seen.offsets, seen.members)
     _, alphas, last = _C.rasterize_to_pixels_fwd(*drawing, *lists)

@@ -1,32 +1,31 @@
-"""`rasterize_evidence`: a loop over views. Backends differ only in how a few views of one size are summed."""
+"""`rasterize_evidence`: a loop over views. `render`: one view. Both leave the sums to a backend."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
-from importlib import import_module
 from itertools import groupby, islice, zip_longest
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.gpu import has_triton, in_parts
-from normlift_ns.raster import reference
-from normlift_ns.raster.projection import assign_tiles, project, to_world
+from normlift_ns.core.gpu import in_parts
+from normlift_ns.core.scene import Scene
+from normlift_ns.options import RasterizeMode
+from normlift_ns.raster.backend import BackendName, Job, choose_backend
 from normlift_ns.raster.settings import RasterSettings
 
-Backend = Literal["auto", "torch", "numba", "gsplat", "triton"]
-RasterizeMode = Literal["classic", "antialiased"]
 Progress = Callable[[int, int | None], None]
 _IN_FLIGHT = 8
 """Most views at once on a GPU."""
 _FLIGHT_ELEMENTS = 2**24
 """Views in flight times Gaussians, about: each takes 60 bytes."""
+_SEVERAL_VIEWS = ("gsplat", "triton")
+"""Backends that take several views at once."""
 _ADVICE = "rasterize at a fraction of the resolution (ns-normlift --lift-downscale 2), or on the CPU (--device cpu)"
 
 
@@ -36,7 +35,7 @@ def rasterize_evidence(
     labels: Iterable[Tensor],
     *,
     num_regions: Iterable[int] | None = None,
-    backend: Backend = "auto",
+    backend: BackendName = "auto",
     rasterize_mode: RasterizeMode = "classic",
     weight_power: int = 1,
     settings: RasterSettings | None = None,
@@ -68,15 +67,14 @@ def rasterize_evidence(
             float64.
         progress: called after every view with (views done, number of views or None).
     Raises:
-        ValueError: an unknown option, labels of another size or type than their camera, an id below -1 or not below
-            its `num_regions`,
-            or iterables of different lengths; the message names the view.
+        ValueError: an unknown option, labels of another size or type than their camera, an id below -2 or not below
+            its `num_regions`, or iterables of different lengths; the message names the view.
     """
-    _check_mode(rasterize_mode)
     if weight_power not in (0, 1, 2):
         raise ValueError(f"weight_power must be 0, 1 or 2, got {weight_power}")
-    settings = settings or RasterSettings()
-    views_evidence, in_flight = _choose_evidence(backend, scene, dtype or scene.means.dtype)
+    job = _job(scene, rasterize_mode, settings, dtype)
+    name, chosen = choose_backend(backend, job, pictures=False)
+    in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS // max(1, len(scene)))) if name in _SEVERAL_VIEWS else 1
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
@@ -95,7 +93,7 @@ def rasterize_evidence(
             def sums(views: Sequence[tuple[Camera, Tensor, int]]) -> Entries:
                 seen, maps, counts = zip(*views)
                 there = [labels.to(scene.means.device, torch.int32) for labels in maps]
-                return views_evidence(seen, there, counts, rasterize_mode == "antialiased", weight_power, settings)
+                return chosen.views_evidence(job, seen, there, counts, weight_power)
 
             parts += in_parts(sums, checked, _ADVICE)
             for _ in flight:
@@ -110,7 +108,7 @@ def render(
     camera: Camera,
     values: Float[Tensor, "n c"],
     *,
-    backend: Backend = "auto",
+    backend: BackendName = "auto",
     rasterize_mode: RasterizeMode = "classic",
     settings: RasterSettings | None = None,
     dtype: torch.dtype | None = None,
@@ -119,71 +117,34 @@ def render(
 
     Args:
         values: colours, relevancies, reliability, …; not premultiplied.
+        backend: as in `rasterize_evidence`, but "triton", which sums evidence and draws no pictures. "auto" is "numba"
+            on a CPU and "torch" elsewhere.
     Returns:
         The image without background (add background * (1 - alpha)), and alpha in 0..1.
     Raises:
         ValueError: values of another length, an unknown option.
     """
-    _check_mode(rasterize_mode)
     if values.ndim != 2 or len(values) != len(scene):
         raise ValueError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
-    settings = settings or RasterSettings()
+    job = _job(scene, rasterize_mode, settings, dtype)
+    _, chosen = choose_backend(backend, job, pictures=True)
     with torch.no_grad():
-        world = to_world(scene, dtype or scene.means.dtype)
-        projected = project(world, camera, settings, rasterize_mode == "antialiased")
-        tiles = assign_tiles(projected, camera.width, camera.height, settings.tile_size)
-        drawn = values[projected.gaussian].to(projected.opacities.dtype)
-        return _choose(backend, scene.means.device).composite(
-            projected, tiles, drawn, camera.width, camera.height, settings
-        )
+        return chosen.composite(job, camera, values)
 
 
-def _check_mode(rasterize_mode: str) -> None:
+def render_picture(scene: Scene, camera: Camera) -> UInt8[Tensor, "h w 3"]:
+    """The trained scene as a camera sees it, sRGB on its background: by the scene's own renderer if it has one."""
+    if scene.renderer is not None:
+        return scene.renderer(camera)
+    color, alpha = render(scene.gaussians, camera, scene.colors(camera), rasterize_mode=scene.rasterize_mode)
+    color = color + (1 - alpha)[:, :, None] * scene.background
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _job(scene: GaussianScene, rasterize_mode: str, settings: RasterSettings | None, dtype: torch.dtype | None) -> Job:
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
-
-
-def _choose_evidence(backend: str, scene: GaussianScene, dtype: torch.dtype) -> tuple[Callable[..., Entries], int]:
-    """How some views of one size are summed, and how many at once."""
-    on_gpu = scene.means.device.type == "cuda"
-    if backend == "auto" and on_gpu and dtype == scene.means.dtype == torch.float32:
-        backend = "triton" if has_triton() else "gsplat"
-    if backend in ("gsplat", "triton"):
-        if dtype != torch.float32:
-            raise ValueError(f'backend "{backend}" computes in float32, not in {dtype}; use backend="torch"')
-        gpu = import_module(f"normlift_ns.raster.{backend}")  # kernels load where they are used
-        in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS // max(1, len(scene))))
-        return partial(gpu.views_evidence, scene), in_flight
-    module, world = _choose(backend, scene.means.device), to_world(scene, dtype)
-
-    def one_view(
-        cameras: Sequence[Camera],
-        labels: Sequence[Tensor],
-        num_regions: Sequence[int],
-        antialiased: bool,
-        weight_power: int,
-        settings: RasterSettings,
-    ) -> Entries:
-        projected = project(world, cameras[0], settings, antialiased)
-        tiles = assign_tiles(projected, cameras[0].width, cameras[0].height, settings.tile_size)
-        return module.view_evidence(projected, tiles, labels[0], num_regions[0], weight_power, settings)
-
-    return one_view, 1
-
-
-def _choose(backend: str, device: torch.device) -> Any:
-    """The module that draws one view in any precision: `view_evidence` and `composite`."""
-    if backend == "auto":
-        backend = "numba" if device.type == "cpu" else "torch"
-    if backend == "torch":
-        return reference
-    if backend == "numba":
-        if device.type != "cpu":
-            raise ValueError(
-                f'backend "numba" needs a scene on the CPU, this one is on {device}; move it, or use backend="torch"'
-            )
-        return import_module("normlift_ns.raster.numba")  # importing numba takes a second
-    raise ValueError(f"unknown backend {backend!r}; it is one of {', '.join(get_args(Backend))}")
+    return Job(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype or scene.means.dtype)
 
 
 def _flights(

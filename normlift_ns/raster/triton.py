@@ -3,34 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NoReturn
 
 import torch
 from jaxtyping import Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_equal_keys
 from normlift_ns.kernels.regions import region_sums
-from normlift_ns.raster.gsplat import project_views
-from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.raster import gsplat
+from normlift_ns.raster.backend import Job
+
+check = gsplat.check
+"""Raises ValueError where gsplat's projection cannot be used."""
+
+
+def composite(job: Job, camera: Camera, values: Tensor) -> NoReturn:
+    """Raises ValueError: there is no kernel for pictures."""
+    raise ValueError(
+        'backend "triton" sums evidence and draws no pictures; render with backend="torch" or "gsplat" on a GPU, '
+        '"numba" on a CPU, or "auto"'
+    )
 
 
 def views_evidence(
-    scene: GaussianScene,
+    job: Job,
     cameras: Sequence[Camera],
     labels: Sequence[Int32[Tensor, "h w"]],
     num_regions: Sequence[int],
-    antialiased: bool,
     weight_power: int,
-    settings: RasterSettings,
 ) -> Entries:
-    """Entries of some views of one size, all in flight at once; bitwise the same on every run.
-
-    Raises:
-        ValueError: as `project_views`.
-    """
-    seen = project_views(scene, cameras, antialiased, settings)
+    """Entries of some views of one size, all in flight at once; bitwise the same on every run."""
+    seen, settings = gsplat.project_views(job, cameras), job.settings
     offsets = torch.cat([seen.offsets.flatten(), seen.offsets.new_tensor([len(seen.members)])])
     first = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
     columns = int(first[-1])

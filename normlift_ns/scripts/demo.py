@@ -6,27 +6,25 @@ import json
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
-from jaxtyping import Float, Int
-from PIL import Image
 from rich.table import Table
-from torch import Tensor
 
-from normlift_ns.core.field import SemanticField
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
-from normlift_ns.encoders.build import SourceOptions
-from normlift_ns.plugin.asking import encoder_of
+from normlift_ns.options import SourceOptions
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
 from normlift_ns.scripts.shared import CONSOLE, run_command
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
 
 TEXTS = ("red", "yellow", "sky blue", "dark green")
 
 
 @dataclass
 class Demo:
-    """Make a room of coloured solids and a trained run of it, lift it with ns-normlift and ask it for colours."""
+    """Make a room of coloured solids and a trained run of it, lift it with ns-normlift and search it for colours."""
 
     folder: Path = Path("demo")
     """Where everything is written; what an earlier demo left there is replaced."""
@@ -37,6 +35,8 @@ class Demo:
 
     def main(self) -> dict[str, float]:
         """Runs the demo; returns mIoU before and after refinement."""
+        from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
+
         CONSOLE.rule("A room made in code")
         room = demo_room(self.num_gaussians)
         write_capture(room, self.folder / "room", views=self.views)
@@ -45,23 +45,22 @@ class Demo:
         CONSOLE.rule("Lifting it")
         _show("ns-normlift", "--load-config", config, "--encoder", "colour", "--queries", *TEXTS)
         source = SourceOptions(encoder="colour")
-        lifted = NormLift(config, source=source, queries=TEXTS, timestamp="demo", overwrite=True).main()
+        run = NormLift(config, source=source, queries=TEXTS, timestamp="demo", overwrite=True).main()
 
-        CONSOLE.rule("Asking it")
-        config, pictures, answers = lifted / "config.yml", self.folder / "pictures", self.folder / "answers.json"
+        CONSOLE.rule("Searching it")
+        pictures, answers = self.folder / "pictures", self.folder / "answers.json"
         flags = ("--render-dir", pictures, "--json", answers)
-        _show("ns-normlift-query", "--load-config", config, "--text", *TEXTS, *flags)
-        NormLiftQuery(config, TEXTS, render_dir=pictures, json=answers).main()
+        _show("ns-normlift-query", "--load-config", run.config, "--text", *TEXTS, *flags)
+        NormLiftQuery(run.config, TEXTS, render_dir=pictures, json=answers).main()
         side_by_side(
             [pictures / f"0012_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures
         )
 
         CONSOLE.rule("Comparing it with the truth")
-        field = SemanticField.load(lifted / "normlift")
-        vectors = encoder_of(field).text(room.names)
         scores = {}
         for name, refined in (("before refinement", False), ("after refinement", True)):
-            found = torch.where(field.valid(refined=refined), field.query(vectors, refined=refined).argmax(dim=1), -1)
+            answer = run.ask(*room.names, refined=refined)
+            found = answer.relevancy.argmax(dim=1).where(answer.valid, -1)
             scores[name] = iou_per_class(found, room.labels, len(room.names))
         table = Table("class", *scores, title="IoU over the Gaussians of each class")
         for i, name in enumerate(room.names):
@@ -71,13 +70,15 @@ class Demo:
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
         (self.folder / "miou.json").write_text(json.dumps(means, indent=2) + "\n")
-        viewer = f"ns-viewer --load-config {config} --viewer.websocket-host 127.0.0.1"
+        viewer = f"ns-viewer --load-config {run.config} --viewer.websocket-host 127.0.0.1"
         CONSOLE.print(f"Pictures are in {pictures}. See it in the viewer: {viewer}", soft_wrap=True)
         return means
 
 
 def side_by_side(paths: list[Path], folder: Path) -> None:
     """Joins pictures of one height into overview.png."""
+    from PIL import Image  # noqa: PLC0415
+
     images = [Image.open(path).convert("RGB") for path in paths]
     joined = Image.new("RGB", (sum(image.width for image in images), images[0].height))
     left = 0
@@ -89,6 +90,8 @@ def side_by_side(paths: list[Path], folder: Path) -> None:
 
 def iou_per_class(found: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:
     """Intersection over union of each class, over the Gaussians whose class is known (truth >= 0)."""
+    import torch  # noqa: PLC0415
+
     known = truth >= 0
     found, truth = found[known], truth[known]
     ious = [((found == c) & (truth == c)).sum() / ((found == c) | (truth == c)).sum() for c in range(classes)]

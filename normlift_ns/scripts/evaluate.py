@@ -6,33 +6,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.table import Table
 
-from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
-from normlift_ns.evaluation.protocols import (
-    LerfOptions,
-    LiftedRun,
-    MaskOptions,
-    ScannetOptions,
-    mask_truth,
-    run_lerf,
-    run_masks,
-    run_scannet,
-)
-from normlift_ns.evaluation.results import Evaluation, write_evaluation
-from normlift_ns.evaluation.studies import (
-    Evaluate,
-    Row,
-    mask_signals,
-    plain_signals,
-    scannet_signals,
-    study_votes,
-    timing,
-)
-from normlift_ns.evaluation.votes import ablation, sweeps
-from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
+from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
+from normlift_ns.scripts.shared import CONSOLE, run_command
+
+if TYPE_CHECKING:
+    from normlift_ns.evaluation.protocols import EvaluatedRun
+    from normlift_ns.evaluation.results import Evaluation
+    from normlift_ns.evaluation.studies import Evaluate, Row
 
 
 @dataclass
@@ -74,22 +58,23 @@ class NormLiftEval:
             )
         if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
             raise ValueError("protocol masks and --data take one run at a time; name a single --load-config")
+        from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
+        from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
+        from normlift_ns.evaluation.studies import study_votes, timing  # noqa: PLC0415
+        from normlift_ns.evaluation.votes import ablation, sweeps  # noqa: PLC0415
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+
         device = choose_device(self.device)
-
-        from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
-        from normlift_ns.plugin.asking import encoder_of, with_texts  # noqa: PLC0415
-        from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
-
         names: list[tuple[str, str]] = []
 
-        def lifted(config: Path) -> LiftedRun:
-            run = load_run(config, data=self.data)
-            names.append((str(run.config.experiment_name), str(run.checkpoint.path)))
-            semantics = with_texts(load_field(run), vectors=self.text_vectors)
-            return LiftedRun(run, semantics, encoder_of(semantics, device), self.refined)
+        def evaluated(config: Path) -> EvaluatedRun:
+            run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
+            names.append((run.scene.name, str(run.scene.checkpoint_path)))
+            return EvaluatedRun(run.scene, run.field, run.texts, self.refined)
 
         # Scenes are large: one is held at a time, unless they are studied.
-        runs: Iterable[LiftedRun] = (lifted(config) for config in self.load_config)
+        runs: Iterable[EvaluatedRun] = (evaluated(config) for config in self.load_config)
         if self.study or self.protocol == "masks":
             runs = list(runs)
         evaluate, measure_signals = self._protocol(runs)
@@ -115,18 +100,26 @@ class NormLiftEval:
         CONSOLE.print(f"Written: {', '.join(map(str, written))}", highlight=False)
         return evaluation
 
-    def _protocol(self, runs: Iterable[LiftedRun]) -> tuple[Evaluate, Callable[[Sequence[LiftedRun]], list[Row]]]:
+    def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
         """How to score runs, and how to measure the signals of R."""
+        from normlift_ns.evaluation import protocols, studies  # noqa: PLC0415 (--help should not wait for torch)
+
         if self.protocol == "scannet":
             given = {"labels": self.labels, "options": self.scannet}
-            return partial(run_scannet, **given), partial(scannet_signals, **given)
+            return partial(protocols.run_scannet, **given), partial(studies.scannet_signals, **given)
         if self.protocol == "lerf":
-            return partial(run_lerf, labels=self.labels, options=self.lerf), partial(plain_signals, labels=self.labels)
-        truth = mask_truth(next(iter(runs)).run, self.labels[0], self.masks)
-        return lambda some: run_masks(next(iter(some)), truth), lambda some: mask_signals(some[0], truth)
+            evaluate = partial(protocols.run_lerf, labels=self.labels, options=self.lerf)
+            return evaluate, partial(studies.plain_signals, labels=self.labels)
+        truth = protocols.mask_truth(next(iter(runs)).scene, self.labels[0], self.masks)
+        return (
+            lambda some: protocols.run_masks(next(iter(some)), truth),
+            lambda some: studies.mask_signals(some[0], truth),
+        )
 
     def _plots(self, studies: Mapping[str, list[Row]], metric: str) -> Iterator[Path]:
         """Figures beside the output file."""
+        from normlift_ns.evaluation.plots import plot_signals, plot_sweeps  # noqa: PLC0415
+
         for name in {"sweeps", "signals"} & set(studies):
             path = self.output_path.with_name(f"{self.output_path.stem}_{name}.svg")
             if name == "sweeps":

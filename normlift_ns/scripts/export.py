@@ -7,92 +7,81 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from rich.table import Table
 
-from normlift_ns.core.files import atomic_path
-from normlift_ns.scripts.shared import CONSOLE, AskOptions, choose_device, run_command
+from normlift_ns.options import MIN_SIZE, REACH, AskOptions
+from normlift_ns.scripts.shared import CONSOLE, run_command
 
 
 @dataclass
 class NormLiftExport:
-    """Write a lifted run, the things asked for, or the scene without them, for other splat tools."""
+    """Write a lifted run, what a query selects in it, or the scene without that, for other splat tools."""
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
     output_dir: Path
     """Folder to write to; made if missing."""
     text: tuple[str, ...] = ()
-    """What to look for; by default the queries stored in the run, with the rule stored with them."""
+    """What to look for. By default the queries stored in the run, with the options stored with them."""
     part: Literal["scene", "selection", "rest"] = "scene"
     """scene: all Gaussians. selection: what any of the texts selects. rest: the scene without that."""
-    rule: AskOptions = field(default_factory=AskOptions)
+    ask: AskOptions = field(default_factory=AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the PLY file; the rows it has of the run go to <name>_rows.npy, the objects to <name>_objects.json."""
-    reach: float = 4.0
+    """Name of the PLY file. The number of each Gaussian in the run goes to <name>_rows.npy, the objects to
+    <name>_objects.json."""
+    reach: float = REACH
     """Gaussians of one object are at most this far apart, in units of the selection's median spacing."""
-    min_size: int = 20
+    min_size: int = MIN_SIZE
     """Least number of Gaussians of an object."""
     overwrite: bool = False
     """Replace files of these names."""
     data: Path | None = None
     """Where the dataset is now, if it was moved."""
     device: str = "auto"
-    """auto, cpu or cuda: where the text encoder runs."""
+    """Where the text encoder runs: auto, cpu or cuda."""
 
     def main(self) -> Path:
         """Writes the files; returns the path of the PLY file."""
-        device = choose_device(self.device)
         target = self.output_dir / Path(self.output_filename).name
-        beside = {kind: target.with_name(f"{target.stem}_{kind}") for kind in ("rows.npy", "objects.json")}
-        found = [path for path in (target, *beside.values()) if path.exists()]
-        if len(found) > 0 and not self.overwrite:
-            raise FileExistsError(
-                f"{found[0]} exists; give another --output-dir or --output-filename, or --overwrite True."
-            )
+        objects = target.with_name(f"{target.stem}_objects.json")
+        for path in (target, target.with_name(f"{target.stem}_rows.npy"), objects):
+            if path.exists() and not self.overwrite:
+                raise FileExistsError(
+                    f"{path} exists; give another --output-dir or --output-filename, or --overwrite True."
+                )
+        from normlift_ns.core.files import atomic_path  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.objects import find_objects  # noqa: PLC0415
 
-        from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
-        from normlift_ns.plugin.asking import encoder_of, pose, respond, with_texts  # noqa: PLC0415
-        from normlift_ns.plugin.config import FIELD_FOLDER  # noqa: PLC0415
-        from normlift_ns.plugin.objects import object_table  # noqa: PLC0415
-        from normlift_ns.plugin.ply import write_splats  # noqa: PLC0415
-        from normlift_ns.plugin.queries import load_question  # noqa: PLC0415
-        from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
-
-        run = load_run(self.load_config, data=self.data)
-        semantics = with_texts(load_field(run), vectors=self.rule.text_vectors, template=self.rule.text_template)
-        if len(self.text) > 0:
-            texts = encoder_of(semantics, device, run.location.run_dir.parent / ".cache" / "texts")
-            question = pose(semantics, texts, self.text, **self.rule.keywords())
-        else:
-            question = load_question(run.location.run_dir / FIELD_FOLDER)
-        if question is None and self.part != "scene":
-            raise ValueError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
-        answer = None if question is None else respond(semantics, question)
-        chosen = torch.zeros(len(run.scene), dtype=torch.bool) if answer is None else answer.selected.any(dim=1)
-        self.output_dir.mkdir(parents=True, exist_ok=True)
-        state = run.checkpoint.model
-        rows = write_splats(
-            target,
-            {name.removeprefix("gauss_params."): x for name, x in state.items() if name.startswith("gauss_params.")},
-            semantics,
-            answer,
-            keep={"scene": torch.ones_like(chosen), "selection": chosen, "rest": ~chosen}[self.part],
-            spherical_harmonics=run.model_config.sh_degree > 0,
+        run = open_run(
+            self.load_config,
+            data=self.data,
+            device=self.device,
+            text_vectors=self.ask.text_vectors,
+            text_template=self.ask.text_template,
         )
-        CONSOLE.print(f"{len(rows):,} of {len(run.scene):,} Gaussians in {target}", highlight=False)
-        beside["objects.json"].unlink(missing_ok=True)
-        if answer is not None and question is not None:
+        answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
+        if answer is None and self.part != "scene":
+            raise ValueError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
+        part = None if answer is None or self.part == "scene" else answer.mask
+        rows = run.export(
+            target, ~part if part is not None and self.part == "rest" else part, answer=answer, overwrite=True
+        )
+        CONSOLE.print(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}", highlight=False)
+        objects.unlink(missing_ok=True)
+        if answer is not None:
+            limits = {"reach": self.reach, "min_size": self.min_size}
             tables: list[dict[str, Any]] = [
-                {"text": text, **object_table(semantics, run.scene, chosen, reach=self.reach, min_size=self.min_size)}
-                for text, chosen in zip(answer.texts, answer.selected.T)
+                {"text": found.text, **find_objects(run.field, answer.means, found.mask, **limits).to_json()}
+                for found in answer
             ]
+            question = answer.question
             facts = {
-                "relevancy": question.form,
+                "relevancy": question.rule,
                 "threshold": question.threshold,
                 "min_reliability": question.min_reliability,
             }
-            with atomic_path(beside["objects.json"]) as temporary:
+            with atomic_path(objects) as temporary:
                 temporary.write_text(json.dumps({"queries": tables, **facts}, indent=2) + "\n")
             CONSOLE.print(_table(tables))
         return target

@@ -1,4 +1,4 @@
-"""ns-normlift: give a trained splatfacto run semantics that can be asked."""
+"""ns-normlift: give a trained splatfacto run semantics that can be searched with text."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from normlift_ns.encoders.build import SourceOptions, make_source
-from normlift_ns.plugin.asking import encoder_settings, pose
-from normlift_ns.plugin.lifting import Export, LiftOptions, LiftResult, Report, lift_run
-from normlift_ns.scripts.shared import CONSOLE, choose_device, run_command
+from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.scripts.shared import CONSOLE, run_command
+
+if TYPE_CHECKING:
+    from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.lifting import Report
 
 
 @dataclass
@@ -42,52 +44,32 @@ class NormLift:
     export_langsplat: Path | None = None
     """Write regions and features of all images into this folder too, in the format of LangSplat's preprocessing."""
     source: SourceOptions = field(default_factory=SourceOptions)
-    options: LiftOptions = field(default_factory=LiftOptions)
+    lift: LiftOptions = field(default_factory=LiftOptions)
 
-    def main(self) -> Path:
-        """Lifts, and returns the directory of the new run."""
+    def main(self) -> LiftedRun:
+        """Lifts, and returns the new run."""
         start = time.perf_counter()
-        device = choose_device(self.device)
-        source = make_source(self.source, device)
-        texts = source.text(self.queries) if len(self.queries) > 0 else None
+        from normlift_ns.lifted_run import lift_run  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.lifting import Export  # noqa: PLC0415
 
-        from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s; mistakes show before)
-        from normlift_ns.plugin.run_dir import run_directory, write_run  # noqa: PLC0415
-
-        run = load_run(self.load_config, data=self.data, load_step=self.load_step)
-        target = run_directory(run, output_dir=self.output_dir, timestamp=self.timestamp)
-        if target.exists() and not self.overwrite:
-            raise FileExistsError(f"{target} exists; give another --timestamp or --output-dir, or --overwrite True.")
-        CONSOLE.print(f"{len(run.scene):,} Gaussians, {len(run.train)} training views, on {device}")
-        export = None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite)
         with progress_bars() as report:
-            result = lift_run(
-                run,
-                source,
-                self.options,
-                target.parent / ".cache",
-                device=device,
-                encoder=encoder_settings(self.source),
-                export=export,
+            run = lift_run(
+                self.load_config,
+                source=self.source,
+                lift=self.lift,
+                queries=self.queries,
+                data=self.data,
+                load_step=self.load_step,
+                output_dir=self.output_dir,
+                timestamp=self.timestamp,
+                overwrite=self.overwrite,
+                device=self.device,
+                export=None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite),
                 report=report,
+                say=CONSOLE.print,
             )
-        if texts is not None and texts.shape[1] != result.field.dimension:
-            raise ValueError(
-                f"the vectors of --queries have {texts.shape[1]} numbers, the features {result.field.dimension}; name "
-                "the model that made the features with --encoder-model and --encoder-pretrained, or give "
-                "--text-vectors"
-            )
-        question = None if texts is None else pose(result.field, source, self.queries)
-        written = write_run(
-            run,
-            result.field,
-            question=question,
-            output_dir=self.output_dir,
-            timestamp=target.name,
-            overwrite=self.overwrite,
-        )
-        CONSOLE.print(summary(result, written, time.perf_counter() - start, self.queries))
-        return written
+        CONSOLE.print(summary(run, time.perf_counter() - start, self.queries))
+        return run
 
 
 @contextmanager
@@ -97,7 +79,7 @@ def progress_bars() -> Iterator[Report]:
         "features": "2D features",
         "lift": "lift, reliability",
         "neighbors": "neighbours",
-        "store": "choosing the form",
+        "store": "choosing storage",
     }
     columns = (TextColumn("{task.description:>17}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=CONSOLE) as progress:
@@ -111,9 +93,9 @@ def progress_bars() -> Iterator[Report]:
         yield report
 
 
-def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str, ...]) -> Panel:
+def summary(run: LiftedRun, total: float, queries: tuple[str, ...]) -> Panel:
     """The panel at the end: what was found, what it took, where it lies and what to type next."""
-    facts: dict[str, Any] = dict(result.field.manifest)
+    facts: dict[str, Any] = dict(run.field.manifest)
     numbers = facts["statistics"]
     chosen = facts["forms"][facts["form"]]
     table = Table.grid(padding=(0, 2))
@@ -129,18 +111,16 @@ def summary(result: LiftResult, run_dir: Path, total: float, queries: tuple[str,
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"
         table.add_row("refined", f"{numbers['refined_share']:.1%} of Gaussians; {lost}")
-    table.add_row(
-        "seconds", "  ".join(f"{name} {t:.1f}" for name, t in result.seconds.items()) + f"  total {total:.1f}"
-    )
+    table.add_row("seconds", "  ".join(f"{name} {t:.1f}" for name, t in run.seconds.items()) + f"  total {total:.1f}")
     cost = facts["cost"]
     gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""
     table.add_row("peak memory", f"{cost['memory_gib']:.2f} GiB{gpu}")
     table.add_row("stored as", f"{facts['form']}, {chosen['bytes'] / 1e6:.1f} MB, cosines within {chosen['bound']:.1e}")
-    others = (f"{name} {form['bytes'] / 1e6:.1f} MB" for name, form in facts["forms"].items() if name != facts["form"])
+    others = (f"{name} {way['bytes'] / 1e6:.1f} MB" for name, way in facts["forms"].items() if name != facts["form"])
     table.add_row("", "instead of " + ", ".join(others))
-    table.add_row("run", str(run_dir))
+    table.add_row("run", str(run.folder))
     text = queries[0] if len(queries) > 0 else "…"
-    table.add_row("next", f'ns-normlift-query --load-config {run_dir / "config.yml"} --text "{text}"')
+    table.add_row("next", f'ns-normlift-query --load-config {run.config} --text "{text}"')
     return Panel(table, title="[bold][green]:tada: Lifted :tada:", expand=False)
 
 

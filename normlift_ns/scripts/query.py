@@ -5,26 +5,28 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.table import Table
 
-from normlift_ns.core.files import atomic_path
-from normlift_ns.scripts.shared import CONSOLE, AskOptions, choose_device, run_command
+from normlift_ns.options import AskOptions
+from normlift_ns.scripts.shared import CONSOLE, run_command
+
+if TYPE_CHECKING:
+    from normlift_ns.lifted_run import Answer
 
 
 @dataclass
 class NormLiftQuery:
-    """Ask a lifted run where things are: a table, and files on request."""
+    """Search a lifted run with text: a table of what is found, and files on request."""
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
     text: tuple[str, ...]
     """What to look for, one or several texts."""
-    rule: AskOptions = field(default_factory=AskOptions)
+    ask: AskOptions = field(default_factory=AskOptions)
     save: bool = False
-    """Store the question in the run, in place of an earlier one: ns-render and ns-viewer then draw its answer."""
+    """Store the queries in the run, in place of earlier ones. ns-render and ns-viewer then draw the answer."""
     json: Path | None = None
     """Write the table to this file."""
     output_path: Path | None = None
@@ -32,50 +34,64 @@ class NormLiftQuery:
     render_dir: Path | None = None
     """Write pictures of the relevancy into this folder."""
     render_views: tuple[str, ...] = ()
-    """Training images from whose cameras to render, such as 0001 0042; by default three of them, evenly spread."""
+    """Training images from whose cameras to render, such as 0001 0042. By default three of them, evenly spread."""
     data: Path | None = None
     """Where the dataset is now, if it was moved."""
     device: str = "auto"
-    """auto, cpu or cuda: where the text encoder runs."""
+    """Where the text encoder runs: auto, cpu or cuda."""
 
     def main(self) -> list[dict[str, Any]]:
         """Asks, prints and writes; returns the rows of the table."""
-        device = choose_device(self.device)
+        from normlift_ns.asking import summarize  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
 
-        from normlift_ns.plugin.adapters import load_run  # noqa: PLC0415 (nerfstudio takes 20 s)
-        from normlift_ns.plugin.asking import ask, encoder_of, summarize, with_texts  # noqa: PLC0415
-        from normlift_ns.plugin.config import FIELD_FOLDER  # noqa: PLC0415
-        from normlift_ns.plugin.pictures import save_overlays, training_cameras  # noqa: PLC0415
-        from normlift_ns.plugin.queries import save_question  # noqa: PLC0415
-        from normlift_ns.plugin.run_dir import load_field  # noqa: PLC0415
-
-        run = load_run(self.load_config, data=self.data)
-        cameras = training_cameras(run, self.render_views)
-        semantics = with_texts(load_field(run), vectors=self.rule.text_vectors, template=self.rule.text_template)
-        texts = encoder_of(semantics, device, run.location.run_dir.parent / ".cache" / "texts")
-        answer = ask(semantics, texts, self.text, **self.rule.keywords())
-        rows, rule = summarize(answer, semantics, run.scene), answer.question
-        CONSOLE.print(_table(rows, f"{rule.form} > {rule.threshold:g}"))
+        run = open_run(
+            self.load_config,
+            data=self.data,
+            device=self.device,
+            text_vectors=self.ask.text_vectors,
+            text_template=self.ask.text_template,
+        )
+        cameras = training_cameras(run.scene, self.render_views)
+        answer = run.ask(*self.text, **self.ask.rules())
+        rows, question = summarize(answer), answer.question
+        CONSOLE.print(_table(rows, f"{question.rule} > {question.threshold:g}"))
         if self.json is not None:
-            facts = {"relevancy": rule.form, "threshold": rule.threshold, "negatives": list(rule.negatives)}
-            with atomic_path(self.json) as temporary:
-                temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
+            _write_json(self.json, rows, answer)
         if self.output_path is not None:
-            tensors = {
-                "relevancy": answer.relevancy,
-                "reliability": semantics.scalars.reliability,
-                "valid": answer.valid,
-            }
-            arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
-            with atomic_path(self.output_path) as temporary, temporary.open("wb") as file:
-                np.savez(file, names=np.array(self.text), **arrays)
+            _write_arrays(self.output_path, answer)
         if self.render_dir is not None:
-            save_overlays(run, answer, cameras, self.render_dir)
-        stored = save_question(run.location.run_dir / FIELD_FOLDER, rule) if self.save else None
+            save_overlays(run.scene, answer, cameras, self.render_dir)
+        stored = run.save(question) if self.save else None
         written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
         if len(written) > 0:
             CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)
         return rows
+
+
+def _write_json(path: Path, rows: list[dict[str, Any]], answer: Answer) -> None:
+    from normlift_ns.core.files import atomic_path  # noqa: PLC0415
+
+    question = answer.question
+    facts = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
+
+
+def _write_arrays(path: Path, answer: Answer) -> None:
+    import numpy as np  # noqa: PLC0415
+
+    from normlift_ns.core.files import atomic_path  # noqa: PLC0415
+
+    tensors = {
+        "relevancy": answer.relevancy,
+        "reliability": answer.field.scalars.reliability,
+        "valid": answer.valid,
+    }
+    arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, names=np.array(answer.texts), **arrays)
 
 
 def _table(rows: list[dict[str, Any]], rule: str) -> Table:

@@ -1,45 +1,18 @@
-"""What the commands have in common: errors that users can act on, and the device."""
+"""What the commands have in common: flags with their help, and errors that users can act on."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, Protocol, get_type_hints
 
-import torch
+import docstring_parser
 import tyro
 from rich.console import Console
 
-from normlift_ns.core.query import RelevancyForm
+from normlift_ns import __version__
 
 CONSOLE = Console(width=120)
-
-
-@dataclass(frozen=True)
-class AskOptions:
-    """How texts are judged."""
-
-    negatives: tuple[str, ...] | None = None
-    """What to compare with; by default LERF's words for open_clip, none for colour."""
-    relevancy: RelevancyForm | Literal["auto"] = "auto"
-    """cosine; lerf: against each negative; margin: above the best negative. auto: lerf with negatives, else cosine."""
-    threshold: float | None = None
-    """Relevancy above which a Gaussian is selected; by default 0.5 (cosine), 0.5 (lerf) or 0.02 (margin)."""
-    min_reliability: float = 0.0
-    """Least reliability of a selected Gaussian, in 0..1."""
-    refined: bool = True
-    """Ask the refined directions."""
-    text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
-    text_template: str | None = None
-    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}"; ensemble: the mean of
-    seven. By default as the run was lifted."""
-
-    def keywords(self) -> dict[str, Any]:
-        """As `plugin.asking.pose` takes them."""
-        rule = {"threshold": self.threshold, "min_reliability": self.min_reliability, "refined": self.refined}
-        return {"negatives": self.negatives, "form": self.relevancy, **rule}
 
 
 class Command(Protocol):
@@ -55,9 +28,12 @@ def run_command(command: type[Command]) -> None:
 
     Errors of flags, input, files, disks and memory become a message and exit code 1, Ctrl-C exit code 130.
     """
+    if "--version" in sys.argv[1:]:
+        print(f"normlift_ns {__version__}")
+        return
     tyro.extras.set_accent_color("bright_yellow")
     try:
-        tyro.cli(tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[command]]).main()  # pyright: ignore[reportAttributeAccessIssue]
+        tyro.cli(tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]).main()  # pyright: ignore[reportAttributeAccessIssue]
     except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read
         sys.exit(1 if stop.code == 2 else stop.code)
     except (ValueError, OSError, MemoryError) as error:
@@ -65,20 +41,23 @@ def run_command(command: type[Command]) -> None:
         CONSOLE.print(str(error), justify="center", markup=False, highlight=False)
         sys.exit(1)
     except KeyboardInterrupt:
-        CONSOLE.print("Interrupted. Nothing half-written is left; the same command goes on where it stopped.")
+        CONSOLE.print("Interrupted. No partial files remain; rerun the command to resume.")
         sys.exit(130)
 
 
-def choose_device(device: str) -> str:
-    """The device to work on; auto: cuda if there is one.
+def with_help(options: Any) -> Any:
+    """The dataclass, with the docstring under each field as the help of its flag, and the first paragraph of its own as
+    the help of all of them.
 
-    Raises:
-        ValueError: an unknown device, or one that this machine lacks.
+    tyro reads docstrings itself, but keeps the line breaks that are there because lines of code are short.
     """
-    if device not in ("auto", "cpu") and not device.startswith("cuda"):
-        raise ValueError(f"--device must be auto, cpu or cuda, got {device!r}")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"--device {device}: this machine has no CUDA device; use --device cpu")
-    if device != "auto":
-        return device
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    hints = get_type_hints(options, include_extras=True)
+    texts = {found.arg_name: found.description or "" for found in docstring_parser.parse_from_object(options).params}
+    for field in fields(options):
+        text = texts.get(field.name, "")
+        if is_dataclass(hints[field.name]):
+            with_help(hints[field.name])
+            text = hints[field.name].__doc__
+        options.__annotations__[field.name] = Annotated[hints[field.name], tyro.conf.arg(help=" ".join(text.split()))]
+    options.__doc__ = " ".join((options.__doc__ or "").split("\n\n")[0].split())
+    return options

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.captures import SHARED
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.build import SourceOptions
-from normlift_ns.plugin.lifting import LiftOptions
+from normlift_ns.lifting import LiftOptions
 from normlift_ns.scripts.lift import NormLift
 
 TEXTS = ("red", "yellow", "sky blue", "dark green")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from normlift_ns.plugin.queries import load_question
+from normlift_ns.runs.question import load_question
 from tests.browser.viewer import CHROMIUM, Tab, chromium, coloured, hue_mask, iou, middle, ns_viewer
 
 pytestmark = [

@@ -1,6 +1,6 @@
 import torch
 
-from normlift_ns.core.components import connected_components
+from normlift_ns.objects import connected_components
 from tests.scenes import generator
 
 

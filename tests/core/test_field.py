@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from normlift_ns import Evidence, Lifted, SemanticField, lift, relevancy
 from normlift_ns.core.field import fingerprint
-from normlift_ns.core.forms import EvidenceForm
 from normlift_ns.core.lowrank import basis_of_rank, spectral_table
+from normlift_ns.core.storage import StoredEvidence
 from tests.captures import clip_vectors, needs_shared
 from tests.scenes import generator, random_evidence, unit_rows
 
@@ -75,7 +75,7 @@ def test_auto_takes_the_smallest_form_within_the_tolerance():
 def test_no_row_is_stored_without_evidence():
     lifted, means, _ = example()
     field = SemanticField.build(lifted, means, form="float16")
-    assert not isinstance(field.store, EvidenceForm)
+    assert not isinstance(field.store, StoredEvidence)
     assert len(field.store.coordinates) == int((lifted.norm > 0).sum()) < N
 
 

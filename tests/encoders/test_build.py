@@ -9,10 +9,10 @@ import pytest
 
 from normlift_ns.encoders import SourceOptions, make_encoder, make_regions, make_source
 from normlift_ns.encoders.build import resolve_regions
-from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.sam import SamMasks
+from normlift_ns.encoders.sam.masks import SamMasks
 
 
 def test_auto_takes_files_where_a_folder_is_given(tmp_path):

@@ -10,9 +10,9 @@ import torch
 from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
 from normlift_ns.encoders.batches import Batches
 from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, CachedTexts
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles
 from normlift_ns.encoders.source import each_view
 from tests.encoders.tiny import CLIP, write_clip

@@ -71,9 +71,9 @@ SEE_ALL = """
 import resource, sys
 from pathlib import Path
 from normlift_ns.encoders import RegionFeatures, cached, read_image
-from normlift_ns.encoders.open_clip import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.sam import MaskRules, SamMasks
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from tests.encoders.tiny import write_clip, write_sam
 
 folder, images = Path(sys.argv[1]), sorted(Path(sys.argv[2]).iterdir())

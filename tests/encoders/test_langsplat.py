@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from normlift_ns.encoders import LangSplat, RegionFeatures, SourceOptions, make_source, write_langsplat
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.open_clip import OpenClipEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles
 from normlift_ns.encoders.text_vectors import TextVectors
 

@@ -9,8 +9,8 @@ from hypothesis.extra.numpy import arrays
 
 from normlift_ns.encoders import RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.levels import joint_partition
 from normlift_ns.encoders.regions import LabelFiles
+from normlift_ns.encoders.source import joint_partition
 
 SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 6))
 

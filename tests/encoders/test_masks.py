@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from normlift_ns.encoders.masks import Suppression, boxes_of, mask_nms, stack_masks
+from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
 from tests.encoders.tiny import needs_cuda
 
 

@@ -17,8 +17,8 @@ import torch
 from safetensors.torch import save_file
 
 from normlift_ns.encoders import SourceOptions, make_encoder
-from normlift_ns.encoders.crops import masked_crops, region_boxes
-from normlift_ns.encoders.open_clip import OpenClipEncoder
+from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from tests.encoders.tiny import CLIP as NAME
 from tests.encoders.tiny import DEVICES, needs_cuda, write_clip
 

@@ -16,10 +16,10 @@ from segment_anything import SamAutomaticMaskGenerator, SamPredictor, sam_model_
 
 from benchmarks.captures import SHARED
 from normlift_ns.encoders.images import read_image
-from normlift_ns.encoders.masks import Suppression
-from normlift_ns.encoders.sam import LEVELS, MaskRules, SamMasks, point_grid
-from normlift_ns.encoders.sam_network import SamNetwork
-from normlift_ns.encoders.sam_weights import load_sam, published_config, published_name
+from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, point_grid
+from normlift_ns.encoders.sam.network import SamNetwork
+from normlift_ns.encoders.sam.rules import Suppression
+from normlift_ns.encoders.sam.weights import load_sam, published_config, published_name
 from tests.captures import needs_shared
 from tests.encoders.test_masks import nms_by_hand, pixels
 from tests.encoders.tiny import SIDE, needs_cuda, tiny_sam, write_sam
@@ -287,7 +287,7 @@ def test_weights_of_another_network_are_not_downloaded(monkeypatch, tmp_path):
         (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2_video"}))
         return str(tmp_path)
 
-    monkeypatch.setattr("normlift_ns.encoders.sam_weights.probe", lambda address: None)
+    monkeypatch.setattr("normlift_ns.encoders.sam.weights.probe", lambda address: None)
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(ValueError, match="of model type 'sam2_video', expected 'sam', the first SAM"):

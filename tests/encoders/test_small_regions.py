@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
 from normlift_ns.encoders import small_regions
-from normlift_ns.encoders.small_regions import clean_masks
+from normlift_ns.encoders.sam.small_regions import clean_masks
 from tests.encoders.tiny import DEVICES
 
 EIGHT = np.ones((3, 3))

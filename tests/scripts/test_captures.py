@@ -15,9 +15,9 @@ from PIL import Image
 
 from benchmarks.captures import SHARED
 from normlift_ns import render
-from normlift_ns.plugin.adapters import SourceRun, load_run
-from normlift_ns.plugin.asking import ask, encoder_of, pixel_relevancy
-from normlift_ns.plugin.run_dir import load_field
+from normlift_ns.asking import ask, encoder_of, pixel_relevancy
+from normlift_ns.nerfstudio_plugin.load import NerfstudioScene, load_scene
+from normlift_ns.nerfstudio_plugin.write import load_field
 from tests.captures import needs_shared
 
 pytestmark = [pytest.mark.slow, needs_shared]
@@ -31,9 +31,9 @@ def command(script: str, *flags: object, cwd: Path) -> str:
     return done.stdout
 
 
-def maps(config: Path, texts: list[str], cameras: str) -> tuple[SourceRun, torch.Tensor]:
+def maps(config: Path, texts: list[str], cameras: str) -> tuple[NerfstudioScene, torch.Tensor]:
     """Relevancy of the texts in all views of a split, [V, H, W, Q]."""
-    run = load_run(config)
+    run = load_scene(config)
     field = load_field(run)
     relevancy = ask(field, encoder_of(field), texts).relevancy
     views = getattr(run, cameras).cameras

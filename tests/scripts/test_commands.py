@@ -12,16 +12,16 @@ import pytest
 import torch
 from PIL import Image
 
+from normlift_ns.asking import ask, encoder_of
 from normlift_ns.demo import DemoRoom
 from normlift_ns.encoders import RegionFeatures, write_langsplat
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
-from normlift_ns.encoders.sam import MaskRules, SamMasks
-from normlift_ns.plugin import lifting
-from normlift_ns.plugin.adapters import load_run
-from normlift_ns.plugin.asking import ask, encoder_of
-from normlift_ns.plugin.queries import load_question
-from normlift_ns.plugin.run_dir import load_field
+from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
+from normlift_ns.nerfstudio_plugin import lifting
+from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.nerfstudio_plugin.write import load_field
+from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.encoders.tiny import CLIP, write_clip, write_sam
@@ -29,7 +29,7 @@ from tests.scripts.conftest import SMALL, run_entry
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
-    run = load_run(lifted)
+    run = load_scene(lifted)
     field = load_field(run)
     answer = encoder_of(field).text(room.names)
     before, after = (
@@ -69,7 +69,7 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     assert 0.005 < red["fraction"] < 0.1
     assert red["peak"] > 0.9
     assert 0.3 < red["mean_reliability"] < 1
-    run = load_run(lifted)
+    run = load_scene(lifted)
     scores = np.load(tmp_path / "a.npz")
     assert scores["relevancy"].shape == (len(run.scene), 2)
     assert scores["names"].tolist() == ["red", "sky blue"]
@@ -92,11 +92,11 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(trained, monkeypatch, caps
     def never(*_args, **_kwargs):
         raise AssertionError("rasterized again")
 
-    monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", never)
+    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", never)
     monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", never)
     flags = ("--load-config", trained, *SMALL, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (load_field(load_run(trained.parents[2] / "normlift" / t / "config.yml")) for t in ("one", "two"))
+    first, second = (load_field(load_scene(trained.parents[2] / "normlift" / t / "config.yml")) for t in ("one", "two"))
     assert torch.equal(first.scalars.norm, second.scalars.norm)
     assert (second.scalars.reliability <= first.scalars.reliability).all()
     assert torch.equal(second.source, torch.arange(len(second), dtype=torch.int32))
@@ -172,8 +172,8 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     flags = ("--load-config", trained, *SMALL, "--regions-dir", tmp_path, "--output-dir", tmp_path / "out")
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
-        monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)
-    fields = [load_field(load_run(tmp_path / "out" / "room" / "normlift" / t / "config.yml")) for t in ("0", "1")]
+        monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
+    fields = [load_field(load_scene(tmp_path / "out" / "room" / "normlift" / t / "config.yml")) for t in ("0", "1")]
     weights = [field.scalars.weight for field in fields]
     assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
     classes, whole = (field.scalars.c_intra for field in fields)
@@ -205,13 +205,13 @@ def test_clip_by_patches_and_questions_without_a_network(trained, clip, tmp_path
     flags = ("--load-config", trained, *clip, "--output-dir", tmp_path, "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     config = tmp_path / "room" / "normlift" / "t" / "config.yml"
-    manifest = load_field(load_run(config)).manifest
+    manifest = load_field(load_scene(config)).manifest
     assert manifest["features"]["kind"] == "patches"
     assert manifest["encoder"]["text_template"] == "{}"
     ask = ("--load-config", config, "--text", "table", "--json")
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
-    monkeypatch.setattr("normlift_ns.encoders.open_clip.load_clip", None)
+    monkeypatch.setattr("normlift_ns.encoders.clip.encoder.load_clip", None)
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
     plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
     assert again == plain
@@ -228,11 +228,11 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
     for level in ("l", "s"):
         more = () if level == "l" else ("--level", level)
         assert run_entry(monkeypatch, lift.entrypoint, *flags, *more, "--timestamp", level) == 0
-        field = load_field(load_run(tmp_path / "room" / "normlift" / level / "config.yml"))
+        field = load_field(load_scene(tmp_path / "room" / "normlift" / level / "config.yml"))
         assert field.manifest["features"]["regions"]["kind"] == "sam"
         assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
         shares.append(field.manifest["statistics"]["zero_evidence_share"])
-        monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)
+        monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
         monkeypatch.setattr("normlift_ns.encoders.sam.SamNetwork", None)
     assert shares[0] != shares[1] and max(shares) < 1
 
@@ -240,7 +240,7 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
 def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
     flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *SMALL, *flags) == 0
-    field = load_field(load_run(trained.parents[2] / "normlift" / "less" / "config.yml"))
+    field = load_field(load_scene(trained.parents[2] / "normlift" / "less" / "config.yml"))
     assert field.manifest["statistics"]["views"] == 5
     assert 0 < field.manifest["statistics"]["zero_evidence_share"] < 0.5
 
@@ -271,7 +271,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
 
 
 def test_selection_follows_threshold_and_reliability(lifted):
-    run = load_run(lifted)
+    run = load_scene(lifted)
     field = load_field(run)
     encoder = encoder_of(field)
     loose, strict = (ask(field, encoder, ["red"], threshold=t).selected for t in (0.2, 0.8))
@@ -294,13 +294,13 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     texts = ("red", "sky blue")
     np.savez(tmp_path / "texts.npz", **dict(zip(texts, ColourEncoder().text(texts).numpy())))
 
-    monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)
+    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
     importing = ("--features", "langsplat", "--features-dir", tmp_path / "features")
     vectors = ("--text-vectors", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     ours, theirs = (tmp_path / "out" / "room" / "normlift" / t / "config.yml" for t in ("ours", "theirs"))
-    first, second = (load_field(load_run(config)) for config in (ours, theirs))
+    first, second = (load_field(load_scene(config)) for config in (ours, theirs))
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
         assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
     assert torch.equal(first.source, second.source)
@@ -326,7 +326,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
 
 def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monkeypatch, capsys):
     source = RegionFeatures(Grid(9), ColourEncoder())
-    for view in load_run(trained).train:
+    for view in load_scene(trained).train:
         write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
     (tmp_path / "features" / "0003_f.npy").unlink()
     np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
@@ -339,7 +339,7 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     with pytest.warns(UserWarning, match=r"1 of 12 images have no features in .*: images/0003\.png; they are left out"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
     assert "1 images without features" in capsys.readouterr().out
-    field = load_field(load_run(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml"))
+    field = load_field(load_scene(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml"))
     assert field.manifest["statistics"]["views"] == 11
     assert int(field.scalars.view_count.max()) <= 11
 
@@ -347,7 +347,9 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
 def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, monkeypatch):
     flags = ("--load-config", trained, *SMALL, "--timestamp", "double", "--precision", "double")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    double, single = (load_field(load_run(config)) for config in (lifted.parents[1] / "double" / "config.yml", lifted))
+    double, single = (
+        load_field(load_scene(config)) for config in (lifted.parents[1] / "double" / "config.yml", lifted)
+    )
     assert double.manifest["options"]["precision"] == "double"
     difference = (double.scalars.reliability - single.scalars.reliability).abs()
     assert 0 < float(difference.quantile(0.99)) < 1e-6

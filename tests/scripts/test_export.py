@@ -13,12 +13,12 @@ import trimesh
 from nerfstudio.configs.method_configs import all_methods
 from plyfile import PlyData
 
+from normlift_ns.asking import ask, encoder_of
 from normlift_ns.demo import DemoRoom
 from normlift_ns.method_configs.normlift import normlift_method
-from normlift_ns.plugin.adapters import load_run
-from normlift_ns.plugin.asking import ask, encoder_of
-from normlift_ns.plugin.config import rerooted
-from normlift_ns.plugin.run_dir import load_field
+from normlift_ns.nerfstudio_plugin.config import rerooted
+from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.nerfstudio_plugin.write import load_field
 from normlift_ns.scripts import export
 from tests.scripts.conftest import run_entry
 
@@ -64,7 +64,7 @@ def test_the_file_is_that_of_ns_export_and_more(
 
 
 def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> None:
-    run = load_run(lifted)
+    run = load_scene(lifted)
     field = load_field(run)
     vertices, rows = PlyData.read(scene_ply)["vertex"], np.load(scene_ply.with_name("splat_rows.npy"))
     assert (np.diff(rows) > 0).all()
@@ -120,7 +120,7 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     sizes = [found["size"] for found in red["objects"]]
     assert sizes == sorted(sizes, reverse=True)
     assert sum(sizes) + red["in_smaller_parts"] == red["gaussians"]
-    ball, run = red["objects"][0], load_run(lifted)
+    ball, run = red["objects"][0], load_scene(lifted)
     truth = run.scene.means[room.labels == room.names.index("red")]
     assert ball["size"] > 0.6 * len(truth)
     assert np.allclose(ball["centroid"], truth.mean(0), atol=0.05)

@@ -19,8 +19,8 @@ from scipy import ndimage
 from benchmarks.captures import SHARED
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.text_vectors import TextVectors
-from normlift_ns.plugin.adapters import load_run
-from normlift_ns.plugin.run_dir import load_field
+from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.nerfstudio_plugin.write import load_field
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.captures import clip_vectors, needs_shared
@@ -136,7 +136,7 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
         flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
         command(monkeypatch, lift.entrypoint, *flags)
         config = trained.parents[2] / "normlift" / name / "config.yml"
-        field = load_field(load_run(config))
+        field = load_field(load_scene(config))
         scores = []
         for refined in (False, True):
             found = torch.where(field.valid(refined=refined), field.query(texts, refined=refined).argmax(1), -1)
@@ -144,7 +144,7 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
         return config, scores
 
     scores = {seed: lifted(seed, "l")[1] for seed in range(3)}
-    monkeypatch.setattr("normlift_ns.plugin.observe.rasterize_evidence", None)  # another level has its evidence
+    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)  # another level has its evidence
     config, summed = lifted(0, "sum")
     asking = ("--text", "sofa", "--negatives", "box", "table", "--json", tmp_path / "a.json")
     command(monkeypatch, query.entrypoint, "--load-config", config, *asking)

@@ -16,11 +16,11 @@ from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInt
 from PIL import Image
 
 from normlift_ns import render
+from normlift_ns.asking import ask, encoder_of
 from normlift_ns.method_configs.normlift import normlift_method
-from normlift_ns.plugin.adapters import load_run
-from normlift_ns.plugin.asking import ask, encoder_of
-from normlift_ns.plugin.queries import load_question
-from normlift_ns.plugin.run_dir import load_field
+from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.nerfstudio_plugin.write import load_field
+from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry
 
@@ -33,13 +33,13 @@ def without_encoders(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("an encoder was made")
 
     monkeypatch.setitem(all_methods, "normlift", normlift_method.config)
-    monkeypatch.setattr("normlift_ns.plugin.panel.encoder_of", never)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.panel.encoder_of", never)
 
 
 def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
     names = [*NAMES, "raw-relevancy_1", "raw-selection", "depth"]
     DatasetRender(lifted, output_path=tmp_path, rendered_output_names=names, split="test", image_format="png").main()
-    run = load_run(lifted)
+    run = load_scene(lifted)
     field = load_field(run)
     answer = ask(field, encoder_of(field), ["red", "yellow"])  # as stored
     values = torch.stack([answer.relevancy[:, 1], answer.selected.any(dim=1).float()], dim=1)
@@ -64,7 +64,7 @@ def test_ns_render_draws_every_output(lifted: Path, tmp_path: Path) -> None:
 
 def test_ns_render_camera_path_and_interpolate(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)  # for videos only
-    pose = np.vstack([load_run(lifted).train._poses[0].numpy(), [0, 0, 0, 1]])
+    pose = np.vstack([load_scene(lifted).train._poses[0].numpy(), [0, 0, 0, 1]])
     camera = {"camera_to_world": pose.flatten().tolist(), "fov": 60, "aspect": 1}
     path = {"camera_type": "perspective", "render_height": 40, "render_width": 60, "camera_path": [camera] * 2}
     (tmp_path / "path.json").write_text(json.dumps({**path, "seconds": 1, "fps": 2}))

@@ -1,1 +1,0 @@
-"""Method specifications of nerfstudio; shipped as normlift_ns.method_configs."""

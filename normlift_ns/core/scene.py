@@ -1,0 +1,119 @@
+"""What the application knows of a trained splat and its photographs, wherever they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.options import RasterizeMode
+
+
+class View(NamedTuple):
+    """One photograph."""
+
+    camera: Camera
+    image: UInt8[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"] | None
+    """True where the pixel counts; None: everywhere."""
+    name: str
+    """Image file relative to the dataset, with forward slashes."""
+
+
+class Views(Protocol):
+    """Photographs as the scene was trained on them, undistorted; each is read when it is asked for."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the images, relative to the dataset, with forward slashes."""
+        ...
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """Of the images, in the same order; asking for them reads no image."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[View]: ...
+
+    def __getitem__(self, index: int, /) -> View:
+        """Reads one photograph.
+
+        Raises:
+            FileNotFoundError, ValueError: a file that is missing or cannot be read; the message names it.
+        """
+        ...
+
+
+class Scene(Protocol):
+    """A trained splat and the photographs that it was trained with."""
+
+    @property
+    def name(self) -> str:
+        """What runs of it are filed under."""
+        ...
+
+    @property
+    def checkpoint_path(self) -> Path:
+        """The file that the Gaussians come from."""
+        ...
+
+    @property
+    def runs_dir(self) -> Path:
+        """Where lifted runs of it go by default."""
+        ...
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """Where the scene comes from, ready for JSON; it stands in the manifest of a lifted run."""
+        ...
+
+    @property
+    def gaussians(self) -> GaussianScene:
+        """The N Gaussians, activated; none left out."""
+        ...
+
+    @property
+    def rasterize_mode(self) -> RasterizeMode:
+        """How the scene was rasterized in its training; lifts must do the same."""
+        ...
+
+    @property
+    def train(self) -> Views:
+        """Photographs of the training, with the cameras that the Gaussians fit."""
+        ...
+
+    @property
+    def held_out(self) -> Views:
+        """Photographs kept for evaluation."""
+        ...
+
+    @property
+    def background(self) -> Float[Tensor, " 3"]:
+        """RGB in 0..1 behind the Gaussians."""
+        ...
+
+    @property
+    def renderer(self) -> Callable[[Camera], UInt8[Tensor, "h w 3"]] | None:
+        """A renderer of the scene's own; None: that of normlift_ns, with `colors` on `background`."""
+        ...
+
+    def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
+        """RGB >= 0 of every Gaussian as the camera sees it."""
+        ...
+
+    @property
+    def parameters(self) -> Mapping[str, Tensor]:
+        """What was trained, as a checkpoint holds it: means [N, 3], quats [N, 4], scales [N, 3] (logarithms), opacities
+        [N, 1] (logits), features_dc [N, 3] and features_rest [N, K, 3]."""
+        ...
+
+    @property
+    def has_harmonics(self) -> bool:
+        """Whether colours are spherical harmonics; False: features_dc are logits."""
+        ...

@@ -1,0 +1,1 @@
+"""OpenCLIP: features of masked crops and of patches."""

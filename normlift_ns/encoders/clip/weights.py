@@ -1,0 +1,104 @@
+"""Finding the weights of OpenCLIP models: a local file, the local cache, or a download; else one clear message."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+from normlift_ns.encoders.weights import first_line, probe
+from normlift_ns.options import DEFAULT_MODEL
+
+REMEDY = (
+    "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
+    "the encoder that needs no weights: --encoder colour"
+)
+_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
+
+
+def import_open_clip() -> Any:
+    """open_clip, imported at the first use because that takes seconds, without the warnings of the old timm that
+    nerfstudio pins."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return importlib.import_module("open_clip")
+
+
+def check_names(model: str, pretrained: str) -> None:
+    """Checks an architecture and its weights by name, without loading or downloading anything.
+
+    Raises:
+        ValueError: a model or a tag of weights that open_clip does not know, or a model that the installed timm does
+            not know.
+        FileNotFoundError: what looks like a weight file does not exist.
+    """
+    open_clip = import_open_clip()
+    if open_clip.get_model_config(model) is None:
+        near = ", ".join(difflib.get_close_matches(model, open_clip.list_models()) or [DEFAULT_MODEL])
+        raise ValueError(
+            f"unknown OpenCLIP model {model!r} (--encoder-model); near names: {near}. All of them: "
+            'python -c "import open_clip; print(open_clip.list_models())"'
+        )
+    tower = open_clip.get_model_config(model)["vision_cfg"].get("timm_model_name")
+    timm = importlib.import_module("timm")
+    if tower is not None and not timm.is_model(tower):
+        raise ValueError(
+            f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
+            f"{timm.__version__} does not have (nerfstudio pins an old one); take a model that open_clip builds "
+            f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
+        )
+    path = Path(pretrained)
+    if path.is_file() or open_clip.is_pretrained_cfg(model, pretrained):
+        return
+    if path.suffix in _SUFFIXES or len(path.parts) > 1:
+        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {REMEDY}")
+    tags = ", ".join(open_clip.list_pretrained_tags_by_model(model)) or "none"
+    raise ValueError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; known: {tags}. Otherwise {REMEDY}")
+
+
+def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
+    """The weight file, downloaded if need be, and what open_clip knows of its training: "mean" and "std" of the images,
+    "quick_gelu".
+
+    A local file tells nothing of that; it gets the mean and standard deviation of the architecture's published weights,
+    if there are any, and the activation that the architecture names.
+
+    Raises:
+        FileNotFoundError: the weights are not in the local cache and cannot be downloaded.
+    """
+    open_clip = import_open_clip()
+    local = Path(pretrained)
+    if local.is_file():
+        tags = open_clip.list_pretrained_tags_by_model(model)
+        published = open_clip.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
+        return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
+    published = open_clip.get_pretrained_cfg(model, pretrained)
+    try:
+        return _cached(published) or _download(published), published
+    except Exception as error:  # whatever a download makes its libraries raise
+        origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
+        raise FileNotFoundError(
+            f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are neither in the local cache nor can they "
+            f"be downloaded ({first_line(error)}); go online once, {REMEDY}"
+        ) from None
+
+
+def _cached(published: dict[str, Any]) -> Path | None:
+    """The file in the cache of the Hugging Face hub, looked for without the network."""
+    hub = importlib.import_module("huggingface_hub")
+    constants = importlib.import_module("open_clip.constants")
+    repository, name = os.path.split(published.get("hf_hub", ""))
+    for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
+        found = hub.try_to_load_from_cache(repository, file) if repository else None
+        if isinstance(found, str):
+            return Path(found)
+    return None
+
+
+def _download(published: dict[str, Any]) -> Path:
+    if published.get("hf_hub"):
+        probe(importlib.import_module("huggingface_hub").constants.ENDPOINT)
+    return Path(import_open_clip().download_pretrained(published))

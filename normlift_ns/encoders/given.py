@@ -1,0 +1,97 @@
+"""Features of one's own: label maps and vectors that are in memory already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from hashlib import blake2b
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float32, Int, UInt8
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from normlift_ns.encoders.source import ViewFeatures, check_prompts
+from normlift_ns.encoders.text_vectors import look_up
+
+
+@dataclass(frozen=True)
+class GivenFeatures:
+    """A `FeatureSource` of (labels, vectors) per image, and of texts with their vectors.
+
+    Raises:
+        ValueError: vectors that are not [regions, D] with the same D everywhere, zero or not finite; labels that are
+            no integer matrix or name a region without a vector. The message names the image.
+    """
+
+    views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
+    """By the name of the image. Labels are 0..R-1, -1 for none; vectors may have any length > 0."""
+    texts: Mapping[str, Float[Tensor, " d"]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        lengths = set()
+        for name, (labels, vectors) in self.views.items():
+            if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
+                raise ValueError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
+            if labels.ndim != 2 or labels.dtype.is_floating_point or int(labels.max()) >= len(vectors):
+                raise ValueError(
+                    f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
+                    f"{labels.dtype} {tuple(labels.shape)} up to {labels.max()}"
+                )
+            lengths.add(vectors.shape[1])
+        lengths |= {len(vector) for vector in self.texts.values()}
+        if len(lengths) > 1:
+            raise ValueError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """Features count by their content."""
+        digest = blake2b(digest_size=16)
+        for name, (labels, vectors) in self.views.items():
+            digest.update(f"{name} {labels.dtype} {tuple(labels.shape)} {vectors.dtype}".encode())
+            digest.update(labels.cpu().contiguous().numpy().tobytes())
+            digest.update(vectors.cpu().contiguous().numpy().tobytes())
+        return {"kind": "given", "content": digest.hexdigest()}
+
+    def available(self, names: Sequence[str]) -> list[str]:
+        unknown = sorted(set(self.views) - set(names))
+        if len(unknown) > 0:
+            raise ValueError(
+                f"there is no training image {unknown[0]!r} for the features given; there are {len(names)}, from "
+                f"{names[0]!r} to {names[-1]!r}"
+            )
+        return [name for name in names if name in self.views]
+
+    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
+        labels, vectors = self.views[name]
+        if labels.shape != image.shape[:2]:
+            raise ValueError(
+                f"labels of {name} are {tuple(labels.shape)}, but the undistorted image is {tuple(image.shape[:2])} "
+                "(height x width)"
+            )
+        return ViewFeatures(labels.int().cpu(), normalize(vectors.double().cpu(), dim=1).float())
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        check_prompts(prompts)
+        return look_up(prompts, self.texts, "the texts given")
+
+
+def features_by_name(features: Any, names: Sequence[str]) -> dict[str, tuple[Tensor, Tensor]]:
+    """Pairs of labels and vectors by the name of their image, as tensors.
+
+    Args:
+        features: one pair per training image, in order; or a mapping from names of images, which may leave some out.
+        names: of all training images.
+    Raises:
+        ValueError: a list of another length.
+    """
+    if not isinstance(features, Mapping):
+        if len(features) != len(names):
+            raise ValueError(
+                f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; give one "
+                "pair per image in the order of scene.train.names, or a dictionary by those names"
+            )
+        features = dict(zip(names, features))
+    return {name: (torch.as_tensor(labels), torch.as_tensor(vectors)) for name, (labels, vectors) in features.items()}

@@ -1,0 +1,1 @@
+"""Regions and features in the files of LangSplat's preprocessing."""

@@ -1,0 +1,237 @@
+"""Weights of SAM: a folder as transformers writes it, a file as Meta publishes it, or a name on the hub."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from normlift_ns.encoders.weights import content_identity, first_line, probe
+from normlift_ns.options import DEFAULT_SAM
+
+REMEDY = (
+    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
+    "as sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
+)
+_FILES = ("model.safetensors", "pytorch_model.bin")
+_FIRST = "the first SAM, ViT-B, -L or -H"
+_OTHERS = {
+    "image_encoder.trunk.": "SAM 2",
+    "image_encoder.layers.": "MobileSAM",
+    "mask_decoder.hf_token": "HQ-SAM",
+    "mask_decoder.compress_vit_feat": "HQ-SAM",
+}
+"""What the parameters of other networks begin with."""
+_MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
+_SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
+_NAMES = {
+    r"^image_encoder\.": "vision_encoder.",
+    r"\.patch_embed\.proj\.": ".patch_embed.projection.",
+    r"\.blocks\.(\d+)\.norm(\d)\.": r".layers.\1.layer_norm\2.",
+    r"\.blocks\.": ".layers.",
+    r"\.neck\.0\.": ".neck.conv1.",
+    r"\.neck\.1\.": ".neck.layer_norm1.",
+    r"\.neck\.2\.": ".neck.conv2.",
+    r"\.neck\.3\.": ".neck.layer_norm2.",
+    r"\.pe_layer\.positional_encoding_gaussian_matrix$": ".shared_embedding.positional_embedding",
+    r"\.point_embeddings\.": ".point_embed.",
+    r"\.mask_downscaling\.0\.": ".mask_embed.conv1.",
+    r"\.mask_downscaling\.1\.": ".mask_embed.layer_norm1.",
+    r"\.mask_downscaling\.3\.": ".mask_embed.conv2.",
+    r"\.mask_downscaling\.4\.": ".mask_embed.layer_norm2.",
+    r"\.mask_downscaling\.6\.": ".mask_embed.conv3.",
+    r"\.norm_final_attn\.": ".layer_norm_final_attn.",
+    r"\.layers\.(\d+)\.norm(\d)\.": r".layers.\1.layer_norm\2.",
+    r"\.output_upscaling\.0\.": ".upscale_conv1.",
+    r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
+    r"\.output_upscaling\.3\.": ".upscale_conv2.",
+}
+"""Names of Meta's parameters, as patterns, and what transformers calls them."""
+
+
+def import_transformers() -> Any:
+    """transformers, imported at the first use because that takes seconds.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        return importlib.import_module("transformers")
+    except ImportError as error:
+        raise ValueError(
+            f"--regions sam needs the package transformers ({first_line(error)}); install it with: "
+            'pip install "normlift-ns[sam]", or cut the images without SAM: --regions patches or superpixel'
+        ) from None
+
+
+def check_sam(checkpoint: str) -> None:
+    """Checks a checkpoint by name, without loading or downloading anything.
+
+    Raises:
+        ValueError: transformers is not installed, or what is neither a path nor a name of the form OWNER/NAME.
+        FileNotFoundError: what looks like a path does not exist.
+    """
+    import_transformers()
+    if Path(checkpoint).exists():
+        return
+    path = Path(checkpoint)
+    if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
+        raise FileNotFoundError(f"SAM checkpoint {checkpoint} does not exist; check the path, or {REMEDY}")
+    if len(path.parts) != 2:
+        raise ValueError(
+            f"SAM checkpoint {checkpoint!r} is neither a path nor a name of the hub such as {DEFAULT_SAM}; {REMEDY}"
+        )
+
+
+def local_sam(checkpoint: str) -> Path | None:
+    """Where a checkpoint lies on this machine, the cache of the hub included; None: nowhere."""
+    if Path(checkpoint).exists():
+        return Path(checkpoint).resolve()
+    hub = importlib.import_module("huggingface_hub")
+    for file in _FILES:
+        config, weights = (hub.try_to_load_from_cache(checkpoint, name) for name in ("config.json", file))
+        if isinstance(config, str) and isinstance(weights, str):
+            return Path(weights).parent
+    return None
+
+
+def sam_identity(checkpoint: str) -> str:
+    """Local files count by their content, a name of the hub as it is."""
+    path = Path(checkpoint)
+    if not path.exists():
+        return checkpoint
+    return content_identity(*(file for file in (path, path / "config.json", *_weights(path)) if file.is_file()))
+
+
+def load_sam(checkpoint: str) -> Any:
+    """transformers' SamModel with the weights of a checkpoint, in float32 on the CPU.
+
+    Raises:
+        FileNotFoundError: it is not on this machine and cannot be downloaded.
+        ValueError: it is damaged, or not of SAM.
+    """
+    path = local_sam(checkpoint) or _download(checkpoint)
+    try:
+        config, state = _read_folder(path) if path.is_dir() else _read_file(path)
+        for name, other in (_SHARED, _SHARED[::-1]):  # one tensor, of which a file may hold one copy
+            if other in state:
+                state.setdefault(name, state[other])
+        with torch.device("meta"):
+            model = import_transformers().SamModel(config)
+        model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
+    except Exception as error:  # whatever a foreign file makes torch, safetensors and transformers raise
+        raise ValueError(f"SAM checkpoint {path} is damaged or not of SAM ({first_line(error)}); {REMEDY}") from None
+    return model.eval().requires_grad_(False)
+
+
+def _download(checkpoint: str) -> Path:
+    hub = importlib.import_module("huggingface_hub")
+    try:
+        probe(hub.constants.ENDPOINT)
+        folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
+        wanted = ["config.json", _FILES[0]] if _model_type(folder) == "sam" else ["config.json"]
+        return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
+    except Exception as error:  # whatever a download makes its libraries raise
+        raise FileNotFoundError(
+            f"SAM checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
+            f"({first_line(error)}); go online once, or {REMEDY}"
+        ) from None
+
+
+def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
+    if _model_type(folder) != "sam":
+        raise ValueError(f"config.json is of model type {_model_type(folder)!r}, expected 'sam', {_FIRST}")
+    found = _weights(folder)
+    if len(found) == 0:
+        raise ValueError(f"the folder has no {_FILES[0]}")
+    config = json.loads((folder / "config.json").read_text())
+    return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
+
+
+def _model_type(folder: Path) -> Any:
+    return json.loads((folder / "config.json").read_text()).get("model_type")
+
+
+def _weights(folder: Path) -> list[Path]:
+    return [folder / name for name in _FILES if (folder / name).is_file()][:1]
+
+
+def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
+    state = _read_tensors(path)
+    for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
+        for part, kind in _OTHERS.items():
+            if str(name).startswith(part):
+                raise ValueError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}")
+    if "image_encoder.pos_embed" not in state:
+        if (path.parent / "config.json").is_file():
+            return _read_folder(path.parent)
+        raise ValueError(f"it has no image_encoder.pos_embed, which Meta's files of {_FIRST} have")
+    return published_config(state), {published_name(name): value for name, value in state.items()}
+
+
+def _read_tensors(path: Path) -> dict[str, Tensor]:
+    if path.suffix == ".safetensors":
+        return load_file(path)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def published_name(name: str) -> str:
+    """What transformers calls a parameter of Meta's files.
+
+    >>> published_name("mask_decoder.iou_prediction_head.layers.2.weight")
+    'mask_decoder.iou_prediction_head.proj_out.weight'
+    """
+    for pattern, replacement in _NAMES.items():
+        name = re.sub(pattern, replacement, name)
+    mlp = re.match(r"(.*(?:hypernetworks_mlps\.\d+|prediction_head))\.layers\.(\d)\.(.*)", name)
+    return name if mlp is None else f"{mlp[1]}.{_MLP[mlp[2]]}.{mlp[3]}"
+
+
+def published_config(state: Mapping[str, Tensor]) -> Any:
+    """transformers' SamConfig of a file of Meta's, from the shapes of its parameters.
+
+    What shapes do not tell is the same in all of Meta's: eight heads in the mask decoder, and its epsilon.
+    """
+    shape = {name: tuple(value.shape) for name, value in state.items()}
+    _, grid, _, width = shape["image_encoder.pos_embed"]
+    patch = shape["image_encoder.patch_embed.proj.weight"][-1]
+    blocks = sum(name.endswith(".attn.rel_pos_h") for name in shape)
+    reach, head = zip(*(shape[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(blocks)))
+    everywhere = [i for i in range(blocks) if reach[i] == 2 * grid - 1]
+    channels = shape["image_encoder.neck.0.weight"][0]
+    layer = "mask_decoder.transformer.layers.0"
+    transformers = import_transformers()
+    vision = transformers.SamVisionConfig(
+        hidden_size=width,
+        output_channels=channels,
+        num_hidden_layers=blocks,
+        num_attention_heads=width // head[0],
+        image_size=grid * patch,
+        patch_size=patch,
+        window_size=(min(reach) + 1) // 2,
+        global_attn_indexes=everywhere,
+        num_pos_feats=channels // 2,
+        mlp_dim=shape["image_encoder.blocks.0.mlp.lin1.weight"][0],
+    )
+    prompt = transformers.SamPromptEncoderConfig(
+        hidden_size=channels,
+        image_size=grid * patch,
+        patch_size=patch,
+        mask_input_channels=shape["prompt_encoder.mask_downscaling.3.weight"][0],
+    )
+    decoder = transformers.SamMaskDecoderConfig(
+        hidden_size=channels,
+        mlp_dim=shape[f"{layer}.mlp.lin1.weight"][0],
+        num_hidden_layers=sum(name.endswith("self_attn.q_proj.weight") for name in shape),
+        attention_downsample_rate=channels // shape[f"{layer}.cross_attn_token_to_image.q_proj.weight"][0],
+        iou_head_hidden_dim=shape["mask_decoder.iou_prediction_head.layers.0.weight"][0],
+        layer_norm_eps=1e-5,
+    )
+    return transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder)

@@ -1,0 +1,55 @@
+"""Options of the protocols. Imports nothing heavy, so that --help is quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from normlift_ns.options import WithoutDirection
+
+Masking = Literal["background", "auto", "langsplat"]
+Average = Literal["frames", "pairs", "categories"]
+MARGIN = 0.02
+"""By which a score must exceed every background word (section "Mask thresholding" of the paper; SFS's code has 0)."""
+
+
+@dataclass(frozen=True)
+class ScannetOptions:
+    """Protocol scannet; --labels gives one *_vh_clean_2.labels.ply per run."""
+
+    min_opacity: float = 0.1
+    """Gaussians with a lower opacity are not scored. 0: all are."""
+    without_direction: WithoutDirection = "first"
+    """Class of Gaussians without a direction: wall (first, as in published scripts) or no class (none). The result of
+    the other choice is reported beside it."""
+
+
+@dataclass(frozen=True)
+class LerfOptions:
+    """Protocol lerf; --labels gives one folder of label files per run."""
+
+    masking: Masking = "background"
+    """How a mask is cut from scores. background: above all background words by the margin. auto: SFS's threshold from
+    the histogram. langsplat: LERF's relevancy, scaled."""
+    margin: float = MARGIN
+    """Of --masking background. SFS's code has 0."""
+    average: Average = "frames"
+    """What is averaged first. frames: the categories of a frame, then frames. pairs: all frames and categories alike.
+    categories: the frames of a category, then categories."""
+    clean: bool = False
+    """Open, close, keep the largest component and fill its holes. SFS's code does so; the paper does not say."""
+    scale: Literal["unit", "norm"] = "unit"
+    """What is composited: cosines (unit), or cosines times ||f|| as in SFS, whose features are not normalised (norm)."""
+
+
+@dataclass(frozen=True)
+class MaskOptions:
+    """Protocol masks; --labels gives a folder of instance masks, PNG or NPY, named as the images."""
+
+    names: Path | None = None
+    """JSON file with the name of every value in the masks. By default labels.json beside their folder."""
+    purity: float = 0.75
+    """A Gaussian is scored if at least this share of its weight lies in the masks of one class."""
+    min_weight: float = 1.0
+    """A Gaussian is scored if it has at least this weight, in pixels over all training views."""

@@ -1,0 +1,25 @@
+"""`ns-train normlift-lerf-ovs`: scenes of the LERF-OVS benchmark, which are COLMAP folders with images/ and sparse/0.
+
+Its labelled frames are training views as well, so all images train; they have the size that the labels have. Features
+are those of LangSplat's preprocessing, in language_features/ of the scene; `--pipeline.source.features none` makes them
+from the photographs instead.
+"""
+
+from pathlib import Path
+
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from normlift_ns.method_configs.normlift import trainer_config
+from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+from normlift_ns.options import SourceOptions
+
+lerf_ovs_method = MethodSpecification(
+    config=trainer_config(
+        "normlift-lerf-ovs",
+        ColmapDataParserConfig(load_3D_points=True, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"),
+        NormLiftModelConfig(),
+        source=SourceOptions(features="langsplat"),
+    ),
+    description="normlift for scenes of the LERF-OVS benchmark: COLMAP folders with LangSplat's language_features/.",
+)

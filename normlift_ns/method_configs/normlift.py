@@ -1,0 +1,89 @@
+"""`ns-train normlift`, and what makes ns-viewer, ns-render and ns-export accept runs of ns-normlift.
+
+Every ns-* command imports this module while nerfstudio builds its list of methods, so it must import neither that list
+(nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils) nor anything slow or optional.
+"""
+
+from typing import Any
+
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+from normlift_ns.nerfstudio_plugin.pipeline import NormLiftPipelineConfig
+from normlift_ns.options import SourceOptions
+
+
+def trainer_config(
+    method_name: str,
+    dataparser: DataParserConfig,
+    model: NormLiftModelConfig,
+    *,
+    source: SourceOptions | None = None,
+    image_scale: float = 1.0,
+    **optimizers: Any,
+) -> TrainerConfig:
+    """splatfacto's training with a lift at its end; the viewer listens on this machine only.
+
+    Args:
+        source: what to see in the images; None: as ns-normlift.
+        image_scale: size of the images used, as a share of that on disk.
+        optimizers: in place of splatfacto's, by the name of the parameters.
+    """
+    return TrainerConfig(
+        method_name=method_name,
+        steps_per_eval_image=100,
+        steps_per_eval_batch=0,
+        steps_per_save=2000,
+        steps_per_eval_all_images=1000,
+        max_num_iterations=30000,
+        mixed_precision=False,
+        pipeline=NormLiftPipelineConfig(
+            datamanager=FullImageDatamanagerConfig(
+                dataparser=dataparser, cache_images_type="uint8", camera_res_scale_factor=image_scale
+            ),
+            model=model,
+            source=source or SourceOptions(),
+        ),
+        optimizers={**_splatfacto_optimizers(), **optimizers},
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
+        vis="viewer",
+    )
+
+
+def _splatfacto_optimizers() -> dict[str, Any]:
+    return {
+        "means": {
+            "optimizer": AdamOptimizerConfig(lr=1.6e-4, eps=1e-15),
+            "scheduler": ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=30000),
+        },
+        "features_dc": {"optimizer": AdamOptimizerConfig(lr=0.0025, eps=1e-15), "scheduler": None},
+        "features_rest": {"optimizer": AdamOptimizerConfig(lr=0.0025 / 20, eps=1e-15), "scheduler": None},
+        "opacities": {"optimizer": AdamOptimizerConfig(lr=0.05, eps=1e-15), "scheduler": None},
+        "scales": {"optimizer": AdamOptimizerConfig(lr=0.005, eps=1e-15), "scheduler": None},
+        "quats": {"optimizer": AdamOptimizerConfig(lr=0.001, eps=1e-15), "scheduler": None},
+        "camera_opt": {
+            "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
+            "scheduler": ExponentialDecaySchedulerConfig(
+                lr_final=5e-7, max_steps=30000, warmup_steps=1000, lr_pre_warmup=0
+            ),
+        },
+        "bilateral_grid": {
+            "optimizer": AdamOptimizerConfig(lr=2e-3, eps=1e-15),
+            "scheduler": ExponentialDecaySchedulerConfig(
+                lr_final=1e-4, max_steps=30000, warmup_steps=1000, lr_pre_warmup=0
+            ),
+        },
+    }
+
+
+normlift_method = MethodSpecification(
+    config=trainer_config("normlift", NerfstudioDataParserConfig(load_3D_points=True), NormLiftModelConfig()),
+    description="splatfacto, lifted at the end of its training: open-vocabulary semantics that can be asked.",
+)

@@ -1,0 +1,1 @@
+"""All that knows nerfstudio: its runs, its model, its viewer."""

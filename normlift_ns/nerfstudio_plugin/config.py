@@ -1,0 +1,252 @@
+"""config.yml of a nerfstudio run: reading it safely, and finding its files from wherever the program was started."""
+
+from __future__ import annotations
+
+import os
+from copy import deepcopy
+from dataclasses import dataclass, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import yaml
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+
+from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+from normlift_ns.runs.files import FIELD_FOLDER
+
+SUPPORTED_METHODS = ("splatfacto", "splatfacto-big", "normlift", "normlift-lerf-ovs", "normlift-scannet")
+_TRUSTED_PACKAGES = ("nerfstudio", "normlift_ns", "torch.optim")
+_OBJECT_TAG = "tag:yaml.org,2002:python/object"
+
+
+class _ConfigLoader(yaml.FullLoader):
+    """Constructs what nerfstudio's configs consist of, and refuses everything else.
+
+    nerfstudio reads config.yml with `yaml.Loader`, which imports any module and calls any function that the file names.
+    Here a name must be a class of nerfstudio, normlift_ns or torch.optim, and an object must be a dataclass, an enum or
+    a path; no other code runs.
+    """
+
+    def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> type:
+        if not _trusted(name):
+            raise yaml.constructor.ConstructorError(None, None, f"{name} is not a class of nerfstudio", mark)
+        found = super().find_python_name(name, mark, unsafe=True)
+        if not isinstance(found, type) or not _trusted(found.__module__):
+            raise yaml.constructor.ConstructorError(None, None, f"{name} is not a class of nerfstudio", mark)
+        return found
+
+    def make_python_instance(
+        self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False, unsafe: bool = False
+    ) -> Any:
+        if suffix.startswith("pathlib.") and suffix.endswith("Path"):
+            return Path(*(args or ()))  # also the paths of another operating system
+        cls = self.find_python_name(suffix, node.start_mark)
+        if is_dataclass(cls) and newobj:
+            return cls.__new__(cls)
+        if issubclass(cls, Enum) and not newobj:
+            return cls(*args)
+        raise yaml.constructor.ConstructorError(None, None, f"{suffix} is no part of a configuration", node.start_mark)
+
+
+_ConfigLoader.add_multi_constructor(f"{_OBJECT_TAG}:", _ConfigLoader.construct_python_object)
+_ConfigLoader.add_multi_constructor(f"{_OBJECT_TAG}/apply:", _ConfigLoader.construct_python_object_apply)
+
+
+def _trusted(name: str) -> bool:
+    return any(name == package or name.startswith(f"{package}.") for package in _TRUSTED_PACKAGES)
+
+
+def read_config(path: Path) -> TrainerConfig:
+    """Reads config.yml of a splatfacto or normlift run, with the paths as they stand in the file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not a config that nerfstudio wrote, a method that cannot be lifted, or a config that names anything
+            but nerfstudio's own configuration classes.
+    """
+    if not path.is_file():
+        hint = f"; {path / 'config.yml'} exists, give that" if (path / "config.yml").is_file() else ""
+        raise FileNotFoundError(
+            f"No config at {path}{hint}. Expected the config.yml that ns-train wrote, "
+            "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
+        )
+    expected = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+    try:
+        text = path.read_text("utf8")
+        root = yaml.compose(text, Loader=_ConfigLoader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{path} is not a nerfstudio config: it is no valid YAML ({_brief(error)}). {expected}"
+        ) from error
+    method = _method_name(root)
+    if method is None:
+        raise ValueError(f"{path} is not a nerfstudio config: it has no method_name. {expected}")
+    if method not in SUPPORTED_METHODS:
+        raise ValueError(
+            f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
+            "Train the capture with: ns-train splatfacto --data ..."
+        )
+    try:
+        config = yaml.load(text, Loader=_ConfigLoader)
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} cannot be read: {_brief(error)}. Only the configuration classes of nerfstudio, normlift_ns and "
+            "torch.optim are read; runs that use a plugin's dataparser or datamanager are not supported."
+        ) from error
+    _check_types(config, path)
+    return config
+
+
+def _method_name(root: yaml.Node | None) -> str | None:
+    """method_name of a config of any method, read without constructing anything."""
+    if not isinstance(root, yaml.MappingNode) or not root.tag.startswith(f"{_OBJECT_TAG}:"):
+        return None
+    for key, value in root.value:
+        if isinstance(key, yaml.ScalarNode) and key.value == "method_name" and isinstance(value, yaml.ScalarNode):
+            return value.value
+    return None
+
+
+def _brief(error: Exception) -> str:
+    """One line of a YAML error: what and where."""
+    if isinstance(error, yaml.MarkedYAMLError):
+        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
+        return f"{error.problem}{line}"
+    return " ".join(str(error).split())
+
+
+def _check_types(config: Any, path: Path) -> None:
+    parts = (
+        ("config", config, (TrainerConfig,)),
+        ("pipeline.datamanager", _get(config, "pipeline", "datamanager"), (FullImageDatamanagerConfig,)),
+        ("pipeline.model", _get(config, "pipeline", "model"), (SplatfactoModelConfig, NormLiftModelConfig)),
+    )
+    for name, part, accepted in parts:
+        if type(part) not in accepted:
+            raise ValueError(
+                f"{path} says method {config.method_name!r}, but its {name} is a {type(part).__name__}, expected "
+                f"{' or '.join(cls.__name__ for cls in accepted)}; only stock splatfacto runs can be lifted. "
+                "Train the capture with: ns-train splatfacto --data ..."
+            )
+
+
+def _get(value: Any, *names: str) -> Any:
+    for name in names:
+        value = getattr(value, name, None)
+    return value
+
+
+@dataclass(frozen=True)
+class RunLocation:
+    """Where the files of a run are now; all paths absolute."""
+
+    run_dir: Path
+    """The folder of config.yml."""
+    output_dir: Path
+    """Where runs of this experiment go: the folder above experiment/method/timestamp, outputs/ by default."""
+    root: Path | None
+    """Working directory of the training, which stock ns-* commands must be run from; None where output_dir is absolute
+    or the run was moved, so that its place does not tell."""
+    data: Path
+    """The dataset: a folder or a .json file."""
+    moved_data: bool
+    """True where `data` is not what the config, read from `root`, says."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the dataset."""
+        return self.data.parent if self.data.suffix == ".json" else self.data
+
+    def portable(self, path: Path) -> Path:
+        """The path as it should stand in a config: relative to `root` where it lies below it, else absolute."""
+        return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
+
+
+def locate(config: TrainerConfig, config_path: Path, data: Path | None = None) -> RunLocation:
+    """Finds the files of a run from where its config.yml lies, whatever the current directory.
+
+    nerfstudio writes output_dir, data and others relative to the directory of the training, which config.yml does not
+    name; but it lies in output_dir/experiment/method/timestamp, so the directory can be told.
+
+    Args:
+        data: where the dataset is now; relative to the current directory. None: where the config says.
+    Raises:
+        FileNotFoundError: no dataset there; the message names every place tried.
+    """
+    run_dir = _absolute(config_path).parent
+    above = _without_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
+    output_dir = _absolute(config.output_dir) if above is None else above
+    root = None if above is None else _without_tail(above, Path(os.path.normpath(config.output_dir)))
+    if data is not None:
+        if not data.exists():
+            raise FileNotFoundError(
+                f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
+                "transforms.json that ns-train got."
+            )
+        return RunLocation(run_dir, output_dir, root, _absolute(data), moved_data=True)
+    stored = stored_data(config)
+    roots = [root] if root is not None else list(output_dir.parents)
+    tried = list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
+    for place in tried:
+        if place.exists():
+            moved = root is None or place != _absolute(root / stored)
+            return RunLocation(run_dir, output_dir, root, place, moved_data=moved)
+    raise FileNotFoundError(
+        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config says {str(stored)!r}. "
+        "If it was moved, say where it is with --data."
+    )
+
+
+def _without_tail(path: Path, tail: Path) -> Path | None:
+    """`path` without the relative path that it ends in; None if it does not."""
+    count = len(path.parts) - len(tail.parts)
+    return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
+
+
+def stored_data(config: TrainerConfig) -> Path:
+    """The dataset as the config names it."""
+    datamanager: Any = config.pipeline.datamanager
+    return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))
+
+
+def rerooted(config: TrainerConfig, config_path: Path, data: Path | None = None) -> TrainerConfig:
+    """A copy of the config with absolute paths, which works from any directory, and without seed points.
+
+    Serves stock nerfstudio too: `eval_setup(path, update_config_callback=lambda config: rerooted(config, path))`.
+
+    Raises:
+        FileNotFoundError: as `locate`.
+    """
+    location = locate(config, config_path, data)
+    config = deepcopy(config)
+    set_data(config, location.data)
+    skip_seed_points(config)
+    if location.root is not None:
+        config.output_dir = location.root / config.output_dir
+    config.relative_model_dir = location.run_dir / config.relative_model_dir
+    model: Any = config.pipeline.model
+    if isinstance(model, NormLiftModelConfig) and model.semantics is not None:
+        model.semantics = location.run_dir / FIELD_FOLDER
+    return config
+
+
+def set_data(config: TrainerConfig, data: Path) -> None:
+    """Changes the dataset in the three places where nerfstudio keeps it."""
+    datamanager: Any = config.pipeline.datamanager
+    config.data = datamanager.data = datamanager.dataparser.data = data
+
+
+def skip_seed_points(config: TrainerConfig) -> None:
+    """Keeps the dataparser from reading the point cloud that a training starts from; a trained run needs none."""
+    dataparser: Any = config.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
+    if hasattr(dataparser, "load_3D_points"):
+        dataparser.load_3D_points = False
+    if hasattr(dataparser, "ply_path"):
+        dataparser.ply_path = None

@@ -1,0 +1,219 @@
+"""A trained splatfacto run as a `Scene` of the core. Needs no CUDA and builds no model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.nerfstudio_plugin.appearance import LOADED_STEP, background, shading_degree, view_colors
+from normlift_ns.nerfstudio_plugin.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
+from normlift_ns.nerfstudio_plugin.config import RunLocation, locate, read_config, rerooted, stored_data
+from normlift_ns.nerfstudio_plugin.views import DatasetViews
+from normlift_ns.options import RasterizeMode
+
+_TRANSFORM_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class NerfstudioScene:
+    """A `Scene`: a trained run of splatfacto (or a lifted copy of one), on the CPU."""
+
+    config: TrainerConfig
+    """The config as it stands in the file; paths are those of the training."""
+    location: RunLocation
+    """Where the files are now."""
+    checkpoint: Checkpoint
+    gaussians: GaussianScene
+    """The Gaussians, activated; none cropped away."""
+    train: DatasetViews
+    """Photographs that the run was trained with; where it optimised the camera poses, with the optimised ones."""
+    held_out: DatasetViews
+    """Photographs kept for evaluation."""
+    dataparser_transform: Float[Tensor, "3 4"]
+    dataparser_scale: float
+    """From the poses in the dataset to the scene's world: scale * (transform @ point)."""
+
+    renderer = None
+    """normlift_ns draws as splatfacto does."""
+
+    @property
+    def name(self) -> str:
+        """The experiment name."""
+        return str(self.config.experiment_name)
+
+    @property
+    def checkpoint_path(self) -> Path:
+        """The checkpoint that the Gaussians come from."""
+        return self.checkpoint.path
+
+    @property
+    def runs_dir(self) -> Path:
+        """The folder above the runs of this experiment, outputs/ by default."""
+        return self.location.output_dir
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Config and step, for the manifest."""
+        return {"source_config": str(self.location.run_dir / "config.yml"), "source_step": self.checkpoint.step}
+
+    @property
+    def background(self) -> Float[Tensor, " 3"]:
+        """RGB in 0..1 behind the Gaussians."""
+        return background(self.model_config)
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """gauss_params of the checkpoint by name."""
+        prefix, state = "gauss_params.", self.checkpoint.model
+        return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+    @property
+    def has_harmonics(self) -> bool:
+        """Whether colours depend on the view."""
+        return self.model_config.sh_degree > 0
+
+    @property
+    def rasterize_mode(self) -> RasterizeMode:
+        """How the run was rasterized; lifts must do the same."""
+        return self.model_config.rasterize_mode
+
+    @cached_property
+    def coefficients(self) -> Float[Tensor, "n k 3"]:
+        """Spherical harmonics of the colours, features_dc and features_rest in one."""
+        return torch.cat([self.parameters["features_dc"][:, None], self.parameters["features_rest"]], dim=1)
+
+    def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
+        """RGB >= 0 of every Gaussian as the camera sees it."""
+        degree = shading_degree(self.model_config, LOADED_STEP)
+        return view_colors(self.gaussians.means, self.coefficients, camera, degree)
+
+    @property
+    def model_config(self) -> SplatfactoModelConfig:
+        """The model's part of the config."""
+        return cast(SplatfactoModelConfig, self.config.pipeline.model)
+
+
+def load_scene(load_config: Path, *, data: Path | None = None, load_step: int | None = None) -> NerfstudioScene:
+    """Loads a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
+
+    Reads nothing but config, checkpoint and the dataset's transforms; photographs are read as they are asked for.
+
+    Args:
+        load_config: config.yml of the run, in output_dir/experiment/method/timestamp.
+        data: where the dataset is now, if it was moved.
+        load_step: step of the checkpoint; None: the last.
+    Raises:
+        FileNotFoundError: config, checkpoint, dataset or an image is missing.
+        ValueError: a config of another method or program, a damaged checkpoint, another dataset than the run's.
+    """
+    stored = read_config(load_config)
+    location = locate(stored, load_config, data)
+    config = rerooted(stored, load_config, data)
+    checkpoint = read_checkpoint(find_checkpoint(config.relative_model_dir, load_step))
+    datamanager = _datamanager(config)
+    outputs = datamanager.train_dataparser_outputs
+    _check_images([*outputs.image_filenames, *(outputs.mask_filenames or ())], location)
+    _check_transform(outputs.dataparser_transform, outputs.dataparser_scale, location)
+    model = cast(SplatfactoModelConfig, config.pipeline.model)
+    train, held_out = (
+        DatasetViews(dataset, location.folder, poses, background(model))
+        for dataset, poses in (
+            (datamanager.train_dataset, _training_poses(datamanager.train_dataset.cameras, model, checkpoint)),
+            (datamanager.eval_dataset, datamanager.eval_dataset.cameras.camera_to_worlds),
+        )
+    )
+    transform, scale = outputs.dataparser_transform, float(outputs.dataparser_scale)
+    return NerfstudioScene(stored, location, checkpoint, _scene(checkpoint.model), train, held_out, transform, scale)
+
+
+def _scene(state: Mapping[str, Tensor]) -> GaussianScene:
+    return GaussianScene(
+        means=state["gauss_params.means"],
+        quats=state["gauss_params.quats"],
+        scales=state["gauss_params.scales"].exp(),
+        opacities=state["gauss_params.opacities"].sigmoid().squeeze(-1),
+    )
+
+
+def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
+    """nerfstudio's own, in test mode: "inference" would switch the downscaling of the images off."""
+    data = stored_data(config)
+    try:
+        return config.pipeline.datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"{error.filename} is missing from the dataset {data}. Expected the dataset that the run was trained with; "
+            "say where it is with --data."
+        ) from error
+    except (AssertionError, LookupError, OSError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"nerfstudio cannot read the dataset {data} ({type(error).__name__}: {error}). Expected the dataset that "
+            "the run was trained with; say where it is with --data."
+        ) from error
+
+
+def _check_images(files: Sequence[Path], location: RunLocation) -> None:
+    """A lift takes minutes; a file that is missing should show before."""
+    missing = [file for file in files if not file.exists()]
+    if missing:
+        raise FileNotFoundError(
+            f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing, the first is "
+            f"{missing[0]}. Put them back, or say where the dataset is with --data."
+        )
+
+
+def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: RunLocation) -> None:
+    """The dataset must give the world that the Gaussians live in: nerfstudio derives it from all poses together."""
+    file = location.run_dir / "dataparser_transforms.json"
+    if not file.exists():
+        return
+    trained = json.loads(file.read_text("utf8"))
+    gap = _world(torch.tensor(trained["transform"]), trained["scale"]) - _world(transform, scale)
+    if float(gap.abs().max()) > _TRANSFORM_TOLERANCE or abs(scale / trained["scale"] - 1) > _TRANSFORM_TOLERANCE:
+        raise ValueError(
+            f"The dataset {location.data} is not the one that {location.run_dir} was trained with: its poses give "
+            f"scale {scale:.6g}, the training had {trained['scale']:.6g}, and the world coordinates differ by up to "
+            f"{float(gap.abs().max()):.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json "
+            "or name the right dataset with --data."
+        )
+
+
+def _world(transform: Tensor, scale: float) -> Tensor:
+    """Rotation, and the translation in scene units."""
+    return transform * torch.tensor([1.0, 1.0, 1.0, scale])
+
+
+def _training_poses(cameras: Cameras, model: SplatfactoModelConfig, checkpoint: Checkpoint) -> Float[Tensor, "v 3 4"]:
+    """Poses that the Gaussians fit: where the run optimised its cameras, splatfacto applies that in training only."""
+    if model.camera_optimizer.mode == "off":
+        return cameras.camera_to_worlds
+    adjustment = checkpoint.model.get("camera_optimizer.pose_adjustment")
+    if adjustment is None or len(adjustment) != len(cameras):
+        raise ValueError(
+            f"The run optimised its camera poses (mode {model.camera_optimizer.mode}), but {checkpoint.path} has "
+            f"{0 if adjustment is None else len(adjustment)} of them for {len(cameras)} training images. Use the "
+            "checkpoint and the dataset of the run; say where the dataset is with --data."
+        )
+    optimizer = model.camera_optimizer.setup(num_cameras=len(adjustment), device="cpu")
+    poses = []
+    with torch.no_grad():
+        optimizer.pose_adjustment.copy_(adjustment)
+        for i in range(len(cameras)):
+            camera = cameras[i : i + 1]
+            camera.metadata = {"cam_idx": i}
+            poses.append(optimizer.apply_to_camera(camera))
+    return torch.cat(poses)

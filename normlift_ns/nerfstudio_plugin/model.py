@@ -1,0 +1,217 @@
+"""splatfacto's model with a semantic field attached: what ns-viewer, ns-render, ns-eval and ns-export load."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from torch import Tensor
+
+from normlift_ns.asking import Question
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.picking import ray_weights
+from normlift_ns.nerfstudio_plugin.appearance import shading_degree, view_colors
+from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
+from normlift_ns.nerfstudio_plugin.panel import Panel
+from normlift_ns.nerfstudio_plugin.views import to_camera
+from normlift_ns.raster.rasterize import render
+from normlift_ns.runs.files import with_paths
+from normlift_ns.runs.question import load_question
+from normlift_ns.viewer.display import Display, draw
+
+
+@dataclass
+class NormLiftModelConfig(SplatfactoModelConfig):
+    """splatfacto with the semantics that ns-normlift lifted onto its Gaussians."""
+
+    _target: type = field(default_factory=lambda: NormLiftModel)
+    semantics: Path | None = None
+    """Folder of the semantic field (the normlift/ folder of a lifted run); none: plain splatfacto."""
+
+    @staticmethod
+    def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
+        """The same model with a field: every field of the config is taken over."""
+        values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
+        return NormLiftModelConfig(**values, semantics=semantics)
+
+
+class NormLiftModel(SplatfactoModel):
+    """splatfacto that loads without LPIPS weights and without CUDA, and renders scalars of its Gaussians.
+
+    On CUDA all but the scalars is stock splatfacto. On the CPU, where splatfacto cannot render, normlift_ns does.
+    """
+
+    config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
+
+    def populate_modules(self) -> None:
+        """As splatfacto's, without what it needs CUDA or a download for; with the panel of the viewer."""
+        if not torch.cuda.is_available():
+            self.seed_points = None  # splatfacto moves them to CUDA; a checkpoint brings its own Gaussians
+        with _lazy_lpips():
+            super().populate_modules()
+        self._field: SemanticField | None = None
+        self._display: Display | None = None
+        self.normlift = Panel(self)
+
+    @property
+    def on_cpu(self) -> bool:
+        """True where normlift_ns renders; stock splatfacto needs CUDA."""
+        return self.device.type == "cpu"
+
+    @property
+    def field(self) -> SemanticField | None:
+        """The attached field, on the model's device."""
+        return self._field
+
+    def load_state_dict(self, dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
+        """Loads a splatfacto or normlift checkpoint, then the field that the config names.
+
+        Raises:
+            FileNotFoundError, ValueError: no field there, a damaged one, or one of other Gaussians.
+        """
+        super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
+        if self.config.semantics is not None:
+            folder = self.config.semantics
+            self.attach(with_paths(SemanticField.load(folder, self.means), folder), load_question(folder))
+        if self.on_cpu:
+            compile_renderer()
+
+    def attach(self, semantic_field: SemanticField, question: Question | None = None) -> None:
+        """Renders a field and the answer to a question from now on, and lets the panel ask it."""
+        self._field = semantic_field.to(self.device)
+        self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
+
+    def detach(self) -> None:
+        """Forgets the field, because the Gaussians are about to change."""
+        self.config.semantics = self._field = self._display = None
+        self.normlift.close()
+
+    def show(self, display: Display | None) -> None:
+        """Replaces what is drawn besides the colours. Safe to call while another thread renders."""
+        self._display = display
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
+
+        Args:
+            camera: one camera.
+            obb_box: Gaussians outside are not drawn.
+        """
+        display = self._display
+        rows = self.rows_in(obb_box, display)
+        view = _opencv(camera.to(self.device))
+        values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
+        if self.on_cpu:
+            outputs, scalars = self._render_on_cpu(view, values, rows)
+        else:
+            outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
+            outputs["background"] = outputs["background"].expand(view.height, view.width, 3)  # [3] where all is cropped
+            scalars = self._scalars_by_gsplat(view, values, rows)
+        self.set_crop(obb_box)
+        if display is None:
+            return outputs
+        return {**outputs, **draw(display, outputs["rgb"], scalars, outputs["accumulation"][:, :, 0])}
+
+    def rows_in(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
+        """The Gaussians that are drawn: inside the box, and not hidden; None: all."""
+        drawn = None if display is None else display.drawn
+        if obb_box is None:
+            return drawn
+        inside = obb_box.within(self.means.detach()).reshape(-1)
+        return inside if drawn is None else inside & drawn
+
+    def in_sight(self, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
+        """`ray_weights` of the Gaussians that were drawn last."""
+        rows = self.rows_in(self.crop_box, self._display)
+        weights = ray_weights(self._scene(rows), origin, direction)
+        return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
+
+    def splats(self) -> tuple[Mapping[str, Tensor], bool]:
+        """The parameters for `write_splats`, and whether colours are spherical harmonics."""
+        return dict(self.gauss_params), self.config.sh_degree > 0
+
+    def _scene(self, rows: Tensor | None) -> GaussianScene:
+        parts = (self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
+        return GaussianScene(*(part.detach() if rows is None else part.detach()[rows] for part in parts))
+
+    def _render_on_cpu(self, view: Camera, values: Tensor, rows: Tensor | None) -> tuple[dict[str, Tensor], Tensor]:
+        """As `SplatfactoModel.get_outputs` outside training, with the values [N, C] in the same pass."""
+        scene = self._scene(rows)
+        coefficients = torch.cat([self.features_dc[:, None], self.features_rest], dim=1).detach()
+        if rows is not None:
+            coefficients, values = coefficients[rows], values[rows]
+        rgb = view_colors(scene.means, coefficients, view, shading_degree(self.config, self.step))
+        depth = scene.means @ view.world_to_camera[2, :3, None] + view.world_to_camera[2, 3]
+        image, alpha = render(
+            scene, view, torch.cat([rgb, depth, values], dim=1), rasterize_mode=self.config.rasterize_mode
+        )
+        alpha = alpha[:, :, None]
+        background = self._get_background_color()
+        expected_depth = image[:, :, 3:4] / alpha.clamp(min=1e-10)
+        outputs = {
+            "rgb": (image[:, :, :3] + (1 - alpha) * background).clamp(0, 1),
+            "depth": torch.where(alpha > 0, expected_depth, expected_depth.max()),
+            "accumulation": alpha,
+            "background": background.expand(view.height, view.width, 3),
+        }
+        return outputs, image[:, :, 4:]
+
+    def _scalars_by_gsplat(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
+        """sum_j A_ij value_j [H, W, C], rasterized as splatfacto rasterizes the colours."""
+        drawn, mode = values if rows is None else values[rows], self.config.rasterize_mode
+        return render(self._scene(rows), view, drawn, backend="gsplat", rasterize_mode=mode)[0]
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Stock metrics; without LPIPS where its weights cannot be had."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        if not self.lpips.available:
+            metrics = {name: value for name, value in metrics.items() if "lpips" not in name}
+        return metrics, images
+
+
+class _Rows(NamedTuple):
+    """Some Gaussians, where splatfacto expects a box that tells which points are within."""
+
+    mask: Bool[Tensor, " n"]
+
+    def within(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        return self.mask
+
+
+def compile_renderer() -> None:
+    """Compiles the CPU rasterizer now: the viewer renders under a tracer, which would slow the compiler down."""
+    scene = GaussianScene(torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1))
+    pose = torch.eye(4)
+    pose[2, 3] = 3
+    K = torch.tensor([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]])
+    render(scene, Camera(K, pose, 4, 4), torch.ones(1, 4))
+
+
+def _opencv(camera: Cameras) -> Camera:
+    pose, intrinsics = camera.camera_to_worlds.reshape(3, 4), camera.get_intrinsics_matrices().reshape(3, 3)
+    return to_camera(pose, intrinsics, int(camera.width.item()), int(camera.height.item()))
+
+
+@contextmanager
+def _lazy_lpips() -> Iterator[None]:
+    """splatfacto builds LPIPS, which downloads AlexNet, before anything else; here it gets `LazyLpips` in its place."""
+    from torchmetrics.image import lpip  # noqa: PLC0415 (import-light: this module is loaded by every ns-* command)
+
+    stock = lpip.LearnedPerceptualImagePatchSimilarity
+    lpip.LearnedPerceptualImagePatchSimilarity = LazyLpips
+    try:
+        yield
+    finally:
+        lpip.LearnedPerceptualImagePatchSimilarity = stock

@@ -1,0 +1,152 @@
+"""`ns-train normlift`: splatfacto's training, and a lift at its end."""
+
+from __future__ import annotations
+
+import shutil
+import traceback
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+import yaml
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from normlift_ns.asking import encoder_settings, make_question
+from normlift_ns.core.files import atomic_path
+from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.lifting import lift_scene
+from normlift_ns.nerfstudio_plugin.checkpoint import numpy_numbers
+from normlift_ns.nerfstudio_plugin.config import stored_data
+from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.nerfstudio_plugin.model import NormLiftModel
+from normlift_ns.nerfstudio_plugin.views import image_name
+from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.runs.files import FIELD_FOLDER, cache_folder
+from normlift_ns.runs.question import save_question
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer, TrainerConfig
+
+
+@dataclass
+class NormLiftPipelineConfig(VanillaPipelineConfig):
+    """splatfacto's pipeline, and what to lift when the training ends."""
+
+    _target: type = field(default_factory=lambda: NormLiftPipeline)
+    source: SourceOptions = field(default_factory=SourceOptions)
+    """What to see in the images."""
+    lift: LiftOptions = field(default_factory=LiftOptions)
+    """What to lift and how."""
+    queries: tuple[str, ...] = ()
+    """Texts to store in the run; ns-render and ns-viewer show their relevancy."""
+
+
+class NormLiftPipeline(VanillaPipeline):
+    """Trains as splatfacto does; after the last checkpoint is saved, lifts that checkpoint in the same run."""
+
+    config: NormLiftPipelineConfig
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        torch.serialization.add_safe_globals(numpy_numbers())  # nerfstudio loads its own checkpoints without, and fails
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Those of splatfacto, and the lift.
+
+        Raises:
+            ValueError, FileNotFoundError: the encoder or a query cannot be used; better known before the training.
+        """
+        callbacks = super().get_training_callbacks(training_callback_attributes)
+        trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
+        model.detach()  # of a lifted checkpoint that is trained further
+        if trainer is not None and trainer.local_rank == 0:
+            source = source_of(trainer.config)
+            folder = dataset_folder(trainer.config)
+            files = self.datamanager.train_dataset.image_filenames  # type: ignore[union-attr]
+            source.available([image_name(file, folder) for file in files])
+            if len(self.config.queries) > 0:
+                source.text(self.config.queries)
+            after = [TrainingCallbackLocation.AFTER_TRAIN]
+            callbacks.append(TrainingCallback(after, _lift_at_the_end, args=[trainer]))
+        return callbacks
+
+
+def dataset_folder(config: TrainerConfig) -> Path:
+    """The folder of the dataset, as the config names it."""
+    data = stored_data(config)
+    return data.parent if data.suffix == ".json" else data
+
+
+def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
+    """What the config says to see in the images; LangSplat's features lie in the dataset if no folder is named.
+
+    Raises:
+        ValueError, FileNotFoundError: as `make_source`; the message names the flags of ns-train.
+    """
+    options: SourceOptions = config.pipeline.source  # type: ignore[attr-defined]
+    if options.features == "langsplat" and options.features_dir is None:
+        options = replace(options, features_dir=dataset_folder(config))
+    try:
+        return make_source(options, device)
+    except FileNotFoundError as error:
+        if options.features != "langsplat":
+            raise
+        raise FileNotFoundError(
+            f"{error}. Write them there with LangSplat's preprocessing, name their folder with "
+            "--pipeline.source.features-dir, or look at the photographs instead: --pipeline.source.features none"
+        ) from error
+
+
+def _lift_at_the_end(trainer: Trainer, step: int) -> None:
+    """Nothing that goes wrong here reaches the training, which is complete and saved."""
+    config = trainer.base_dir / "config.yml"
+    try:
+        lift_trained(trainer)
+    except Exception:  # whatever it is
+        if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
+            shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
+        traceback.print_exc()
+        CONSOLE.rule("Error", style="red")
+        CONSOLE.print(
+            f"The training is complete and saved, but lifting it at step {step} failed, see above. "
+            f"Lift it again with: ns-normlift --load-config {config}",
+            soft_wrap=True,
+        )
+
+
+def lift_trained(trainer: Trainer) -> Path:
+    """Lifts the last checkpoint of a trainer, writes the field and its config into the run, and shows it in the viewer.
+
+    Returns:
+        Folder of the field.
+    """
+    pipeline: Any = trainer.pipeline
+    options, path = pipeline.config, trainer.base_dir / "config.yml"
+    CONSOLE.print("Lifting the trained scene")
+    scene = load_scene(path)
+    source = source_of(trainer.config, str(pipeline.device))
+    encoder = encoder_settings(options.source)
+    device = "cuda" if pipeline.device.type == "cuda" else "cpu"
+    result = lift_scene(scene, source, options.lift, cache_folder(path.parent), device=device, encoder=encoder)
+    folder = trainer.base_dir / FIELD_FOLDER
+    result.field.save(folder, overwrite=True)
+    question = None
+    if len(options.queries) > 0:
+        question = make_question(result.field, source, options.queries)
+        save_question(folder, question)
+    trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.dump(trainer.config), "utf8")
+    with trainer.train_lock:
+        pipeline.model.attach(result.field, question)
+    viewer: Any = trainer.viewer_state
+    if hasattr(viewer, "_trigger_rerender"):
+        viewer._trigger_rerender()
+    CONSOLE.print(f"Lifted: {folder}. Ask it with: ns-normlift-query --load-config {path} --text ...", soft_wrap=True)
+    return folder

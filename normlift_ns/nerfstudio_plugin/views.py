@@ -1,0 +1,140 @@
+"""The photographs of a run as splatfacto trained on them: undistorted, with the cameras that belong to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.scene import View
+
+_DRAWN_AS_PINHOLE = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
+
+
+def to_camera(
+    camera_to_world: Float[Tensor, "3 4"], intrinsics: Float[Tensor, "3 3"], width: int, height: int
+) -> Camera:
+    """nerfstudio's OpenGL pose (x right, y up, z backward) as an OpenCV camera, by splatfacto's own steps."""
+    rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
+    pose = torch.eye(4, dtype=camera_to_world.dtype, device=camera_to_world.device)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ camera_to_world[:, 3]
+    return Camera(intrinsics.to(pose.device), pose, width, height)  # nerfstudio makes intrinsics on the CPU
+
+
+class DatasetViews:
+    """`Views`: photographs of one split of a dataset, in dataset order; each is read and undistorted when it is asked for.
+
+    Images, masks and intrinsics are those of `FullImageDatamanager.cached_train`, which holds all of them in memory
+    (and pins that memory, which needs CUDA).
+
+    Args:
+        dataset: a split as nerfstudio's datamanager made it; is not changed.
+        folder: where the dataset lies, for `names`.
+        poses: camera-to-world poses [V, 3, 4] in OpenGL convention; the dataset's, or as the training optimised them.
+        background: RGB in 0..1 behind images with an alpha channel.
+    """
+
+    def __init__(
+        self,
+        dataset: InputDataset,
+        folder: Path,
+        poses: Float[Tensor, "v 3 4"],
+        background: Float[Tensor, " 3"],
+    ) -> None:
+        self._dataset = dataset
+        self._poses = poses
+        self._background = background
+        self.files = list(dataset.image_filenames)
+        """Image files, absolute."""
+        self.names = [image_name(file, folder) for file in self.files]
+        """Image files relative to the dataset, with forward slashes."""
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[View]:
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, index: int) -> View:
+        """Reads one photograph.
+
+        Raises:
+            FileNotFoundError, ValueError: a file that is missing, cannot be read or has another size than its camera;
+                the message names it.
+        """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"view {index} of {len(self)}")
+        index %= len(self)
+        data = self._read(index)
+        image, _, mask = _undistorted(self._dataset.cameras, index, data)
+        if image.shape[2] == 4:
+            alpha = image[:, :, 3:].float() / 255
+            image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
+        return View(self.cameras[index], image, None if mask is None else mask[:, :, 0], self.names[index])
+
+    @cached_property
+    def cameras(self) -> list[Camera]:
+        """All cameras, those of the undistorted images; reads no image."""
+        return [self._camera(i) for i in range(len(self))]
+
+    def _camera(self, index: int) -> Camera:
+        camera = self._dataset.cameras[index].reshape(())
+        if int(camera.camera_type) not in _DRAWN_AS_PINHOLE:
+            raise ValueError(
+                f"{self.files[index]} was taken with a {CameraType(int(camera.camera_type)).name} camera; splatfacto "
+                "draws perspective and fisheye cameras only."
+            )
+        blank = torch.zeros(int(camera.height), int(camera.width), 3, dtype=torch.uint8)
+        image, intrinsics, _ = _undistorted(self._dataset.cameras, index, {"image": blank})
+        return to_camera(self._poses[index], intrinsics, image.shape[1], image.shape[0])
+
+    def _read(self, index: int) -> dict[str, Any]:
+        file, camera = self.files[index], self._dataset.cameras[index]
+        try:
+            data = self._dataset.get_data(index, image_type="uint8")
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                f"{error.filename} is missing, which the dataset names. Put it back, or say where the dataset is "
+                "with --data."
+            ) from error
+        except (OSError, SyntaxError, ValueError, AssertionError) as error:
+            raise ValueError(
+                f"{file} or its mask cannot be read ({error}). Expected an 8-bit image; copy it again from the capture."
+            ) from error
+        found, expected = tuple(data["image"].shape[1::-1]), (int(camera.width), int(camera.height))
+        if found != expected:
+            raise ValueError(
+                f"{file} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} (width x height). "
+                "Use the images that the run was trained with."
+            )
+        return data
+
+
+def _undistorted(
+    cameras: Cameras, index: int, data: dict[str, Any]
+) -> tuple[UInt8[Tensor, "h w c"], Float[Tensor, "3 3"], Bool[Tensor, "h w 1"] | None]:
+    """Image, intrinsics and mask by nerfstudio's undistortion, as `FullImageDatamanager` does it for every image."""
+    camera = cameras[index].reshape(())
+    intrinsics = camera.get_intrinsics_matrices()
+    if camera.distortion_params is None or bool((camera.distortion_params == 0).all()):
+        return data["image"], intrinsics, data.get("mask")
+    distortion = camera.distortion_params.numpy()
+    matrix, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics.numpy())
+    pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
+    return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
+
+
+def image_name(file: Path, folder: Path) -> str:
+    """The file relative to the folder of its dataset, with forward slashes."""
+    return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()

@@ -1,0 +1,163 @@
+"""What the views of a scene say about its Gaussians: evidence and feature rows, block by block, kept in a cache."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int32, UInt8
+from torch import Tensor
+
+from normlift_ns.core.evidence import MASKED, Evidence
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.scene import Scene, View
+from normlift_ns.encoders.source import FeatureSource, each_view
+from normlift_ns.options import RasterizeMode
+from normlift_ns.raster.rasterize import rasterize_evidence, render_picture
+from normlift_ns.raster.settings import RasterSettings
+
+BLOCK = 16
+"""Views per file of evidence: what an interrupted run may lose."""
+_KEY = "normlift_ns.block/3"
+"""Part of every key: to be raised when evidence changes for the same input."""
+
+
+class Block(NamedTuple):
+    """Some views as the rasterizer and the lift need them."""
+
+    cameras: list[Camera]
+    labels: list[Int32[Tensor, "h w"]]
+    """Cells, -1 unlabelled, -2 masked."""
+    regions: list[Int32[Tensor, "levels c"]]
+    """Region of every cell, -1 none."""
+    features: list[Float[Tensor, "r d"]]
+
+
+def spread(count: int, most: int | None) -> list[int]:
+    """At most `most` of `count` indices, evenly spread, the first and the last among them.
+
+    >>> spread(10, 4)
+    [0, 3, 6, 9]
+    """
+    if most is None or most >= count:
+        return list(range(count))
+    return torch.linspace(0, count - 1, most).round().long().tolist() if most > 1 else [0]
+
+
+def observe_views(
+    scene: Scene,
+    indices: Sequence[int],
+    source: FeatureSource,
+    *,
+    rendered: bool,
+    divisor: int,
+    done: Callable[[View], None],
+) -> Block:
+    """Labels and features of some training views.
+
+    Args:
+        rendered: look at the trained scene rendered from the cameras instead of at the photographs.
+        divisor: of the size of images and cameras.
+        done: called after every view, with the view as the source saw it.
+    """
+    waiting: deque[View] = deque()
+
+    def images() -> Iterator[tuple[Tensor, str]]:
+        for index in indices:
+            view = scene.train[index]
+            view = view._replace(image=render_picture(scene, view.camera)) if rendered else view
+            waiting.append(_smaller(view, divisor) if divisor > 1 else view)
+            yield waiting[-1].image, view.name
+
+    block = Block([], [], [], [])
+    for found in each_view(source, images()):
+        view = waiting.popleft()
+        block.cameras.append(view.camera)
+        block.labels.append(found.labels if view.mask is None else found.labels.where(view.mask, MASKED))
+        block.regions.append(found.region_of_cell)
+        block.features.append(found.features)
+        done(view)
+    return block
+
+
+def block_evidence(
+    gaussians: GaussianScene,
+    block: Block,
+    folder: Path,
+    *,
+    rasterize_mode: RasterizeMode,
+    weight_power: int,
+    dtype: torch.dtype,
+    reuse: bool,
+    done: Callable[[], None],
+) -> Evidence:
+    """Evidence of the regions of a block.
+
+    That of its cells, from which it is made, is taken from the folder if it was rasterized before with the same scene,
+    cameras and labels, whatever the regions and features were.
+    """
+    settings, counts = RasterSettings(), [regions.shape[1] for regions in block.regions]
+    facts = [_KEY, rasterize_mode, weight_power, str(dtype), asdict(settings), counts]
+    tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, *block.labels]
+    tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
+    path = folder / f"{_digest(facts, tensors)}.safetensors"
+    if reuse and path.exists():
+        try:
+            evidence = Evidence.load(path).to(gaussians.means.device)
+            for _ in block.cameras:
+                done()
+            return _of_regions(evidence, block)
+        except ValueError:  # damaged: rasterize again
+            path.unlink()
+    evidence = rasterize_evidence(
+        gaussians,
+        block.cameras,
+        block.labels,
+        num_regions=counts,
+        rasterize_mode=rasterize_mode,
+        weight_power=weight_power,
+        settings=settings,
+        dtype=dtype,
+        progress=lambda *_: done(),
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    evidence.save(path)
+    return _of_regions(evidence, block)
+
+
+def _of_regions(evidence: Evidence, block: Block) -> Evidence:
+    counts = torch.tensor([0, *(len(rows) for rows in block.features)])
+    first = counts.cumsum(0).tolist()
+    columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]
+    region_view = torch.repeat_interleave(torch.arange(len(block.features)), counts[1:])
+    return evidence.regroup(torch.cat(columns, dim=1), region_view.int())
+
+
+def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
+    key = blake2b(json.dumps(facts).encode(), digest_size=16)
+    for tensor in tensors:
+        key.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
+        key.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return key.hexdigest()
+
+
+def _smaller(view: View, divisor: int) -> View:
+    """The view at a fraction of its size: pixels are averaged, a mask keeps what it keeps throughout."""
+    camera = view.camera
+    height, width = max(1, camera.height // divisor), max(1, camera.width // divisor)
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
+    mask = None if view.mask is None else _averaged(view.mask[:, :, None], height, width)[:, :, 0] > 0.999
+    image: UInt8[Tensor, "h w 3"] = _averaged(view.image, height, width).round().to(torch.uint8)
+    smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
+    return view._replace(camera=smaller, image=image, mask=mask)
+
+
+def _averaged(image: Tensor, height: int, width: int) -> Tensor:
+    channels_first = image.permute(2, 0, 1)[None].float()
+    return torch.nn.functional.interpolate(channels_first, (height, width), mode="area")[0].permute(1, 2, 0)

@@ -1,0 +1,192 @@
+"""Everything that a user can choose, as plain dataclasses. Imports nothing heavy, so that --help is quick.
+
+The docstring under a field is the help of its flag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+RasterizeMode = Literal["classic", "antialiased"]
+"""How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
+Storage = Literal["evidence", "float16", "low_rank"]
+"""How directions are stored: the evidence itself (exact), float16, or float16 coordinates in a basis."""
+Rule = Literal["cosine", "lerf", "margin"]
+"""How the relevancy of a text follows from cosines; see `normlift_ns.relevancy`."""
+Unlabeled = Literal["ignore", "dilute"]
+"""What a pixel without a region counts as: nothing at all, or an observation of the zero vector."""
+
+EncoderName = Literal["open_clip", "colour"]
+RegionsName = Literal["auto", "sam", "patches", "superpixel", "grid", "files"]
+FeaturesName = Literal["none", "langsplat"]
+Fill = Literal["black", "white"]
+Missing = Literal["error", "skip"]
+
+DEFAULT_MODEL, DEFAULT_PRETRAINED = "ViT-B-16", "laion2b_s34b_b88k"
+"""Of OpenCLIP."""
+DEFAULT_SAM = "facebook/sam-vit-huge"
+THRESHOLDS: dict[Rule, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
+"""Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
+WithoutDirection = Literal["none", "first"]
+"""Class of a Gaussian without a direction, where one is scored: none, or the first."""
+REACH, MIN_SIZE = 4.0, 20
+"""How far apart Gaussians of one object may be, in units of the selection's median spacing, and how many it needs."""
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What the images show: an encoder, and the regions that it looks at."""
+
+    encoder: EncoderName = "open_clip"
+    """open_clip: CLIP features of masked crops, or of patches. colour: mean colours against colour names, without
+    learned weights."""
+    encoder_model: str = DEFAULT_MODEL
+    """Architecture of the open_clip encoder."""
+    encoder_pretrained: str = DEFAULT_PRETRAINED
+    """Weights of the open_clip encoder: a tag to download, or a local file of that architecture."""
+    crop_fill: Fill = "black"
+    """Colour around a region in the crop that the open_clip encoder sees."""
+    text_template: str = "{}"
+    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
+    seven templates. By default the bare text."""
+    regions: RegionsName = "auto"
+    """sam: SAM's masks. patches: the patches of a CLIP vision transformer, each with a feature of its own. superpixel:
+    SLIC superpixels. grid: squares. files: label maps from --regions-dir. auto: files if --regions-dir is given, sam if
+    --sam-model is. Otherwise, for open_clip, sam on a GPU if its weights are on this machine, else patches where the
+    model has them; superpixel for all other encoders."""
+    region_count: int | None = None
+    """Approximate number of regions per image. By default 256 for superpixel and grid, 1024 for patches."""
+    sam_model: str | None = None
+    """Weights of SAM: a folder in the format of transformers, a file published by Meta, or a name to download. By
+    default facebook/sam-vit-huge, as LangSplat uses."""
+    regions_dir: Path | None = None
+    """Folder with one label map per image, PNG or NPY with the same stem."""
+    regions_background: int = 0
+    """The value in label maps that means no region. Negative values never mean one."""
+    regions_resample: bool = False
+    """Resize label maps of another size to the image's by nearest neighbour, instead of refusing them."""
+    level: str | None = None
+    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. sam and langsplat: s, m or
+    l (subparts, parts, wholes; l by default), or default (all of SAM's masks in one map). langsplat also knows sum (the
+    vectors of all levels added up)."""
+    features: FeaturesName = "none"
+    """Take regions and features from --features-dir instead of looking at images. langsplat: files of LangSplat's
+    preprocessing."""
+    features_dir: Path | None = None
+    """Folder of the features."""
+    features_missing: Missing = "error"
+    """What to do about images without features: error, or skip to leave them out of the lift."""
+    text_vectors: Path | None = None
+    """NPZ file, text -> vector, to look texts up in instead of encoding them. For imported features."""
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Parameters of the vote among neighbours.
+
+    The paper publishes no values. The defaults were fitted where the truth is known, and were checked on damage that
+    the fit had not seen: see docs/accuracy.md.
+
+    Raises:
+        ValueError: a value outside its range.
+
+    >>> RefineConfig(k=12).sigma_d
+    1.0
+    """
+
+    k: int = 36
+    """Number of neighbours K, at least 1."""
+    sigma_d: float = 1.0
+    """Width of the spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest one at
+    another place, because scenes are rescaled."""
+    tau: float = 0.95
+    """Cosine at which two directions half agree, in -1..1."""
+    gamma: float = 0.4
+    """Softness of that agreement, > 0."""
+    delta: float = 0.0
+    """Margin Delta by which the best neighbour must win, >= 0."""
+
+    def __post_init__(self) -> None:
+        for name, valid, expected in (
+            ("k", self.k >= 1, "at least 1"),
+            ("sigma_d", self.sigma_d > 0, "positive"),
+            ("tau", -1 <= self.tau <= 1, "in -1..1"),
+            ("gamma", self.gamma > 0, "positive"),
+            ("delta", self.delta >= 0, "not negative"),
+        ):
+            if not valid:
+                raise ValueError(f"RefineConfig.{name} must be {expected}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class LiftOptions:
+    """What to lift and how.
+
+    Raises:
+        ValueError: a number out of range.
+
+    >>> LiftOptions(max_views=8).storage
+    'auto'
+    """
+
+    image_source: Literal["photos", "render"] = "photos"
+    """What the encoder sees: the photographs, or the trained scene rendered from their cameras."""
+    max_views: int | None = None
+    """Use at most this many training views, evenly spread. By default all."""
+    lift_downscale: int = 1
+    """Divide the size of images and cameras by this number."""
+    beta: float = 1.0
+    """Strength of the prior in the reliability, in virtual views."""
+    unlabeled: Unlabeled = "ignore"
+    """Pixels without a region: ignore them, or let them dilute as observations of nothing."""
+    weight_power: Literal[1, 2] = 1
+    """1: weights A_ij as in the paper. 2: their squares."""
+    refine: bool = True
+    """Repair unreliable Gaussians by a vote among neighbours."""
+    vote: RefineConfig = field(default_factory=RefineConfig)
+    tolerance: float = 1e-3
+    """Largest error that storage may add to any cosine."""
+    storage: Storage | Literal["auto"] = "auto"
+    """How directions are stored: evidence (exact), float16, or low_rank (coordinates in a basis). auto: the smallest
+    within the tolerance."""
+    precision: Literal["standard", "double"] = "standard"
+    """standard: float32, summed in float64 where digits cancel. double: float64 throughout, slow on a GPU."""
+    reuse_evidence: bool = True
+    """Reuse cached 2D features and evidence of earlier lifts where they fit."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("max_views", self.max_views), ("lift_downscale", self.lift_downscale)):
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Configs of version 0.1 call `storage` `form`."""
+        vars(self).update({"storage" if name == "form" else name: value for name, value in state.items()})
+
+
+@dataclass(frozen=True)
+class AskOptions:
+    """How texts are compared with the scene, and what counts as found."""
+
+    negatives: tuple[str, ...] | None = None
+    """Texts to compare with. By default LERF's (object, things, stuff, texture) for open_clip, none for colour."""
+    rule: Rule | Literal["auto"] = "auto"
+    """How relevancy is computed. cosine: the cosine itself. lerf: against each negative. margin: above the best
+    negative. auto: lerf with negatives, else cosine."""
+    threshold: float | None = None
+    """Relevancy above which a Gaussian is selected. By default 0.5 (cosine and lerf) or 0.02 (margin)."""
+    min_reliability: float = 0.0
+    """Minimum reliability of a selected Gaussian, in 0..1."""
+    refined: bool = True
+    """Use refined features."""
+    text_vectors: Path | None = None
+    """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
+    text_template: str | None = None
+    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
+    seven templates. By default as the run was lifted."""
+
+    def rules(self) -> dict[str, Any]:
+        """As `LiftedRun.ask` takes them: all but what says who reads the texts."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("text_")}

@@ -1,0 +1,156 @@
+"""The ways to rasterize: one protocol, one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, Protocol, get_args
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from normlift_ns.core.evidence import Entries
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gpu import has_triton
+from normlift_ns.raster.projection import Projected, Tiles, World, assign_tiles, project, to_world
+from normlift_ns.raster.settings import RasterSettings
+
+BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all views of one call have in common."""
+
+    scene: GaussianScene
+    antialiased: bool
+    settings: RasterSettings
+    dtype: torch.dtype
+    """Precision of the computation."""
+
+    @cached_property
+    def world(self) -> World:
+        """The drawable Gaussians, ready for any camera."""
+        return to_world(self.scene, self.dtype)
+
+    def seen_by(self, camera: Camera) -> tuple[Projected, Tiles]:
+        """What a camera sees of them, and in which tiles."""
+        projected = project(self.world, camera, self.settings, self.antialiased)
+        return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
+
+
+class Backend(Protocol):
+    """One way to rasterize. `raster.gsplat` and `raster.triton` are backends as they stand, as modules."""
+
+    def check(self, job: Job) -> None:
+        """Raises ValueError, with what to use instead, where the backend cannot do the job."""
+        ...
+
+    def views_evidence(
+        self,
+        job: Job,
+        cameras: Sequence[Camera],
+        labels: Sequence[Int32[Tensor, "h w"]],
+        num_regions: Sequence[int],
+        weight_power: int,
+    ) -> Entries:
+        """Sums of A_ij ** weight_power by (Gaussian, region) of some views of one size."""
+        ...
+
+    def composite(
+        self, job: Job, camera: Camera, values: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        """sum_j A_ij values_j and sum_j A_ij of every pixel."""
+        ...
+
+
+@dataclass(frozen=True)
+class TileBackend:
+    """A backend that goes through projected Gaussians and tile lists, one view at a time, in any precision."""
+
+    name: str
+    kernels: Any
+    """Module with `view_evidence` and `composite`."""
+    on: str | None = None
+    """The only type of device that it works on; None: any."""
+
+    def check(self, job: Job) -> None:
+        device = job.scene.means.device
+        if self.on is not None and device.type != self.on:
+            raise ValueError(
+                f'backend "{self.name}" needs a scene on the {self.on.upper()}, this one is on {device}; move it, or '
+                'use backend="torch"'
+            )
+
+    def views_evidence(
+        self,
+        job: Job,
+        cameras: Sequence[Camera],
+        labels: Sequence[Int32[Tensor, "h w"]],
+        num_regions: Sequence[int],
+        weight_power: int,
+    ) -> Entries:
+        (camera,), (label_map,), (count,) = cameras, labels, num_regions
+        return self.kernels.view_evidence(*job.seen_by(camera), label_map, count, weight_power, job.settings)
+
+    def composite(
+        self, job: Job, camera: Camera, values: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        projected, tiles = job.seen_by(camera)
+        drawn = values[projected.gaussian].to(projected.opacities.dtype)
+        return self.kernels.composite(projected, tiles, drawn, camera.width, camera.height, job.settings)
+
+
+def _torch() -> Backend:
+    from normlift_ns.raster import reference  # noqa: PLC0415 (each backend loads where it is used)
+
+    return TileBackend("torch", reference)
+
+
+def _numba() -> Backend:
+    from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
+
+    return TileBackend("numba", numba, on="cpu")
+
+
+def _gsplat() -> Backend:
+    from normlift_ns.raster import gsplat  # noqa: PLC0415
+
+    return gsplat
+
+
+def _triton() -> Backend:
+    from normlift_ns.raster import triton  # noqa: PLC0415
+
+    return triton
+
+
+BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
+"""All backends by name, in the order from the most general to the fastest."""
+
+
+def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend]:
+    """The backend of a name, checked; "auto": the fastest that can do the job.
+
+    Args:
+        pictures: composite values; False: sum evidence.
+    Raises:
+        ValueError: an unknown name, or a backend that cannot do the job.
+    """
+    if name == "auto":
+        name = _fastest(job, pictures)
+    if name not in BACKENDS:
+        raise ValueError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
+    backend = BACKENDS[name]()
+    backend.check(job)
+    return name, backend
+
+
+def _fastest(job: Job, pictures: bool) -> str:
+    if job.scene.means.device.type == "cpu":
+        return "numba"
+    if pictures or not job.scene.means.is_cuda or job.dtype != torch.float32 or job.scene.means.dtype != torch.float32:
+        return "torch"
+    return "triton" if has_triton() else "gsplat"

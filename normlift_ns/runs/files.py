@@ -1,0 +1,94 @@
+"""Where the files of a lifted run are, and how its directory appears complete or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.field import SemanticField
+
+FIELD_FOLDER = "normlift"
+"""Folder of the semantic field inside the run directory."""
+TEXTS_FILE = "texts.npz"
+"""Texts with vectors of the user's own, in the folder of the field."""
+
+
+def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> Path:
+    """Where a lifted run goes: output_dir/name/normlift/timestamp, absolute.
+
+    Args:
+        timestamp: None: now, as 2024-05-01_120000.
+    """
+    stamp = timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    return Path(os.path.abspath(output_dir)) / name / "normlift" / stamp
+
+
+def cache_folder(run_dir: Path) -> Path:
+    """Folder of 2D features, evidence and texts, shared by the lifted runs beside each other."""
+    return run_dir.parent / ".cache"
+
+
+def texts_cache(run_dir: Path) -> Path:
+    """Folder in which vectors of texts are kept."""
+    return cache_folder(run_dir) / "texts"
+
+
+def load_field(
+    run_dir: Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
+) -> SemanticField:
+    """The semantic field of a lifted run.
+
+    Args:
+        means, checkpoint: as in `SemanticField.load`.
+    Raises:
+        FileNotFoundError: the run has none.
+        ValueError: a damaged field, or one of other Gaussians than the means.
+    """
+    folder = run_dir / FIELD_FOLDER
+    if not folder.exists():
+        raise FileNotFoundError(
+            f"{run_dir} is a run without semantics (no {FIELD_FOLDER}/ in it). Lift it with ns-normlift --load-config, "
+            "then give the config.yml that ns-normlift names at its end."
+        )
+    return with_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
+
+
+def with_paths(field: SemanticField, folder: Path) -> SemanticField:
+    """The field, with the file of its texts, which the manifest names as it lies in the folder, by its whole path."""
+    encoder = field.manifest.get("encoder")
+    if not isinstance(encoder, dict) or encoder.get("text_vectors") is None:
+        return field
+    path = str(folder / encoder["text_vectors"])  # an absolute one stays
+    return replace(field, manifest={**field.manifest, "encoder": {**encoder, "text_vectors": path}})
+
+
+def refuse_existing(run_dir: Path, overwrite: bool) -> None:
+    """Raises FileExistsError if the directory is there and may not be replaced."""
+    if run_dir.exists() and not overwrite:
+        raise FileExistsError(f"{run_dir} exists; give another --timestamp or --output-dir, or --overwrite True.")
+
+
+@contextmanager
+def complete_directory(path: Path) -> Iterator[Path]:
+    """A temporary directory that takes the place of `path` if all goes well, and vanishes if not, Ctrl-C included."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{kind}") for kind in ("tmp", "old"))
+    temporary.mkdir()
+    try:
+        yield temporary
+        if path.exists():
+            path.rename(old)
+        temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if old.exists() and not path.exists():
+            old.rename(path)
+        shutil.rmtree(old, ignore_errors=True)

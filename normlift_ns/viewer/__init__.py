@@ -1,0 +1,1 @@
+"""What a viewer shows of a field, whichever viewer it is."""

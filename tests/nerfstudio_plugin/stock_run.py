@@ -1,0 +1,228 @@
+"""A splatfacto run as `ns-train splatfacto` writes it, made by nerfstudio's own Trainer on a CPU in seconds.
+
+Recipe. `write_dataset` writes a nerfstudio dataset of small pictures with lens distortion and a seed point cloud.
+`train_splatfacto` takes nerfstudio's registered configuration and runs `Trainer.setup()` and `Trainer.train()`; they
+write config.yml, dataparser_transforms.json and the checkpoint (optimizers, schedulers with numpy scalars, LPIPS).
+What splatfacto cannot do without a GPU, internet or system libraries is replaced while it trains (`splatfacto_on_cpu`):
+
+* gsplat.rasterization: normlift_ns' reference rasterizer, which autograd differentiates;
+* Tensor.cuda: the identity;
+* torchmetrics' LPIPS, which downloads AlexNet: a small network of our own;
+* open3d, which needs system libraries, for reading the seed points;
+* torch.compile: eager, as compiling takes longer than the training.
+
+To put known Gaussians into the run, set them in `prepare`, which gets the Trainer between setup and training.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from nerfstudio.configs.method_configs import method_configs
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from PIL import Image
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.nerfstudio_plugin.appearance import view_colors
+from normlift_ns.raster import reference
+from normlift_ns.raster.projection import assign_tiles, project, to_world
+from normlift_ns.raster.settings import RasterSettings
+
+WIDTH, HEIGHT, FOCAL, K1 = 48, 36, 40.0, 0.06
+"""Of the pictures in the dataset, before undistortion."""
+
+
+class StockRun(NamedTuple):
+    """What is left of a training."""
+
+    workspace: Path
+    """Its working directory."""
+    config: Path
+    """Its config.yml."""
+    trainer: Any
+    """nerfstudio's Trainer, with pipeline, model and datamanager."""
+
+
+def write_dataset(
+    folder: Path, *, count: int = 10, masks: bool = False, channels: int = 3, halved: bool = False
+) -> None:
+    """Writes transforms.json, `count` pictures from a circle around the origin, and sparse_pc.ply.
+
+    Args:
+        masks: with a mask per picture that is 0 in its left quarter.
+        channels: 3: JPEG without loss of size, 4: PNG with an alpha channel that is 0 in the right quarter.
+        halved: also with pictures of half the size in images_2/, as ns-process-data makes them.
+    """
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    suffix = "png" if channels == 4 else "jpg"
+    frames = []
+    for i in range(count):
+        picture = _picture(rng)
+        if channels == 4:
+            picture = np.dstack([picture, np.full((HEIGHT, WIDTH), 255, np.uint8)])
+            picture[:, 3 * WIDTH // 4 :, 3] = 0
+        image = Image.fromarray(picture)
+        image.save(folder / "images" / f"{i:03d}.{suffix}")
+        if halved:
+            (folder / "images_2").mkdir(exist_ok=True)
+            image.resize((WIDTH // 2, HEIGHT // 2)).save(folder / "images_2" / f"{i:03d}.{suffix}")
+        frames.append({"file_path": f"images/{i:03d}.{suffix}", "transform_matrix": _pose(i, count).tolist()})
+        if masks:
+            mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            mask[:, : WIDTH // 4] = 0
+            (folder / "masks").mkdir(exist_ok=True)
+            Image.fromarray(mask).save(folder / "masks" / f"{i:03d}.png")
+            frames[-1]["mask_path"] = f"masks/{i:03d}.png"
+    intrinsics = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT, "k1": K1}
+    meta = {"camera_model": "OPENCV", **intrinsics, "ply_file_path": "sparse_pc.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    points = rng.normal(scale=0.5, size=(60, 3))
+    lines = [
+        f"{x:.4f} {y:.4f} {z:.4f} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(points, rng.integers(0, 256, (60, 3)))
+    ]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(lines)}"]
+    header += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    (folder / "sparse_pc.ply").write_text("\n".join([*header, "end_header", *lines]) + "\n")
+
+
+def _picture(rng: np.random.Generator) -> np.ndarray:
+    coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
+    return np.asarray(coarse.resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC))
+
+
+def _pose(i: int, count: int) -> np.ndarray:
+    """Camera-to-world, OpenGL: on a wavy circle of radius 4, looking at the origin."""
+    angle = 2 * np.pi * i / count
+    position = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1 + 0.5 * np.sin(3 * angle)])
+    back = position / np.linalg.norm(position)
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, position], axis=1)
+    return pose
+
+
+def train_splatfacto(
+    workspace: Path,
+    data: Path,
+    *,
+    method: str = "splatfacto",
+    timestamp: str = "run",
+    steps: int = 1,
+    configure: Callable[[TrainerConfig], None] = lambda config: None,
+    prepare: Callable[[Trainer], None] = lambda trainer: None,
+) -> StockRun:
+    """`ns-train METHOD --data DATA` in the directory `workspace`.
+
+    Args:
+        data: the dataset, relative to the workspace or absolute.
+        configure: changes the configuration, like flags of ns-train.
+        prepare: changes the Trainer between setup and training.
+    """
+    config = deepcopy(method_configs[method])
+    assert isinstance(config, TrainerConfig)
+    config.machine.device_type = "cpu"
+    config.timestamp = timestamp
+    config.max_num_iterations = steps
+    config.data = config.pipeline.datamanager.data = data
+    model: Any = config.pipeline.model
+    model.num_downscales = 0  # from the start at full resolution
+    model.stop_split_at = 0  # neither densify nor cull
+    configure(config)
+    with working_directory(workspace), splatfacto_on_cpu():
+        config.save_config()
+        trainer = config.setup()
+        trainer.config.vis = "none"  # no viewer, no tensorboard
+        trainer.setup()
+        prepare(trainer)
+        trainer.train()
+        writer.EVENT_WRITERS.clear()  # nerfstudio keeps those of every training in the process
+        return StockRun(workspace, workspace / config.get_base_dir() / "config.yml", trainer)
+
+
+@contextmanager
+def splatfacto_on_cpu() -> Iterator[None]:
+    """Replaces what stock splatfacto needs a GPU, the internet or system libraries for."""
+    with (
+        patch("nerfstudio.models.splatfacto.rasterization", rasterization),
+        patch.object(torch.Tensor, "cuda", lambda tensor, *args, **kwargs: tensor),
+        patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", SmallLpips),
+        patch("nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio._load_3D_points", _load_points),
+        torch.compiler.set_stance("force_eager"),
+    ):
+        yield
+
+
+@contextmanager
+def working_directory(folder: Path) -> Iterator[None]:
+    """Changes the current directory for a while."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def _load_points(parser: Any, file: Path, transform: Tensor, scale: float) -> dict[str, Tensor]:
+    rows = np.loadtxt(file, skiprows=file.read_text().split("\n").index("end_header") + 1)
+    points = torch.from_numpy(rows[:, :3]).float() @ transform[:, :3].T + transform[:, 3]
+    return {"points3D_xyz": points * scale, "points3D_rgb": torch.from_numpy(rows[:, 3:].astype(np.uint8))}
+
+
+class SmallLpips(torch.nn.Module):
+    """Has weights, as LPIPS has, so that they get into the checkpoint."""
+
+    def __init__(self, normalize: bool) -> None:
+        super().__init__()
+        self.net = torch.nn.Linear(3, 3)
+
+    def forward(self, image: Tensor, target: Tensor) -> Tensor:
+        return (image - target).square().mean()
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    sh_degree: int | None = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    **unused: Any,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """gsplat.rasterization of one camera, differentiable, as far as splatfacto and NormLiftModel call it."""
+    settings, camera = RasterSettings(), Camera(Ks[0], viewmats[0], width, height)
+    projected = project(
+        to_world(GaussianScene(means, quats, scales, opacities), means.dtype),
+        camera,
+        settings,
+        rasterize_mode == "antialiased",
+    )
+    tiles = assign_tiles(projected, width, height, settings.tile_size)
+    rgb = colors if sh_degree is None else view_colors(means, colors, camera, sh_degree)
+    depth = means @ viewmats[0, 2, :3, None] + viewmats[0, 2, 3]
+    values = torch.cat([rgb, depth], dim=1)[projected.gaussian]
+    image, alpha = reference.composite(projected, tiles, values, width, height, settings)
+    alpha = alpha[..., None]
+    channels = [image[..., :-1]]
+    if render_mode == "RGB+ED":
+        channels.append(image[..., -1:] / alpha.clamp(min=1e-10))
+    return torch.cat(channels, dim=-1)[None], alpha[None], {"means2d": projected.means2d}
