@@ -6,11 +6,10 @@ from collections.abc import Iterator
 
 from benchmarks.accuracy import OTHERS, VARIES
 from benchmarks.documents import TITLES, Document, table
+from benchmarks.signals import STEP
 
 SCENES = {"": "tabletop", "demo.": "demo"}
 """Prefix of the keys of accuracy.json, name of the scene."""
-STEP = "hard"
-"""Step of the ladder whose signals are shown."""
 
 
 def findings(found: dict[str, Document]) -> str:

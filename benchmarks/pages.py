@@ -12,8 +12,9 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from benchmarks.documents import TITLES, Document, documents, table
-from benchmarks.findings import STEP, findings, steps
+from benchmarks.findings import findings, steps
 from benchmarks.plots import DOCS, NAMES
+from benchmarks.signals import STEP
 from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
 
 PRESET_FLAGS = {
