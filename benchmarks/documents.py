@@ -1,13 +1,15 @@
-"""Results files and Markdown tables, for the pages that are made of them."""
+"""Results files, read: what the tables and plots of the documentation are made of."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from math import nan
 from pathlib import Path
-from typing import Any
 
-from benchmarks.report import RESULTS
+from benchmarks.report import RESULTS, Metric
 
 TITLES = {
     "none": "without refinement",
@@ -17,22 +19,29 @@ TITLES = {
     "support_only": "support only",
     "full": "full",
 }
+PRESETS = {
+    "exact": "float64 (--precision double)",
+    "float32": "default: float32",
+    "tf32": "TF32 vote",
+    "half": "float16 vote",
+    "low_rank": "stored in a basis, tolerance 5e-2",
+    "half_resolution": "half resolution (--lift-downscale 2)",
+    "every_second_view": "every second view",
+}
 
 
+@dataclass(frozen=True)
 class Document:
-    """One results file; values by key."""
+    """One results file."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.found = path, path.exists()
-        self.content: dict[str, Any] = json.loads(path.read_text()) if self.found else {"metrics": []}
-        self.values = {m["key"]: m["value"] for m in self.content["metrics"]}
+    command: str
+    hardware: str
+    metrics: tuple[Metric, ...]
 
-    @property
-    def origin(self) -> str:
-        """Where the figures come from."""
-        if not self.found:
-            return f"*`results/{self.path.name}` is absent: run its benchmark first.*"
-        return f"`{self.content['command']}` on {self.content['hardware']}."
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Values by key."""
+        return {metric.key: metric.value for metric in self.metrics}
 
     def interval(self, key: str, digits: int = 1) -> str:
         """Mean and half of its 95 % interval; empty where it was not measured."""
@@ -40,15 +49,22 @@ class Document:
         return f"{v[key]:.{digits}f} ± {v[f'{key}_ci95']:.{digits}f}" if key in v else ""
 
 
-def documents() -> dict[str, Document]:
-    """All results files that the pages speak of."""
+Documents = Mapping[str, Document]
+
+
+def read(path: Path) -> Document:
+    """The document of one results file."""
+    content = json.loads(path.read_text())
+    rows = ({**row, "value": nan if row["value"] is None else row["value"]} for row in content["metrics"])
+    return Document(content["command"], content["hardware"], tuple(Metric(**row) for row in rows))
+
+
+def documents() -> Documents:
+    """All results files that the pages speak of, by their names."""
     names = ("cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses")
-    return {name: Document(RESULTS / f"{name}.json") for name in names}
+    return {name: read(RESULTS / f"{name}.json") for name in names}
 
 
-def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
-    """A Markdown table."""
-    yield "| " + " | ".join(header) + " |"
-    yield "|" + "---|" * len(header)
-    yield from ("| " + " | ".join(row) + " |" for row in rows)
-    yield ""
+def steps(accuracy: Document) -> list[str]:
+    """Names of the steps of the ladder of damage."""
+    return [k.split(".")[1] for k in accuracy.values if k.startswith("ladder.") and k.endswith(".full.miou")]

@@ -197,7 +197,7 @@ def main(arguments: argparse.Namespace) -> None:
     given = (HELD_OUT, range(200, 200 + arguments.seeds), arguments.voters)
     for one, squared in (x for site in sites for x in zip(site.observations(*given), site.observations(*given, 2))):
         base, new = one.miou(START), one.miou(fitted)
-        for group in ("held_out", f"{one.scene}.held_out", f"held_out.{one.damage}"):
+        for group in ("held_out", f"{one.scene}.held_out"):
             add(f"{group}.none", one.unrefined())
             add(f"{group}.start", base)
             add(f"{group}.fitted", new)

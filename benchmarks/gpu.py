@@ -157,7 +157,7 @@ def measure(report: Report, case: Case) -> None:
 
         lift_s = reliability_s + directions_s
         norm_error, direction_error = lift_errors(case, evidence, table, lifted)
-        vote_error = vote_errors(case, evidence, lifted, config, neighbors, source)
+        vote_error = vote_errors(case, lifted, config, neighbors, source)
         add("gaussians", n, "")
         add("views", views, "")
         add("rgb_s", rgb_s, "s, stock gsplat")
@@ -212,9 +212,7 @@ def lift_errors(case: Case, evidence: Evidence, table: torch.Tensor, lifted: Lif
     return float(reliability), float(turned)
 
 
-def vote_errors(
-    case: Case, evidence: Evidence, lifted: Lifted, config: RefineConfig, neighbors: Any, source: torch.Tensor
-) -> float:
+def vote_errors(case: Case, lifted: Lifted, config: RefineConfig, neighbors: Any, source: torch.Tensor) -> float:
     """Share of a sample of Gaussians whose refined direction is off by more than 1e-3 from that of a float64 vote.
 
     Copying another Gaussian is no error where both have the same direction, as those seen in one region only.

@@ -1,49 +1,90 @@
-"""Pictures from benchmark JSON: time against error over the presets of a lift.
-
-python -m benchmarks.plots      docs/presets.svg from results/presets.json
-"""
+"""Plots of the documentation from the results files; the same figures give the same file."""
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from benchmarks.report import RESULTS
+from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps
+from benchmarks.signals import STEP
+from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
 
 DOCS = Path(__file__).parents[1] / "docs"
-NAMES = {
-    "exact": "float64 (--precision double)",
-    "float32": "default: float32",
-    "tf32": "TF32 vote",
-    "half": "float16 vote",
-    "low_rank": "stored in a basis, tolerance 5e-2",
-    "half_resolution": "half resolution (--lift-downscale 2)",
-    "every_second_view": "every second view",
-}
 FLOOR = 1e-4
 """Where an error of 0 is drawn."""
 
 
-def plot_presets(source: Path, target: Path) -> None:
-    document = json.loads(source.read_text())
-    metrics = {metric["key"]: metric["value"] for metric in document["metrics"]}
-    mpl.rcParams["svg.hashsalt"] = "presets"  # the same file for the same figures
+def plots(found: Documents, folder: Path) -> Iterator[Path]:
+    """Draws all of them, and names the files."""
+    accuracy, fit, signals = (found[name] for name in ("accuracy", "fit", "signals"))
+    yield plot_presets(found["presets"], folder / "presets.svg")
+    yield plot_accuracy(accuracy, folder / "accuracy.svg")
+    yield plot_drift(signals, folder / "drift.svg")
+    curves = ((key.split(".", 2)[1:], value) for key, value in fit.values.items() if key.startswith("curve."))
+    rows = [{"parameter": name, "value": float(at), "miou": value} for (name, at), value in curves]
+    plot_sweeps(rows, "miou", "mIoU on held-out damage, points", folder / "sensitivity.svg")
+    yield folder / "sensitivity.svg"
+    start = f"tabletop.{STEP}."
+    one = {k.removeprefix(start): value for k, value in signals.values.items() if k.startswith(start)}
+    plot_signals(one, folder / "reliability.svg")
+    yield folder / "reliability.svg"
+
+
+def plot_presets(document: Document, target: Path) -> Path:
+    """Time against error over the presets of a lift."""
+    v = document.values
+    mpl.rcParams["svg.hashsalt"] = "presets"
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
-    for name, label in NAMES.items():
-        seconds, error = metrics[f"{name}.s"], max(metrics[f"{name}.rms_error"], FLOOR)
-        axes.plot(seconds, error, "o", label=f"{label}: {seconds:.3g} s, {metrics[f'{name}.rms_error']:.2g}")
+    for name, label in PRESETS.items():
+        seconds, error = v[f"{name}.s"], v[f"{name}.rms_error"]
+        axes.plot(seconds, max(error, FLOOR), "o", label=f"{label}: {seconds:.3g} s, {error:.2g}")
     axes.set(xscale="log", yscale="log", xlabel="seconds: evidence, lift, neighbours, vote", ylim=(FLOOR / 2, 2))
     axes.set_ylabel("error of refined directions against float64, RMS")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    axes.set_title(f"fox, 15 views, {document['hardware'].split(',')[0]}", fontsize=10)
+    axes.set_title(f"fox, 15 views, {document.hardware.split(',')[0]}", fontsize=10)
+    return _saved(figure, target)
+
+
+def plot_accuracy(document: Document, target: Path) -> Path:
+    """mIoU of every variant on every step of the ladder, tabletop."""
+    names = steps(document)
+    mpl.rcParams["svg.hashsalt"] = "accuracy"
+    figure = Figure(figsize=(9, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for i, name in enumerate(TITLES):
+        values = [document.values[f"ladder.{step}.{name}.miou"] for step in names]
+        bars = [document.values[f"ladder.{step}.{name}.miou_ci95"] for step in names]
+        places = [x + 0.13 * (i - 2.5) for x in range(len(names))]
+        axes.bar(places, values, 0.13, yerr=bars, label=TITLES[name], error_kw={"linewidth": 0.6})
+    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
+    axes.set_ylabel("mIoU over Gaussians, points")
+    axes.legend(fontsize=8, ncols=3)
+    axes.grid(axis="y", alpha=0.3)
+    return _saved(figure, target)
+
+
+def plot_drift(document: Document, target: Path) -> Path:
+    """Share of pairs whose mixture is nearest to a third class, by the share of one of the two, tabletop."""
+    mpl.rcParams["svg.hashsalt"] = "drift"
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axes = figure.subplots()
+    keys = [k.split(".drift.noise")[1].split(".mix") for k in document.values if k.startswith("tabletop.drift.")]
+    for noise in dict.fromkeys(noise for noise, _ in keys):
+        mixes = [mix for other, mix in keys if other == noise]
+        rates = [document.values[f"tabletop.drift.noise{noise}.mix{mix}"] for mix in mixes]
+        axes.plot(list(map(float, mixes)), rates, marker="o", markersize=3, label=f"noise {noise}")
+    axes.set_xlabel("share of one of two features")
+    axes.set_ylabel("pairs nearest to a third, %")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    axes.grid(alpha=0.3)
+    return _saved(figure, target)
+
+
+def _saved(figure: Figure, target: Path) -> Path:
     figure.savefig(target, metadata={"Date": None})
-
-
-if __name__ == "__main__":
-    plot_presets(RESULTS / "presets.json", DOCS / "presets.svg")
-    print(f"Written: {DOCS / 'presets.svg'}")
+    return target

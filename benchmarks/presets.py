@@ -124,7 +124,6 @@ def main(output: Path) -> None:
         error = error.norm(dim=1)[exact.known]
         report.add(f"{name}.s", seconds, "s", error.square().mean().sqrt())
         report.add(f"{name}.rms_error", error.square().mean().sqrt(), "length of the difference, RMS")
-        report.add(f"{name}.median_error", error.median(), "length of the difference, median")
         report.add(f"{name}.other_share", (error > 0.1).float().mean(), "of Gaussians, off by more than 0.1")
         report.add(f"{name}.peak_gib", torch.cuda.max_memory_allocated() / 2**30, "GiB")
     report.write(output)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -49,16 +51,29 @@ class Report:
             "command": " ".join(
                 ["python -m", f"benchmarks.{Path(sys.argv[0]).stem}", *(a for a in sys.argv[1:] if a == "--quick")]
             ),
-            "metrics": [asdict(metric) for metric in self.metrics],
+            "metrics": [_row(metric) for metric in self.metrics],
         }
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.name}.json"
-        path.write_text(json.dumps(document, indent=1) + "\n")
+        path.write_text(as_text(document))
         table = Table("key", "value", "unit", "error against float64", title=f"{self.name}: {document['hardware']}")
         for m in self.metrics:
             table.add_row(m.key, f"{m.value:.4g}", m.unit, "" if m.error is None else f"{m.error:.2e}")
         Console(width=120).print(table)
         return path
+
+
+def as_text(document: Mapping[str, Any]) -> str:
+    """The document as JSON: every entry of the header on one line, and every metric on one line."""
+    header = [f" {json.dumps(key)}: {json.dumps(value)}," for key, value in document.items() if key != "metrics"]
+    metrics = ",\n".join(f"  {json.dumps(metric, allow_nan=False)}" for metric in document["metrics"])
+    return "\n".join(["{", *header, ' "metrics": [', metrics, " ]", "}"]) + "\n"
+
+
+def _row(metric: Metric) -> dict[str, Any]:
+    """The metric as JSON has it, with null for what is not a finite number."""
+    numbers = {"value": metric.value, "error": metric.error}
+    return asdict(metric) | {key: x if x is not None and math.isfinite(x) else None for key, x in numbers.items()}
 
 
 def hardware() -> str:

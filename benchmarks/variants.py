@@ -57,13 +57,13 @@ def only(neighbors: Neighbors, voters: Tensor | None) -> Neighbors:
 
 def refined_scores(
     variant: Variant, means: Tensor, lifted: Lifted, scores: Scores, neighbors: Neighbors,
-    config: RefineConfig | None = None, beta: float = 1.0,
+    config: RefineConfig | None = None,
 ) -> Scores:  # fmt: skip
     """Scores after one variant of `refine_variant`."""
     config = config or RefineConfig()
     if variant == "none":
         return scores
-    reliability = variant_reliability(variant, lifted, beta)
+    reliability = variant_reliability(variant, lifted)
     if variant == "linear":
         return _average(reliability, scores, neighbors, config)
     source = refine(means, lifted.directions, reliability, config, neighbors=neighbors).long()

@@ -11,11 +11,8 @@ import torch
 
 from benchmarks.accuracy import KEYS, Bench, summarize
 from benchmarks.damage import LADDER, Damage, Lengths, observe
-from benchmarks.documents import documents
-from benchmarks.findings import findings
 from benchmarks.fit import MOST, observation
 from benchmarks.losses import coarse_evidence
-from benchmarks.pages import page
 from benchmarks.report import Report
 from benchmarks.signals import mistakes
 from benchmarks.variants import (
@@ -225,12 +222,6 @@ def test_rows_and_their_summary(world):
     )
     assert 0 <= values["ablation.full.miou_2d"] <= 100
     assert values["preset.half.miou"] == pytest.approx(values["ablation.full.miou"], abs=1)
-
-
-@pytest.mark.parametrize(("name", "made"), [("speed_and_error", page), ("accuracy", findings)])
-def test_pages_are_made_of_the_committed_results(name, made):
-    written = ROOT / "docs" / f"{name}.md"
-    assert written.read_text() == made(documents()), "write it again: python -m benchmarks.pages"
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The benchmarks run and report what they promise; the errors beside the times are small."""
+"""The benchmarks run and report what they promise; the errors beside the times are small; results are easy to read."""
 
 import json
 import subprocess
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.report import RESULTS, Report, as_text
 from tests.captures import needs_shared
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,3 +59,23 @@ def test_quick_front_ends_benchmark(tmp_path):
     assert all(metrics[f"sam_masks_{level}"]["value"] > 0 for level in ("default", "s", "m", "l"))
     assert metrics["nms_10_s"]["error"] == 0
     assert metrics["encode_10_s"]["error"] < 1e-5 and metrics["patches_s"]["error"] < 1e-5
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.json")), ids=lambda path: path.name)
+def test_results_have_one_metric_per_line(path):
+    document = json.loads(path.read_text())
+    assert set(document) == {"hardware", "versions", "command", "metrics"}
+    assert all(set(metric) == {"key", "value", "unit", "error"} for metric in document["metrics"])
+    assert path.read_text() == as_text(document)
+    assert sum(line.startswith('  {"key": ') for line in path.read_text().splitlines()) == len(document["metrics"])
+
+
+def test_a_report_is_valid_json(tmp_path):
+    report = Report("some")
+    report.add("time_s", 0.25, "s", 1e-7)
+    report.add("of one seed_ci95", float("nan"), "points")
+    document = json.loads(report.write(tmp_path).read_text(), parse_constant=pytest.fail)
+    assert document["metrics"] == [
+        {"key": "time_s", "value": 0.25, "unit": "s", "error": 1e-7},
+        {"key": "of one seed_ci95", "value": None, "unit": "points", "error": None},
+    ]

@@ -1,0 +1,174 @@
+"""The tables of docs/accuracy.md and docs/speed_and_error.md, as Markdown, from the results files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from benchmarks.accuracy import OTHERS
+from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps
+from benchmarks.signals import STEP
+
+PREFIXES = {"tabletop": "", "demo": "demo."}
+"""Prefix of the keys of accuracy.json, by scene."""
+FLAGS = {
+    "exact": "`--precision double`", "float32": "default", "half_resolution": "`--lift-downscale 2`",
+    "every_second_view": "`--max-views` half", "low_rank": "`--form low_rank --tolerance 0.05`",
+}  # fmt: skip
+
+
+def tables(found: Documents) -> dict[str, str]:
+    """Every table by its name in the markers of the pages; `origin-…` is the line that says what measured a file."""
+    accuracy, fit, signals, h100 = (found[name] for name in ("accuracy", "fit", "signals", "h100"))
+    return {
+        **{f"origin-{name}": f"`{one.command}` on {one.hardware}.\n" for name, one in found.items()},
+        **{f"ablation-{scene}": ablation(accuracy, scene) for scene in PREFIXES},
+        **{f"damage-{scene}": damage(accuracy, scene) for scene in PREFIXES},
+        **{f"reliability-{scene}": reliability(accuracy, scene) for scene in PREFIXES},
+        "evidence": evidence(signals),
+        "opacity": opacity(signals),
+        "views": views(signals),
+        "mixtures": mixtures(signals),
+        "parameters": parameters(fit),
+        "held-out": held_out(fit),
+        "presets": presets(found["presets"], accuracy, found["losses"]),
+        "stages": stages(h100),
+        "core-gpu": every_metric(h100),
+        "core-cpu": every_metric(found["cpu"]),
+        "forms": every_metric(found["forms"], "_tol0.01_"),
+    }
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(cells) + " |" for cells in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]]) + "\n"
+
+
+def ablation(accuracy: Document, scene: str) -> str:
+    """Means over the ladder of damage."""
+    prefix, rows = PREFIXES[scene], []
+    for name, label in TITLES.items():
+        key = f"{prefix}ablation.{name}"
+        gain = "" if name == "full" else accuracy.interval(f"{prefix}ablation.full_minus_{name}.miou")
+        rows.append((label, *(accuracy.interval(f"{key}.{c}") for c in ("miou", "macc", "miou_2d")), gain))
+    for name, label in OTHERS.items():
+        key = f"{prefix}baseline.{name}"
+        rows.append((f"*{label}*", accuracy.interval(f"{key}.miou"), accuracy.interval(f"{key}.macc"), "", ""))
+    return table((scene, "mIoU", "mAcc", "mIoU in held-out views", "full is better by"), rows)
+
+
+def damage(accuracy: Document, scene: str) -> str:
+    """mIoU of every variant on every step."""
+    start = f"{PREFIXES[scene]}ladder"
+    rows = [(step, *(accuracy.interval(f"{start}.{step}.{name}.miou") for name in TITLES)) for step in steps(accuracy)]
+    return table((f"{scene}, mIoU", *TITLES.values()), rows)
+
+
+def reliability(accuracy: Document, scene: str) -> str:
+    """How well R and the norm rank accuracy."""
+    v, prefix, rows = accuracy.values, PREFIXES[scene], []
+    for step in steps(accuracy):
+        low, high = (v[f"{prefix}reliability.{step}.{end}_bin"] for end in ("lowest", "highest"))
+        ranks = (f"{v[f'{prefix}{name}.{step}.spearman_bins']:.2f}" for name in ("reliability", "norm"))
+        rows.append((step, *ranks, f"{low:.0f} to {high:.0f} %"))
+    return table((scene, "by R", "by norm", "accuracy, lowest to highest tenth of R"), rows)
+
+
+def evidence(signals: Document) -> str:
+    """Gaussians with and without evidence."""
+    s, rows = signals.values, []
+    for scene in PREFIXES:
+        for group, label in (("all", "all"), ("zero", "R = 0"), ("seen", "R > 0")):
+            key = f"{scene}.{STEP}.{group}"
+            share, faint, right = (f"{100 * s[f'{key}.{x}']:.1f} %" for x in ("share", "faint", "accuracy"))
+            mean, seen = f"{s[f'{key}.opacity']:.3f}", f"{s[f'{key}.views']:.1f}"
+            rows.append((f"{scene}, {label}", share, mean, faint, seen, right))
+    return table(("", "share", "mean opacity", "opacity < 0.1", "views", "accuracy"), rows)
+
+
+def opacity(signals: Document) -> str:
+    """R against opacity."""
+    s, rows = signals.values, []
+    for scene in PREFIXES:
+        key = f"{scene}.{STEP}.opacity"
+        fifths = ", ".join(f"{s[f'{key}.quintile{i}']:.2f}" for i in range(1, 6))
+        rows.append((scene, *(f"{s[f'{key}.{x}']:.3f}" for x in ("spearman", "kendall", "jaccard")), fifths))
+    header = ("R > 0 against opacity", "Spearman", "Kendall", "Jaccard, lowest fifths", "opacity by fifths of R")
+    return table(header, rows)
+
+
+def views(signals: Document) -> str:
+    """mIoU by number of views, before and after the vote."""
+    counts = [k.split(".")[:3:2] for k in signals.values if ".views." in k and k.endswith(".full.miou")]
+    rows = [
+        (f"{scene}, {n}", *(signals.interval(f"{scene}.views.{n}.{x}.miou") for x in ("none", "full")))
+        for scene, n in counts
+    ]
+    return table(("views", "before", "after"), rows)
+
+
+def mixtures(signals: Document) -> str:
+    """Share of pairs of classes whose equal mixture is nearest to a third."""
+    s = signals.values
+    keys = [k for k in s if k.startswith("tabletop.drift.") and k.endswith("mix0.5")]
+    noise = [k.split("noise")[1].split(".mix")[0] for k in keys]
+    rows = [(scene, *(f"{s[f'{scene}.drift.noise{x}.mix0.5']:.1f} %" for x in noise)) for scene in PREFIXES]
+    return table(("length of the noise", *noise), rows)
+
+
+def parameters(fit: Document) -> str:
+    """What was fitted."""
+    names = ("k", "sigma_d", "tau", "gamma", "delta")
+    groups = (("fitted, the defaults", "fitted"), ("fitted for plain voting", "fitted_knn"))
+    rows = [(label, *(f"{fit.values[f'{group}.{x}']:g}" for x in names)) for label, group in groups]
+    return table(("", *names), rows)
+
+
+def held_out(fit: Document) -> str:
+    """What the fit is worth on other damage."""
+    rows = [
+        (label, *(fit.interval(f"{scene}held_out.{key}", 2) for scene in ("", "tabletop.", "demo.")))
+        for key, label in (
+            ("none", "unrefined"),
+            ("fitted", "fitted"),
+            ("fitted_minus_start", "fitted, against the first guess"),
+            ("squared_minus_linear", "weights A^2 instead of A"),
+            ("squared_minus_linear_unrefined", "the same, unrefined"),
+            ("dilute_minus_ignore", "`--unlabeled dilute` instead of `ignore`"),
+        )
+    ]
+    return table(("mIoU on damage that was not fitted to", "both", "tabletop", "demo"), rows)
+
+
+def presets(document: Document, accuracy: Document, losses: Document) -> str:
+    """Time, memory and error of the whole lift, and what it does to mIoU where that was measured."""
+    v, rows = document.values, []
+    for name, label in PRESETS.items():
+        seconds, memory = f"{v[f'{name}.s']:.3g} s", f"{v[f'{name}.peak_gib']:.2f} GiB"
+        error, other = f"{v[f'{name}.rms_error']:.2g}", f"{100 * v[f'{name}.other_share']:.2g} %"
+        key = "ablation.full.miou" if name == "float32" else f"preset.{name}.miou"
+        task = (accuracy.interval(key), losses.interval(name, 2))
+        rows.append((label, FLAGS.get(name, "benchmark only"), seconds, memory, error, other, *task))
+    header = ("preset", "how", "time", "peak memory", "RMS error", "directions off by > 0.1", "mIoU, tabletop")
+    return table((*header, "mIoU, demo"), rows)
+
+
+def stages(h100: Document) -> str:
+    """Seconds of the stages of a lift, in the columns of the paper's table."""
+    v, rows = h100.values, []
+    for case in [k.removesuffix(".total_s") for k in v if k.endswith(".total_s")]:
+        size = f"{v[f'{case}.gaussians'] / 1e6:.2f} M, {v[f'{case}.views']:.0f}"
+        post = v[f"{case}.reliability_s"] + v[f"{case}.neighbors_s"] + v[f"{case}.vote_s"]
+        times = (v[f"{case}.evidence_lift_s"], post, v[f"{case}.total_s"])
+        rows.append((case, size, *(f"{t:.3f} s" for t in times), f"{v[f'{case}.peak_gib']:.1f} GiB"))
+    return table(("", "Gaussians, views", "lift", "reliability, neighbours, vote", "total", "peak memory"), rows)
+
+
+def every_metric(document: Document, having: str = "") -> str:
+    """The metrics of one file, of those whose key has some part, as they stand."""
+    rows = [
+        (f"`{m.key}`", f"{m.value:.4g} {m.unit}", "" if m.error is None else f"{m.error:.1e}")
+        for m in document.metrics
+        if having in m.key
+    ]
+    return table(("what", "value", "relative error against float64"), rows)
