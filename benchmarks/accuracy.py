@@ -105,7 +105,7 @@ class Bench:
             seen = observe(other, self.words, damage, seed)
             row[name] = scores_3d(world, lifted_scores(lift(seen.evidence, seen.features), self.classes), self.counted)
         correct = classify(plain.cosine, plain.valid) == world.truth
-        for name, key in (("reliability", lifted.reliability), ("norm", lifted.norm)):
+        for name, key in (("reliability", lifted.scalars.reliability), ("norm", lifted.scalars.norm)):
             row[f"{name}_bins"] = accuracy_bins(key[known], correct[known])
         return row
 
@@ -113,7 +113,7 @@ class Bench:
         """The full variant by faster lifts, as in `benchmarks.presets`."""
         means = self.world.scene.means
         read = partial(lifted.directions, dtype=torch.float16)
-        source = refine(means, read, lifted.reliability, self.config, neighbors=self.neighbors).long()
+        source = refine(means, read, lifted.scalars.reliability, self.config, neighbors=self.neighbors).long()
         half = Scores(plain.cosine[source], plain.valid[source])
         views = list(range(0, observed.evidence.num_views, 2))
         columns = observed.evidence.columns_of(views)

@@ -65,17 +65,19 @@ def main(quick: bool, output: Path) -> None:
     with stopwatch() as neighbor_watch:
         neighbors = nearest_neighbors(scene.means, config.k)
     with stopwatch() as refine_watch:
-        source = refine(scene.means, lifted.directions, lifted.reliability, config, neighbors=neighbors)
+        source = refine(scene.means, lifted.directions, lifted.scalars.reliability, config, neighbors=neighbors)
 
-    pairs = rasterize_evidence(scene, cameras, labels, weight_power=0).weight.double().sum()
+    pairs = rasterize_evidence(scene, cameras, labels, weight_power=0).rows.weight.double().sum()
     exact_evidence = rasterize_evidence(scene, cameras, labels, dtype=torch.float64)
     evidence_error = relative_difference(evidence.rows, exact_evidence.rows)
     with stopwatch() as reference_watch:
         reference = rasterize_evidence(scene, cameras[:1], labels[:1], backend="torch")
     exact = lift(evidence, features.double())
-    lift_error = (lifted.reliability.double() - exact.reliability).abs().max() / exact.reliability.max()
+    lift_error = (
+        lifted.scalars.reliability.double() - exact.scalars.reliability
+    ).abs().max() / exact.scalars.reliability.max()
     turned = (directions.double() - exact.directions()).norm(dim=1)
-    exact_source = refine(scene.means, exact.directions(), exact.reliability, config, neighbors=neighbors)
+    exact_source = refine(scene.means, exact.directions(), exact.scalars.reliability, config, neighbors=neighbors)
 
     report.add("fox_evidence_s", watch.seconds, "s", evidence_error)
     report.add("fox_evidence_peak_gib", peak, "GiB")
@@ -91,7 +93,7 @@ def main(quick: bool, output: Path) -> None:
     other = (directions[source.long()].double() - exact.directions()[exact_source.long()]).norm(dim=1) > OTHER
     report.add("fox_refine_s", neighbor_watch.seconds + refine_watch.seconds, "s", other.double().mean())
     report.add("fox_refined_share", (source != torch.arange(len(source))).float().mean(), "of Gaussians")
-    report.add("fox_zero_evidence_share", (lifted.reliability == 0).float().mean(), "of Gaussians")
+    report.add("fox_zero_evidence_share", (lifted.scalars.reliability == 0).float().mean(), "of Gaussians")
     report.add("fox_total_peak_gib", peak_gib(), "GiB, float64 checks included")
     report.write(output)
 

@@ -106,7 +106,7 @@ def observe(world: World, words: Words, damage: Damage, seed: int, lengths: Leng
     features = _features(present // 2 % world.classes, words, damage, lengths or Lengths(), g)
     evidence = world.evidence
     if damage.dominant > 1:
-        evidence = _weighted(evidence, _factors(len(cells.maps), damage, g).to(evidence.weight))
+        evidence = _weighted(evidence, _factors(len(cells.maps), damage, g).to(evidence.rows.weight))
     if len(chosen) < len(cells.maps):
         evidence = evidence.select_views(chosen)
     renumbered = torch.full((len(cells.maps),), -1)
@@ -190,10 +190,10 @@ def _factors(views: int, damage: Damage, g: torch.Generator) -> Tensor:
 
 def _weighted(evidence: Evidence, factor: Tensor) -> Evidence:
     """Evidence with a factor [V] on the weight of each view."""
-    blank = evidence.unlabeled
+    rows, blank = evidence.rows, evidence.unlabeled
     return replace(
         evidence,
-        weight=evidence.weight * factor[evidence.region_view[evidence.region.long()].long()],
+        rows=replace(rows, weight=rows.weight * factor[evidence.region_view[rows.column.long()].long()]),
         unlabeled=replace(blank, weight=blank.weight * factor[blank.column.long()]),
     )
 

@@ -114,7 +114,7 @@ def observation(
     """Lifts, and multiplies the directions of every voter's neighbours with each other."""
     observed = observe(world, words, damage, seed)
     lifted = lift(observed.evidence, observed.features)
-    diluted = lift(observed.evidence, observed.features, unlabeled="dilute").reliability
+    diluted = lift(observed.evidence, observed.features, unlabeled="dilute").scalars.reliability
     group = torch.cat([voters[:, None], neighbors.index[voters].long()], dim=1)
     spacing = neighbors.spacing[neighbors.spacing.isfinite()].median()
     distance = torch.nn.functional.pad(neighbors.distance[voters], (1, 0)) / spacing
@@ -125,9 +125,9 @@ def observation(
         gram[rows] = (u @ u.transpose(1, 2)).half()
     scores = lifted_scores(lifted, words.classes.to(voters.device))
     return Observation(
-        world.name, name, seed, scores, group, distance.float(), gram, lifted.norm, lifted.n_eff, diluted,
-        world.truth[voters],
-    )  # fmt: skip
+        *(world.name, name, seed, scores, group, distance.float(), gram),
+        *(lifted.scalars.norm, lifted.scalars.n_eff, diluted, world.truth[voters]),
+    )
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class Site:
         """A sample of voters per seed."""
         world = self.world
         if weight_power == 2:
-            world = replace(world, evidence=world.squared.to(world.evidence.weight.device))
+            world = replace(world, evidence=world.squared.to(world.evidence.rows.weight.device))
         known = (world.truth >= 0).nonzero().squeeze(1)
         for seed in seeds:
             g = torch.Generator().manual_seed(seed)

@@ -65,7 +65,7 @@ def main(output: Path) -> None:
             for form, facts in forms.items():
                 key = (form, facts.get("rank"))
                 if key not in measured:
-                    field = SemanticField.build(lifted, means, form=form, tolerance=tolerance)
+                    field = SemanticField.build(lifted, means, storage=form, tolerance=tolerance)
                     measured[key] = float((field.query(names.float(), refined=False)[some] - exact).abs().max())
                 size = facts["bytes"] / len(means)
                 mark = " (chosen)" if form == chosen else ""

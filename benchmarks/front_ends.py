@@ -27,9 +27,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.report import RESULTS, Report
-from normlift_ns.encoders import sam as sam_module
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.sam import masks as sam_module
 from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
 from normlift_ns.encoders.sam.network import SamNetwork
 from normlift_ns.encoders.sam.rules import Suppression, mask_nms, stack_masks

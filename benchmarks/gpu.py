@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from normlift_ns import (
     refine,
 )
 from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.raster.backend import Job
 from normlift_ns.raster.gsplat import project_views
 from normlift_ns.raster.settings import RasterSettings
 
@@ -139,8 +140,8 @@ def measure(report: Report, case: Case) -> None:
         gsplat512_s = timed(backward)[0] * views / min(GSPLAT_VIEWS, views)
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-        settings = RasterSettings()
-        intersections = len(project_views(case.scene, case.cameras[:1], False, settings).members)
+        job = Job(case.scene, False, RasterSettings(), torch.float32)
+        intersections = len(project_views(job, case.cameras[:1]).members)
         evidence_s, evidence = timed(case.evidence)
         evidence_gib = torch.cuda.max_memory_allocated() / 2**30
         table = features(evidence.num_regions)
@@ -179,15 +180,14 @@ def measure(report: Report, case: Case) -> None:
         add("nonzeros", evidence.nnz, "entries")
         pixels = sum(camera.width * camera.height for camera in case.cameras[:4])
         pairs = rasterize_evidence(case.scene, case.cameras[:4], case.labels[:4], weight_power=0)
-        add("contributors_per_pixel", pairs.weight.double().sum() / pixels, "Gaussians")
+        add("contributors_per_pixel", pairs.rows.weight.double().sum() / pixels, "Gaussians")
 
 
 def query_field(lifted: Lifted, source: torch.Tensor) -> SemanticField:
     """A field of the exact form without its costly facts (bytes and bounds of the other forms)."""
-    from normlift_ns.core.storage import Scalars  # noqa: PLC0415
-
-    scalars = Scalars(*(getattr(lifted, name) for name in Scalars.__dataclass_fields__))
-    return SemanticField(scalars, source, StoredEvidence(lifted.evidence, lifted.features), {"dimension": DIMENSION})
+    return SemanticField(
+        lifted.scalars, source, StoredEvidence(lifted.evidence, lifted.features), {"dimension": DIMENSION}
+    )
 
 
 def evidence_error(case: Case, evidence: Evidence) -> float:
@@ -203,11 +203,13 @@ def lift_errors(case: Case, evidence: Evidence, table: torch.Tensor, lifted: Lif
     rows = sample_rows(len(case.scene))
     chosen = evidence.rows.select_rows(rows)
     part = Evidence(
-        chosen.offsets, chosen.column, chosen.weight.double(), evidence.region_view,
-        evidence.unlabeled.select_rows(rows), evidence.num_views,
-    )  # fmt: skip
+        replace(chosen, weight=chosen.weight.double()),
+        evidence.region_view,
+        evidence.unlabeled.select_rows(rows),
+        evidence.num_views,
+    )
     exact = lift(part, table.double())
-    reliability = (lifted.reliability[rows].double() - exact.reliability).abs().max()
+    reliability = (lifted.scalars.reliability[rows].double() - exact.scalars.reliability).abs().max()
     turned = (lifted.directions(rows).double() - exact.directions()).norm(dim=1).max()
     return float(reliability), float(turned)
 
@@ -229,9 +231,9 @@ def vote_errors(case: Case, lifted: Lifted, config: RefineConfig, neighbors: Any
     )
     near.index[local[:, 0]] = local[:, 1:].int()
     near.distance[local[:, 0]] = neighbors.distance[rows].double()
-    found = refine(case.scene.means[used].double(), exact, lifted.reliability[used].double(), config, neighbors=near)[
-        local[:, 0]
-    ]
+    found = refine(
+        case.scene.means[used].double(), exact, lifted.scalars.reliability[used].double(), config, neighbors=near
+    )[local[:, 0]]
     ours = torch.searchsorted(used, source[rows].long())
     return float(((exact[found.long()] - exact[ours]).norm(dim=1) > 1e-3).float().mean())
 
@@ -261,15 +263,16 @@ def agreement(report: Report, cases: Sequence[Case]) -> None:
         for mode in ("classic", "antialiased"):
             ours, again, stock = (some.evidence(backend=b, rasterize_mode=mode) for b in ("triton", "triton", "gsplat"))
             worst = max(worst, relative_difference(ours.rows, stock.rows))
-            weight = ours.weight.double().sum() + ours.unlabeled.weight.double().sum()
+            weight = ours.rows.weight.double().sum() + ours.unlabeled.weight.double().sum()
             alpha = 0.0
             for camera in some.cameras:
-                seen = project_views(case.scene, [camera], mode == "antialiased", RasterSettings())
+                job = Job(case.scene, mode == "antialiased", RasterSettings(), torch.float32)
+                seen = project_views(job, [camera])
                 drawing = (seen.means2d, seen.conics, torch.zeros(1, len(case.scene), 1, device="cuda"), seen.opacities)
                 _, alphas = rasterize_to_pixels(*drawing, camera.width, camera.height, 16, seen.offsets, seen.members)
                 alpha += float(alphas.double().sum())
             alpha_worst = max(alpha_worst, abs(float(weight) / alpha - 1))
-            repeatable &= torch.equal(ours.weight, again.weight) and torch.equal(ours.region, again.region)
+            repeatable &= all(torch.equal(getattr(ours.rows, x), getattr(again.rows, x)) for x in ("weight", "column"))
     report.add("triton_vs_gsplat_rel", worst, "relative Frobenius norm, worst of fox and tabletop in both modes")
     report.add("weight_vs_alpha_rel", alpha_worst, "relative difference of the sums of E and of gsplat's alpha")
     report.add("bitwise_repeatable", float(repeatable), "1: yes")

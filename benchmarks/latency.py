@@ -23,12 +23,11 @@ from nerfstudio.cameras.cameras import Cameras
 from benchmarks.captures import SHARED, trained_scene, trained_state, training_cameras
 from benchmarks.cpu import clip_like_table, grid_labels
 from benchmarks.report import RESULTS, Report
-from normlift_ns import Camera, SemanticField, lift, rasterize_evidence
-from normlift_ns.asking import Answer, answer, reselect
+from normlift_ns import Camera, SemanticField, asking, lift, rasterize_evidence
+from normlift_ns.asking import Question
 from normlift_ns.core.query import CANONICAL_NEGATIVES, relevancy
-from normlift_ns.core.storage import Form
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.runs.question import Question
+from normlift_ns.options import Storage
 from normlift_ns.viewer.display import make_display
 from normlift_ns.viewer.status import report as status
 
@@ -61,7 +60,7 @@ def true_relevancy(exact_directions: torch.Tensor, question: Question) -> torch.
         for vectors in (question.vectors, question.negative_vectors)
         if vectors is not None
     )
-    return relevancy(positive, negative, form="lerf")
+    return relevancy(positive, negative, rule="lerf")
 
 
 def fox_model(device: str) -> NormLiftModel:
@@ -91,14 +90,15 @@ def measure(
     """
     device, question = model.device.type, questions()
     model.attach(field)
-    answer: Answer = answer(field, question)
+    means = model.means.detach()
+    answer = asking.answer(field, means, question)
     error = (answer.relevancy[some].double() - exact).abs().max()
 
     def whole() -> None:
         model.normlift._answer_to(question, "")
 
-    report.add(f"fox_{name}_relevancy_ms", least(device, lambda: answer(field, question)), "ms", error)
-    report.add(f"fox_{name}_threshold_ms", least(device, lambda: reselect(field, answer, 0.55, 0.1)), "ms")
+    report.add(f"fox_{name}_relevancy_ms", least(device, lambda: asking.answer(field, means, question)), "ms", error)
+    report.add(f"fox_{name}_threshold_ms", least(device, lambda: asking.reselect(answer, 0.55, 0.1)), "ms")
     report.add(f"fox_{name}_display_ms", least(device, lambda: make_display(field, answer)), "ms")
     report.add(f"fox_{name}_status_ms", least(device, lambda: status(answer, None)), "ms")
     report.add(f"fox_{name}_answer_ms", least(device, whole), "ms", error)
@@ -116,12 +116,12 @@ def main(quick: bool, device: str, output: Path) -> None:
     source = torch.arange(len(scene)).to(device)
     moved = torch.randperm(len(scene), generator=g)[: len(scene) // 5]  # about the share that the vote replaces
     source[moved] = torch.randint(0, len(scene), (len(moved),), generator=g).to(device)
-    forms: tuple[tuple[Form, torch.Tensor], ...] = (("evidence", mixed), ("float16", mixed), ("low_rank", classes))
-    for form, features in forms:
-        field = SemanticField.build(lift(evidence, features), scene.means, source, form=form)
+    ways: tuple[tuple[Storage, torch.Tensor], ...] = (("evidence", mixed), ("float16", mixed), ("low_rank", classes))
+    for storage, features in ways:
+        field = SemanticField.build(lift(evidence, features), scene.means, source, storage=storage)
         directions = lift(evidence, features.double()).directions(source[some])
         exact = true_relevancy(directions, questions()).where(field.valid()[some, None], 0.0)
-        measure(report, form, field, exact, some, model)
+        measure(report, storage, field, exact, some, model)
     camera = viewer_camera(cameras[0]).to(device)
     report.add("fox_overlay_ms", least(device, lambda: model.get_outputs_for_camera(camera)), "ms per frame")
     model.show(None)

@@ -60,12 +60,12 @@ def miou(world: World, words: Words, observed: Observed, *, low_rank: bool = Fal
     """Of the whole method, in points; stored in a basis and read again if that is asked."""
     lifted, config = lift(observed.evidence, observed.features), RefineConfig()
     near = nearest_neighbors(world.scene.means, config.k)
-    source = refine(world.scene.means, lifted.directions, lifted.reliability, config, neighbors=near).long()
+    source = refine(world.scene.means, lifted.directions, lifted.scalars.reliability, config, neighbors=near).long()
     if not low_rank:
         plain = lifted_scores(lifted, words.classes)
         scores = Scores(plain.cosine[source], plain.valid[source])
     else:
-        field = SemanticField.build(lifted, world.scene.means, source, tolerance=TOLERANCE, form="low_rank")
+        field = SemanticField.build(lifted, world.scene.means, source, tolerance=TOLERANCE, storage="low_rank")
         scores = Scores(field.query(words.classes), field.valid())
     found = classify(scores.cosine, scores.valid)
     return 100 * class_scores(confusion(world.truth, found, world.classes)).miou

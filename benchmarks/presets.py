@@ -66,20 +66,21 @@ def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
         directions = lifted.directions()
         source, row_of = (torch.arange(len(means), dtype=torch.int32, device=means.device) for _ in range(2))
         vote(
-            spatial_order(means), neighbors.index, neighbors.distance, directions, row_of, lifted.reliability, source,
+            *(spatial_order(means), neighbors.index, neighbors.distance, directions, row_of),
+            *(lifted.scalars.reliability, source),
             tau=config.tau, gamma=config.gamma, width=float(decay_width(neighbors, config)), delta=config.delta,
             precision="tf32",
         )  # fmt: skip
     else:
         read = partial(lifted.directions, dtype=torch.float16) if precision == "half" else lifted.directions
-        source = refine(means, read, lifted.reliability, config, neighbors=neighbors)
-    return Outcome(lifted.directions(source.long()), lifted.norm[source.long()] > 0), (lifted, source)
+        source = refine(means, read, lifted.scalars.reliability, config, neighbors=neighbors)
+    return Outcome(lifted.directions(source.long()), lifted.scalars.norm[source.long()] > 0), (lifted, source)
 
 
 def low_rank(case: Case, table: torch.Tensor) -> tuple[Outcome, Any]:
     """The default lift, stored in a basis that changes no cosine by more than 5e-2."""
     _, (lifted, source) = run(case, table, "float32")
-    field = SemanticField.build(lifted, case.scene.means, source, tolerance=5e-2, form="low_rank")
+    field = SemanticField.build(lifted, case.scene.means, source, tolerance=5e-2, storage="low_rank")
     return Outcome(field.directions(), field.valid()), None
 
 

@@ -47,8 +47,8 @@ def evidence_table(world: World, words: Words, report: Report) -> None:
             lifted = lift(observed.evidence, observed.features)
             scores = lifted_scores(lifted, words.classes.to(world.truth.device))
             answer = classify(scores.cosine, scores.valid)
-            shown = signals(lifted, world.scene.opacities, world.truth, answer) if step == STEP else {}
-            found.append(shown | mistakes(lifted.reliability, world.truth, answer))
+            shown = signals(lifted.scalars, world.scene.opacities, world.truth, answer) if step == STEP else {}
+            found.append(shown | mistakes(lifted.scalars.reliability, world.truth, answer))
         for key in found[0]:
             report.add(f"{world.name}.{step}.{key}", float(np.mean([one[key] for one in found])), "of 1")
 

@@ -12,7 +12,7 @@ PREFIXES = {"tabletop": "", "demo": "demo."}
 """Prefix of the keys of accuracy.json, by scene."""
 FLAGS = {
     "exact": "`--precision double`", "float32": "default", "half_resolution": "`--lift-downscale 2`",
-    "every_second_view": "`--max-views` half", "low_rank": "`--form low_rank --tolerance 0.05`",
+    "every_second_view": "`--max-views` half", "low_rank": "`--storage low_rank --tolerance 0.05`",
 }  # fmt: skip
 
 

@@ -40,8 +40,8 @@ class Scores(NamedTuple):
 def lifted_scores(lifted: Lifted, classes: Tensor) -> Scores:
     """Cosines of the unrefined directions."""
     sums = lifted.evidence.rows.matmul(lifted.features @ classes.T.to(lifted.features))
-    length = (lifted.weight * lifted.norm)[:, None]
-    valid = lifted.norm > 0
+    length = (lifted.scalars.weight * lifted.scalars.norm)[:, None]
+    valid = lifted.scalars.norm > 0
     return Scores(torch.where(valid[:, None], sums / length, 0.0), valid)
 
 
@@ -63,7 +63,7 @@ def refined_scores(
     config = config or RefineConfig()
     if variant == "none":
         return scores
-    reliability = variant_reliability(variant, lifted)
+    reliability = variant_reliability(variant, lifted.scalars)
     if variant == "linear":
         return _average(reliability, scores, neighbors, config)
     source = refine(means, lifted.directions, reliability, config, neighbors=neighbors).long()
@@ -102,8 +102,8 @@ def centre_evidence(world: World) -> Evidence:
         cell[here] = torch.where(inside, cells.of_pixel[v, y, x].long(), -1)
     cell = cell.to(row.device)
     kept = cell >= 0
-    found = SparseRows.from_coo(row[kept], cell[kept], weights.weight[kept].to(world.evidence.weight), len(means))
-    return replace(world.evidence, offsets=found.offsets, region=found.column, weight=found.weight)
+    found = SparseRows.from_coo(row[kept], cell[kept], weights.weight[kept].to(world.evidence.rows.weight), len(means))
+    return replace(world.evidence, rows=found)
 
 
 def top_evidence(world: World, top: int = TOP) -> Evidence:
@@ -122,7 +122,7 @@ def top_evidence(world: World, top: int = TOP) -> Evidence:
         found = SparseRows.from_coo(gaussian, of_pixel[pixel].long(), weight, size)
         parts.append((found.row_index(), found.column, found.weight))
     rows = SparseRows.stack(parts, size, world.scene.means.device)
-    return replace(world.evidence, offsets=rows.offsets, region=rows.column, weight=rows.weight)
+    return replace(world.evidence, rows=rows)
 
 
 def median_scores(observed: Observed, classes: Tensor, gaussians: Tensor | None = None, *, steps: int = 10) -> Scores:

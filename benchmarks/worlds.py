@@ -125,7 +125,7 @@ def cell_evidence(
 
 def truth_of(evidence: Evidence, cells: Cells, classes: int) -> Tensor:
     """Class of every Gaussian by the exact masks, see `PURITY` and `WEIGHT`."""
-    one_hot = torch.nn.functional.one_hot(cells.mask + 1, classes + 1).to(evidence.weight)
+    one_hot = torch.nn.functional.one_hot(cells.mask + 1, classes + 1).to(evidence.rows.weight)
     weights = evidence.rows.matmul(one_hot)
     total = weights.sum(1)
     share, best = weights[:, 1:].max(dim=1)

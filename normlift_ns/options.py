@@ -97,16 +97,16 @@ class RefineConfig:
     """
 
     k: int = 36
-    """Number of neighbours K, at least 1."""
+    """Number of neighbours K in the vote, at least 1."""
     sigma_d: float = 1.0
-    """Width of the spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest one at
+    """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest one at
     another place, because scenes are rescaled."""
     tau: float = 0.95
-    """Cosine at which two directions half agree, in -1..1."""
+    """Cosine at which two directions half agree in the vote, in -1..1."""
     gamma: float = 0.4
     """Softness of that agreement, > 0."""
     delta: float = 0.0
-    """Margin Delta by which the best neighbour must win, >= 0."""
+    """Margin Delta by which the best neighbour must win the vote, >= 0."""
 
     def __post_init__(self) -> None:
         for name, valid, expected in (

@@ -68,7 +68,7 @@ def random_evidence(
 
     labeled = rows(s)
     region_view = torch.repeat_interleave(torch.arange(views), counts).int()
-    return Evidence(labeled.offsets, labeled.column, labeled.weight, region_view, rows(views), views)
+    return Evidence(labeled, region_view, rows(views), views)
 
 
 def dense(rows: SparseRows, columns: int) -> Tensor:

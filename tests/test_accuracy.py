@@ -110,9 +110,9 @@ def test_each_damage_does_what_its_name_says(world):
     assert len(columns(dropped=0.5).features) < 24
     few = columns(views=2)
     assert (few.evidence.num_views, len(few.features)) == (2, 8)
-    assert few.evidence.weight.sum() < plain.evidence.weight.sum()
+    assert few.evidence.rows.weight.sum() < plain.evidence.rows.weight.sum()
     heavy = columns(dominant=64.0)
-    assert heavy.evidence.weight.sum() > 5 * plain.evidence.weight.sum()
+    assert heavy.evidence.rows.weight.sum() > 5 * plain.evidence.rows.weight.sum()
     assert torch.equal(heavy.columns, plain.columns)
     for moved in ("shifted", "pose"):
         assert 0.05 < float((columns(**{moved: 8.0}).columns != plain.columns).float().mean()) < 0.9
@@ -147,7 +147,7 @@ def test_votes_of_the_fit_are_those_of_refine(world):
     observed = observe(world, WORDS, LADDER["hard"], 5)
     lifted = lift(observed.evidence, observed.features)
     for config in (RefineConfig(), RefineConfig(k=12, tau=0.7, gamma=0.1, sigma_d=1.5, delta=0.0)):
-        expected = refine(world.scene.means, lifted.directions, lifted.reliability, config)[voters]
+        expected = refine(world.scene.means, lifted.directions, lifted.scalars.reliability, config)[voters]
         same = (one.sources(config, one.reliability(1.0)) == expected).float().mean()
         assert same > 0.97  # cosines are kept in half precision
 
@@ -195,10 +195,10 @@ def test_other_methods(world):
     everything = top_evidence(world, top=10_000)
     size = world.evidence.num_regions
     assert torch.allclose(dense(everything.rows, size), dense(world.evidence.rows, size), rtol=1e-3, atol=1e-5)
-    assert top_evidence(world, top=1).weight.sum() < everything.weight.sum()
+    assert top_evidence(world, top=1).rows.weight.sum() < everything.rows.weight.sum()
     observed = observe(world, WORDS, Damage(noise=0.0), 0)
     median = median_scores(observed, WORDS.classes)
-    assert torch.equal(median.valid, lift(observed.evidence, observed.features).norm > 0)
+    assert torch.equal(median.valid, lift(observed.evidence, observed.features).scalars.norm > 0)
     some = median_scores(observed, WORDS.classes, torch.tensor([5, 17]))
     assert torch.allclose(some.cosine[[5, 17]], median.cosine[[5, 17]], atol=1e-6)
 

@@ -1,8 +1,9 @@
-"""Imports go one way, and the package imports nothing heavy."""
+"""Imports go one way and in no circle; the package imports nothing heavy; nerfstudio is known to few."""
 
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,67 +11,141 @@ import pytest
 import normlift_ns
 
 ROOT = Path(normlift_ns.__file__).parent
+LAYERS = (
+    ("options",),
+    ("kernels",),
+    ("core",),
+    ("raster", "encoders"),
+    ("observing", "objects"),
+    ("lifting", "asking"),
+    ("runs",),
+    ("viewer",),
+    ("nerfstudio_plugin",),
+    ("lifted_run", "method_configs", "plugin"),
+    ("evaluation", "demo"),
+    ("scripts",),
+)
+"""From the ground up: a module imports from its own package and from lower layers only."""
+FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
-ALLOWED = {
+FOREIGN = {
+    "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
-    "core": BASE | {"normlift_ns.kernels", "normlift_ns.core"},
-    "raster": BASE | {"numba", "gsplat", "normlift_ns.kernels", "normlift_ns.core", "normlift_ns.raster"},
-    "encoders": BASE
-    | {
-        "open_clip",
-        "matplotlib",
-        "skimage",
-        "PIL",
-        "huggingface_hub",
-        "torchvision",
-        *(f"normlift_ns.{x}" for x in ("core", "encoders")),
-    },
-    "demo": BASE | {"nerfstudio", "matplotlib", "PIL", *(f"normlift_ns.{x}" for x in ("core", "raster", "demo"))},
-    "plugin": BASE
-    | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "matplotlib", "plyfile"}
-    | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin")},
-    "evaluation": BASE
-    | {"cv2", "plyfile", "skimage", "matplotlib"}
-    | {f"normlift_ns.{x}" for x in ("core", "raster", "encoders", "plugin", "evaluation")},
+    "core": BASE,
+    "raster": {"torch", "numpy", "jaxtyping", "numba", "gsplat"},
+    "encoders": BASE | {"open_clip", "matplotlib", "skimage", "PIL", "huggingface_hub", "torchvision"},
+    "observing": {"torch", "jaxtyping"},
+    "objects": BASE,
+    "lifting": {"torch"},
+    "asking": {"torch", "numpy", "jaxtyping"},
+    "runs": BASE | {"plyfile"},
+    "viewer": {"torch", "jaxtyping", "matplotlib"},
+    "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml"},
+    "lifted_run": {"torch", "numpy", "jaxtyping"},
+    "method_configs": {"nerfstudio"},
+    "plugin": set(),
+    "evaluation": BASE | {"cv2", "plyfile", "skimage", "matplotlib"},
+    "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
+    "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser"},
 }
+"""What is not of this package and not of Python, by layer."""
+KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/run.py")
+FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
+MOST_MODULES = 18
 
 
-def imported(path: Path) -> set[str]:
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+def layer(path: Path) -> str:
+    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def module(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imports(path: Path) -> Iterator[tuple[str, bool]]:
+    """Modules that a file imports, wherever it does, and whether while it is itself imported."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        for child in ast.iter_child_nodes(node):
+            child.parent = node  # type: ignore[attr-defined]
+    for node in ast.walk(tree):
+        names = []
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path} uses a relative import"
-            names |= {
-                f"{node.module}.{alias.name}" if node.module == "normlift_ns" else node.module or ""
-                for alias in node.names
-            }
-    return names
+            found = [f"{node.module}.{alias.name}" for alias in node.names]
+            modules = {module(file) for file in FILES}
+            names = [name if name in modules else node.module or "" for name in found]
+        parent, now = node, True
+        while parent is not tree:
+            parent = parent.parent  # type: ignore[attr-defined]
+            typing = isinstance(parent, ast.If) and ast.unparse(parent.test) == "TYPE_CHECKING"
+            now &= not (typing or isinstance(parent, ast.FunctionDef))
+        yield from ((name, now) for name in names)
 
 
-@pytest.mark.parametrize("layer", ALLOWED)
-def test_imports_go_downwards(layer):
-    files = sorted((ROOT / layer).rglob("*.py"))
-    assert len(files) > 3
-    for path in files:
-        for name in imported(path):
-            if name.split(".")[0] in sys.stdlib_module_names:
+@pytest.mark.parametrize("path", FILES, ids=module)
+def test_imports_go_downwards(path):
+    here = layer(path)
+    for name, _ in imports(path):
+        top, *rest = name.split(".")
+        if top == "normlift_ns":
+            assert len(rest) > 0, f"{path} imports the face of the package"
+            there = rest[0]
+            if there == "__version__":
                 continue
-            parts = name.split(".")
-            prefixes = {".".join(parts[: i + 1]) for i in range(len(parts))}
-            assert prefixes & ALLOWED[layer], f"{path.relative_to(ROOT)} imports {name}"
+            assert there == here or FLOOR[there] < FLOOR[here], f"{module(path)} imports {name} from above"
+        elif top not in sys.stdlib_module_names:
+            assert top in FOREIGN[here], f"{module(path)} imports {name}"
 
 
-def test_importing_the_package_is_light():
-    heavy = ("nerfstudio", "gsplat", "open_clip", "numba", "matplotlib", "triton")
-    code = f"import normlift_ns, sys; print([m for m in {heavy!r} if m in sys.modules])"
+@pytest.mark.parametrize("path", FILES, ids=module)
+def test_only_the_plugin_knows_nerfstudio(path):
+    known = path.relative_to(ROOT).as_posix().startswith(KNOW_NERFSTUDIO)
+    found = [name for name, _ in imports(path) if name.split(".")[0] == "nerfstudio"]
+    assert known or found == []
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    arrows = {module(path): {name for name, _ in imports(path)} for path in FILES}
+    open_modules = {name: arrows[name] & set(arrows) - {name} for name in arrows}
+    while leaves := [name for name, needs in open_modules.items() if len(needs) == 0]:
+        for name in leaves:
+            del open_modules[name]
+        for needs in open_modules.values():
+            needs -= set(leaves)
+    assert open_modules == {}
+
+
+def test_no_folder_is_crowded():
+    folders = {path.parent for path in FILES}
+    crowded = {str(f.relative_to(ROOT)): n for f in folders if (n := len(list(f.glob("*.py")))) > MOST_MODULES}
+    assert crowded == {}
+
+
+def loaded(code: str, names: set[str]) -> str:
+    """Which of the modules a program has imported."""
+    program = f"import sys; {code}; print(sorted({names!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout.strip().splitlines()[-1]
+
+
+def test_importing_the_package_costs_nothing():
+    heavy = {"torch", "numpy", "nerfstudio", "scipy", "open_clip", "gsplat", "numba", "matplotlib", "triton"}
+    assert loaded("import normlift_ns; normlift_ns.__version__", heavy) == "[]"
+    assert loaded("import normlift_ns.scripts.lift", heavy) == "[]"
     assert (
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+        loaded("import normlift_ns; normlift_ns.lift, normlift_ns.render", heavy - {"torch", "numpy", "scipy"}) == "[]"
     )
+    assert loaded("import normlift_ns.lifted_run", {"nerfstudio", "open_clip", "gsplat"}) == "[]"
 
 
-def test_public_names_exist_and_have_docstrings():
+def test_public_names_exist_and_have_docstrings_with_examples():
+    assert set(normlift_ns.__all__) <= set(dir(normlift_ns))
     for name in normlift_ns.__all__:
         member = getattr(normlift_ns, name)
-        assert isinstance(member, tuple) or member.__doc__, name
+        if not isinstance(member, tuple):
+            assert ">>>" in member.__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = normlift_ns.nothing

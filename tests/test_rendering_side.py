@@ -35,7 +35,7 @@ def test_least_squares_renders_better_and_leaves_the_sphere():
     B = torch.where(in_front[:, None], classes[0], classes[1])  # what a mask with one vector per region says
 
     lifted = lift(evidence, B)
-    f = lifted.norm[:, None] * lifted.directions()
+    f = lifted.scalars.norm[:, None] * lifted.directions()
     joint = torch.linalg.lstsq(A, B, driver="gelsd").solution
 
     def residual(u: torch.Tensor) -> float:
@@ -49,7 +49,7 @@ def test_least_squares_renders_better_and_leaves_the_sphere():
     # 3D side: back-projection is optimal for every single Gaussian; least squares is not.
     gain = alignment(f) - alignment(joint)
     assert (gain >= -1e-9).all()
-    assert gain.max() > 0.05 * lifted.weight.max()
+    assert gain.max() > 0.05 * lifted.scalars.weight.max()
     # Back-projected norms are shares of agreement; those of least squares are no such thing.
     assert (f.norm(dim=1) <= 1).all()
     assert joint.norm(dim=1).max() > 1.2

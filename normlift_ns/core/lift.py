@@ -161,7 +161,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
             f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
             f"{features.dtype} {tuple(features.shape)}"
         )
-    exact = features.to(evidence.weight.device, torch.float64)
+    exact = features.to(evidence.rows.weight.device, torch.float64)
     length = torch.linalg.vector_norm(exact, dim=1)
     bad = (~((length - 1).abs() < 1e-2)).nonzero().squeeze(1)
     if bad.numel() > 0:
@@ -170,7 +170,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
             f"{bad.numel()} of {len(features)} feature rows are not unit vectors ({shown}); normalise them, "
             "and label regions without a feature -1"
         )
-    double = torch.float64 in (evidence.weight.dtype, features.dtype)
+    double = torch.float64 in (evidence.rows.weight.dtype, features.dtype)
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
 

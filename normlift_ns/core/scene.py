@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -24,6 +24,7 @@ class View(NamedTuple):
     """Image file relative to the dataset, with forward slashes."""
 
 
+@runtime_checkable
 class Views(Protocol):
     """Photographs as the scene was trained on them, undistorted; each is read when it is asked for."""
 
@@ -39,8 +40,6 @@ class Views(Protocol):
 
     def __len__(self) -> int: ...
 
-    def __iter__(self) -> Iterator[View]: ...
-
     def __getitem__(self, index: int, /) -> View:
         """Reads one photograph.
 
@@ -50,6 +49,7 @@ class Views(Protocol):
         ...
 
 
+@runtime_checkable
 class Scene(Protocol):
     """A trained splat and the photographs that it was trained with."""
 

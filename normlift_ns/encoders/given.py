@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from hashlib import blake2b
 from typing import Any
 
@@ -45,7 +44,7 @@ class GivenFeatures:
         if len(lengths) > 1:
             raise ValueError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
 
-    @cached_property
+    @property
     def identity(self) -> dict[str, Any]:
         """Features count by their content."""
         digest = blake2b(digest_size=16)

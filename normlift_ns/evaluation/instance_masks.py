@@ -78,7 +78,7 @@ def gaussian_truth(
         min_weight: least weight in all views together, in pixels; -1 below either.
     """
     columns = torch.arange(evidence.num_regions) % classes
-    by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.weight))
+    by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.rows.weight))
     total = by_class.sum(1) + evidence.unlabeled.row_sums().to(by_class)
     best = by_class.max(dim=1)
     known = (total >= min_weight) & (best.values >= purity * total)

@@ -32,14 +32,19 @@ class FrameScores(NamedTuple):
 
 
 def found_mask(
-    score: Float[Tensor, "h w"], background: Float[Tensor, "h w b"], masking: Masking, *, margin: float, instances: int
+    score: Float[Tensor, "h w"],
+    background: Float[Tensor, "h w b"],
+    masking: Masking,
+    *,
+    margin: float,
+    instances: int,
 ) -> Bool[Tensor, "h w"]:
     """The pixels that a prompt is found in.
 
     Args:
-        masking: "background": score above every background word by the margin. "auto": SFS's threshold from the histogram
-            of the scores; it is told the number of true instances. "langsplat": the relevancy, scaled to 0..1 over the
-            image, must exceed 0.7 (0.4 after 2 x - 1), by the majority in 7 x 7 pixels.
+        masking: "background": score above every background word by the margin. "auto": SFS's threshold from the
+            histogram of the scores; it is told the number of true instances. "langsplat": the relevancy, scaled to
+            0..1 over the image, must exceed 0.7 (0.4 after 2 x - 1), by the majority in 7 x 7 pixels.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin

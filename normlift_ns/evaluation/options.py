@@ -40,7 +40,7 @@ class LerfOptions:
     clean: bool = False
     """Open, close, keep the largest component and fill its holes. SFS's code does so; the paper does not say."""
     scale: Literal["unit", "norm"] = "unit"
-    """What is composited: cosines (unit), or cosines times ||f|| as in SFS, whose features are not normalised (norm)."""
+    """What is composited. unit: cosines. norm: cosines times ||f||, as in SFS, whose features are not normalised."""
 
 
 @dataclass(frozen=True)

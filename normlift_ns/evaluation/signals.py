@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from normlift_ns.core.lift import Lifted
+from normlift_ns.core.lift import Scalars
 from normlift_ns.core.metrics import NO_CLASS, bin_means, kendall, lowest_jaccard, spearman
-from normlift_ns.core.storage import Scalars
 
 SAMPLE = 20_000
 """Gaussians of which Kendall's tau is taken, which is slow."""
@@ -21,7 +20,7 @@ HISTOGRAM = 20
 
 
 def signals(
-    lifted: Lifted | Scalars,
+    scalars: Scalars,
     opacity: Float[Tensor, " n"],
     truth: Int[Tensor, " n"] | None = None,
     found: Int[Tensor, " n"] | None = None,
@@ -39,8 +38,8 @@ def signals(
         truth: class of every Gaussian.
         found: class that the unrefined direction answers.
     """
-    reliability, seen = lifted.reliability, lifted.reliability > 0
-    views = lifted.view_count.double()
+    reliability, seen = scalars.reliability, scalars.reliability > 0
+    views = scalars.view_count.double()
     correct = None if truth is None or found is None else (found == truth)
     known = torch.ones_like(seen) if truth is None else truth != NO_CLASS
     out: dict[str, float] = {}
@@ -57,7 +56,7 @@ def signals(
     out["opacity.jaccard"] = lowest_jaccard(r, o)
     out |= {f"opacity.quintile{i + 1}": x for i, x in enumerate(_bins(r, o, 5))}
     if correct is not None:
-        for name, key in (("reliability", reliability), ("norm", lifted.norm)):
+        for name, key in (("reliability", reliability), ("norm", scalars.norm)):
             bins = accuracy_bins(key[known], correct[known])
             out |= {f"{name}.bin{i + 1}": x for i, x in enumerate(bins)}
             order = torch.arange(len(bins), dtype=torch.float64)

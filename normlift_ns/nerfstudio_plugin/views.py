@@ -33,7 +33,7 @@ def to_camera(
 
 
 class DatasetViews:
-    """`Views`: photographs of one split of a dataset, in dataset order; each is read and undistorted when it is asked for.
+    """`Views`: photographs of one split of a dataset, in its order; each is read and undistorted when it is asked for.
 
     Images, masks and intrinsics are those of `FullImageDatamanager.cached_train`, which holds all of them in memory
     (and pins that memory, which needs CUDA).
@@ -83,9 +83,13 @@ class DatasetViews:
             image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
         return View(self.cameras[index], image, None if mask is None else mask[:, :, 0], self.names[index])
 
-    @cached_property
+    @property
     def cameras(self) -> list[Camera]:
         """All cameras, those of the undistorted images; reads no image."""
+        return self._cameras
+
+    @cached_property
+    def _cameras(self) -> list[Camera]:
         return [self._camera(i) for i in range(len(self))]
 
     def _camera(self, index: int) -> Camera:

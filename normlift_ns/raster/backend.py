@@ -1,11 +1,11 @@
-"""The ways to rasterize: one protocol, one table."""
+"""What every way to rasterize looks like. The table of all of them is in `raster.backends`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float, Int32
@@ -13,11 +13,8 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.gpu import has_triton
 from normlift_ns.raster.projection import Projected, Tiles, World, assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
-
-BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class TileBackend:
     on: str | None = None
     """The only type of device that it works on; None: any."""
 
-    def check(self, job: Job) -> None:
+    def check(self, job: Job) -> None:  # noqa: D102 (as in the protocol)
         device = job.scene.means.device
         if self.on is not None and device.type != self.on:
             raise ValueError(
@@ -84,7 +81,7 @@ class TileBackend:
                 'use backend="torch"'
             )
 
-    def views_evidence(
+    def views_evidence(  # noqa: D102 (as in the protocol)
         self,
         job: Job,
         cameras: Sequence[Camera],
@@ -95,62 +92,9 @@ class TileBackend:
         (camera,), (label_map,), (count,) = cameras, labels, num_regions
         return self.kernels.view_evidence(*job.seen_by(camera), label_map, count, weight_power, job.settings)
 
-    def composite(
+    def composite(  # noqa: D102 (as in the protocol)
         self, job: Job, camera: Camera, values: Float[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
         projected, tiles = job.seen_by(camera)
         drawn = values[projected.gaussian].to(projected.opacities.dtype)
         return self.kernels.composite(projected, tiles, drawn, camera.width, camera.height, job.settings)
-
-
-def _torch() -> Backend:
-    from normlift_ns.raster import reference  # noqa: PLC0415 (each backend loads where it is used)
-
-    return TileBackend("torch", reference)
-
-
-def _numba() -> Backend:
-    from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
-
-    return TileBackend("numba", numba, on="cpu")
-
-
-def _gsplat() -> Backend:
-    from normlift_ns.raster import gsplat  # noqa: PLC0415
-
-    return gsplat
-
-
-def _triton() -> Backend:
-    from normlift_ns.raster import triton  # noqa: PLC0415
-
-    return triton
-
-
-BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
-"""All backends by name, in the order from the most general to the fastest."""
-
-
-def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend]:
-    """The backend of a name, checked; "auto": the fastest that can do the job.
-
-    Args:
-        pictures: composite values; False: sum evidence.
-    Raises:
-        ValueError: an unknown name, or a backend that cannot do the job.
-    """
-    if name == "auto":
-        name = _fastest(job, pictures)
-    if name not in BACKENDS:
-        raise ValueError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
-    backend = BACKENDS[name]()
-    backend.check(job)
-    return name, backend
-
-
-def _fastest(job: Job, pictures: bool) -> str:
-    if job.scene.means.device.type == "cpu":
-        return "numba"
-    if pictures or not job.scene.means.is_cuda or job.dtype != torch.float32 or job.scene.means.dtype != torch.float32:
-        return "torch"
-    return "triton" if has_triton() else "gsplat"

@@ -69,8 +69,8 @@ def check(job: Job) -> None:
     means = job.scene.means
     if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
         raise ValueError(
-            f"gsplat draws float32 on a GPU, this is a {means.dtype} scene on {means.device}, to be computed in "
-            f'{job.dtype}; move it (scene.to("cuda")), or use backend="torch", which knows every device and precision'
+            f"gsplat computes in float32 on a GPU; this scene is {means.dtype} on {means.device}, and wanted is "
+            f'{job.dtype}. Move it (scene.to("cuda")), or use backend="torch", which knows every device and precision'
         )
     if not _gsplat_version().startswith("1.4."):
         raise ValueError(

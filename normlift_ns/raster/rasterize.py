@@ -16,7 +16,8 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.gpu import in_parts
 from normlift_ns.core.scene import Scene
 from normlift_ns.options import RasterizeMode
-from normlift_ns.raster.backend import BackendName, Job, choose_backend
+from normlift_ns.raster.backend import Job
+from normlift_ns.raster.backends import BackendName, choose_backend
 from normlift_ns.raster.settings import RasterSettings
 
 Progress = Callable[[int, int | None], None]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 from dataclasses import fields, is_dataclass
+from importlib.metadata import version
 from typing import Annotated, Any, Protocol, get_type_hints
 
 import docstring_parser
 import tyro
 from rich.console import Console
-
-from normlift_ns import __version__
 
 CONSOLE = Console(width=120)
 
@@ -29,7 +28,7 @@ def run_command(command: type[Command]) -> None:
     Errors of flags, input, files, disks and memory become a message and exit code 1, Ctrl-C exit code 130.
     """
     if "--version" in sys.argv[1:]:
-        print(f"normlift_ns {__version__}")
+        print(f"normlift_ns {version('normlift-ns')}")
         return
     tyro.extras.set_accent_color("bright_yellow")
     try:
@@ -45,19 +44,20 @@ def run_command(command: type[Command]) -> None:
         sys.exit(130)
 
 
-def with_help(options: Any) -> Any:
+def with_help(options: Any, *, nested: bool = False) -> Any:
     """The dataclass, with the docstring under each field as the help of its flag, and the first paragraph of its own as
     the help of all of them.
 
-    tyro reads docstrings itself, but keeps the line breaks that are there because lines of code are short.
+    tyro reads docstrings itself, but keeps the line breaks that are there because lines of code are short. Options in
+    the options of a command join their group.
     """
     hints = get_type_hints(options, include_extras=True)
     texts = {found.arg_name: found.description or "" for found in docstring_parser.parse_from_object(options).params}
     for field in fields(options):
-        text = texts.get(field.name, "")
-        if is_dataclass(hints[field.name]):
-            with_help(hints[field.name])
-            text = hints[field.name].__doc__
-        options.__annotations__[field.name] = Annotated[hints[field.name], tyro.conf.arg(help=" ".join(text.split()))]
+        hint, text, name = hints[field.name], texts.get(field.name, ""), None
+        if is_dataclass(hint):
+            with_help(hint, nested=True)
+            text, name = hint.__doc__ or "", "" if nested else None
+        options.__annotations__[field.name] = Annotated[hint, tyro.conf.arg(name=name, help=" ".join(text.split()))]
     options.__doc__ = " ".join((options.__doc__ or "").split("\n\n")[0].split())
     return options

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -14,11 +16,11 @@ SEEDS = st.integers(0, 2**31)
 
 
 def same(a: Evidence, b: Evidence) -> bool:
-    arrays = ("offsets", "region", "weight", "region_view")
-    blank = ("offsets", "column", "weight")
+    arrays = ("offsets", "column", "weight")
     return (
-        all(torch.equal(getattr(a, name), getattr(b, name)) for name in arrays)
-        and all(torch.equal(getattr(a.unlabeled, name), getattr(b.unlabeled, name)) for name in blank)
+        torch.equal(a.region_view, b.region_view)
+        and all(torch.equal(getattr(a.rows, name), getattr(b.rows, name)) for name in arrays)
+        and all(torch.equal(getattr(a.unlabeled, name), getattr(b.unlabeled, name)) for name in arrays)
         and (a.num_views, a.weight_power, a.num_excluded) == (b.num_views, b.weight_power, b.num_excluded)
     )
 
@@ -87,9 +89,9 @@ def test_regrouping_columns_into_themselves_changes_nothing():
     twice = evidence.regroup(torch.arange(sum(VIEWS)).expand(2, -1), evidence.region_view)
     features = unit_rows(sum(VIEWS), 8, 0)
     one, two = (lift(e, features, unlabeled="dilute") for e in (evidence, twice))
-    assert torch.allclose(two.weight, 2 * one.weight, rtol=1e-14)
+    assert torch.allclose(two.scalars.weight, 2 * one.scalars.weight, rtol=1e-14)
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability"):
-        assert torch.allclose(getattr(two, name), getattr(one, name), rtol=1e-12), name
+        assert torch.allclose(getattr(two.scalars, name), getattr(one.scalars, name), rtol=1e-12), name
 
 
 def test_regrouping_refuses_columns_that_do_not_fit():
@@ -130,8 +132,8 @@ def test_cells_give_the_evidence_of_every_level(seed, power, dtype):
         tolerance = 1e-13 if dtype == torch.float64 else 1e-6
         assert torch.allclose(dense(found.rows, 8), dense(alone.rows, 8), rtol=tolerance, atol=0)
         assert torch.allclose(dense(found.unlabeled, 2), dense(alone.unlabeled, 2), rtol=tolerance, atol=0)
-        assert torch.equal(found.region, alone.region)
-        assert found.weight.dtype == alone.weight.dtype == dtype
+        assert torch.equal(found.rows.column, alone.rows.column)
+        assert found.rows.weight.dtype == alone.rows.weight.dtype == dtype
 
 
 def test_merge_refuses_other_scenes():
@@ -156,9 +158,9 @@ def test_pruning_stays_within_its_bound(seed, relative):
     features = unit_rows(sum(VIEWS), 8, seed)
     smaller, bound = evidence.prune(relative=relative)
     before, after = lift(evidence, features), lift(smaller, features)
-    f, g = before.norm[:, None] * before.directions(), after.norm[:, None] * after.directions()
+    f, g = before.scalars.norm[:, None] * before.directions(), after.scalars.norm[:, None] * after.directions()
     assert ((f - g).norm(dim=1) <= bound + 1e-12).all()
-    assert ((before.norm - after.norm).abs() <= bound + 1e-12).all()
+    assert ((before.scalars.norm - after.scalars.norm).abs() <= bound + 1e-12).all()
     has = evidence.rows.row_sums() > 0
     assert (smaller.rows.row_sums()[has] > 0).all()
     assert same(evidence.prune(relative=0.0)[0], evidence)
@@ -168,9 +170,9 @@ def test_pruning_drops_something_and_says_what():
     weight = torch.tensor([1.0, 0.25, 0.01, 2.0])
     rows = SparseRows.from_coo(torch.tensor([0, 0, 0, 1]), torch.tensor([0, 1, 2, 0]), weight, 3)
     blank = SparseRows.from_coo(torch.zeros(0).int(), torch.zeros(0).int(), torch.zeros(0), 3)
-    evidence = Evidence(rows.offsets, rows.column, rows.weight, torch.zeros(3).int(), blank, 1)
+    evidence = Evidence(rows, torch.zeros(3).int(), blank, 1)
     smaller, bound = evidence.prune(relative=0.1)
-    assert smaller.weight.tolist() == pytest.approx([1, 0.25, 2])
+    assert smaller.rows.weight.tolist() == pytest.approx([1, 0.25, 2])
     assert bound.tolist() == pytest.approx([2 * 0.01 / 1.26, 0, 0])
     with pytest.raises(ValueError, match=r"relative must be in 0\.\.1"):
         evidence.prune(relative=1.5)
@@ -218,12 +220,14 @@ def test_from_entries_keeps_unlabelled_weight_apart():
 
 def test_disagreeing_arrays_are_refused():
     e = random_evidence(5, [2, 2], 0)
-    with pytest.raises(ValueError, match=r"region must be in 0\.\.1"):
-        Evidence(e.offsets, e.region, e.weight, e.region_view[:2], e.unlabeled, 2)
+    with pytest.raises(ValueError, match=r"column must be in 0\.\.1"):
+        replace(e, region_view=e.region_view[:2])
     with pytest.raises(ValueError, match="one per Gaussian"):
-        Evidence(e.offsets[:-1], e.region[: e.offsets[-2]], e.weight[: e.offsets[-2]], e.region_view, e.unlabeled, 2)
+        replace(e, rows=e.rows.select_rows(torch.arange(4)))
+    with pytest.raises(ValueError, match="arrays disagree"):
+        replace(e, rows=replace(e.rows, weight=e.rows.weight[1:]))
     with pytest.raises(ValueError, match="region_view must be non-decreasing"):
-        Evidence(e.offsets, e.region, e.weight, e.region_view.flip(0), e.unlabeled, 2)
+        replace(e, region_view=e.region_view.flip(0))
 
 
 @settings(deadline=None)

@@ -1,13 +1,14 @@
 """What is stored answers like the lift that made it, within the bound it states."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, Lifted, SemanticField, lift, relevancy
+from normlift_ns import Lifted, SemanticField, lift, relevancy
 from normlift_ns.core.field import fingerprint
 from normlift_ns.core.lowrank import basis_of_rank, spectral_table
 from normlift_ns.core.storage import StoredEvidence
@@ -35,7 +36,7 @@ def example(
 @pytest.mark.parametrize("refined", [True, False])
 def test_every_form_answers_within_its_bound_after_a_round_trip(form, refined, tmp_path):
     lifted, means, source = example()
-    field = SemanticField.build(lifted, means, source, form=form, tolerance=2e-3)
+    field = SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)
     field.save(tmp_path / "normlift")
     loaded = SemanticField.load(tmp_path / "normlift", means)
     text = 10 * unit_rows(20, D, 9).float()
@@ -50,13 +51,13 @@ def test_every_form_answers_within_its_bound_after_a_round_trip(form, refined, t
     assert (loaded.query(text, refined=refined)[~loaded.valid(refined=refined)] == 0).all()
     assert 0 < int((~loaded.valid(refined=False)).sum()) < N  # the example has Gaussians without evidence
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "view_count"):
-        assert torch.equal(getattr(loaded.scalars, name), getattr(lifted, name))
+        assert torch.equal(getattr(loaded.scalars, name), getattr(lifted.scalars, name))
 
 
 def test_sizes_are_those_of_the_files(tmp_path):
     lifted, means, source = example()
     for form in FORMS:
-        field = SemanticField.build(lifted, means, source, form=form, tolerance=2e-3)
+        field = SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)
         field.save(tmp_path / form)
         stored = sum(p.stat().st_size for p in (tmp_path / form).glob("*.safetensors"))
         shared = 4 * 8 * N  # seven scalars and the source of each Gaussian
@@ -74,9 +75,9 @@ def test_auto_takes_the_smallest_form_within_the_tolerance():
 
 def test_no_row_is_stored_without_evidence():
     lifted, means, _ = example()
-    field = SemanticField.build(lifted, means, form="float16")
+    field = SemanticField.build(lifted, means, storage="float16")
     assert not isinstance(field.store, StoredEvidence)
-    assert len(field.store.coordinates) == int((lifted.norm > 0).sum()) < N
+    assert len(field.store.coordinates) == int((lifted.scalars.norm > 0).sum()) < N
 
 
 @settings(deadline=None, max_examples=30)
@@ -111,7 +112,7 @@ def test_measured_error_never_exceeds_the_bound_on_real_clip_vectors(noise, tole
     exact = lifted.directions()
     text = clip_vectors()
     for form in forms:
-        answer = SemanticField.build(lifted, torch.rand(300, 3), form=form, tolerance=tolerance).query(
+        answer = SemanticField.build(lifted, torch.rand(300, 3), storage=form, tolerance=tolerance).query(
             text, refined=False
         )
         worst = (answer.double() - exact @ text.T).abs().max().item()
@@ -126,9 +127,9 @@ def test_near_cancelled_gaussians_force_an_exact_form():
     table = torch.cat([u, torch.nn.functional.normalize(-u + 1e-4 * unit_rows(1, D, 1), dim=1), unit_rows(9, D, 2)])
     rows = random_evidence(2, [11], 0, fill=1.0)
     weight = torch.cat([torch.ones(2), torch.full((9,), 1e-9), torch.ones(11)]).double()
-    evidence = Evidence(rows.offsets, rows.region, weight, rows.region_view, rows.unlabeled, 1)
+    evidence = replace(rows, rows=replace(rows.rows, weight=weight))
     lifted = lift(evidence, table)
-    assert lifted.norm[0] < 1e-4
+    assert lifted.scalars.norm[0] < 1e-4
     forms = SemanticField.build(lifted, torch.rand(2, 3), tolerance=1e-3).manifest["forms"]
     assert "low_rank" not in forms or forms["low_rank"]["rank"] == 11
 
@@ -137,9 +138,9 @@ def test_queries_near_cancellation_are_right():
     u = unit_rows(1, D, 0)
     table = torch.cat([u, torch.nn.functional.normalize(-u + 1e-4 * unit_rows(1, D, 1), dim=1)]).float()
     rows = random_evidence(1, [2], 0, fill=1.0, dtype=torch.float32)
-    evidence = Evidence(rows.offsets, rows.region, torch.ones(2), rows.region_view, rows.unlabeled, 1)
+    evidence = replace(rows, rows=replace(rows.rows, weight=torch.ones(2)))
     lifted = lift(evidence, table)
-    field = SemanticField.build(lifted, torch.zeros(1, 3), form="evidence")
+    field = SemanticField.build(lifted, torch.zeros(1, 3), storage="evidence")
     text = unit_rows(50, D, 3).float()
     exact = torch.nn.functional.normalize(table.double().sum(0, keepdim=True), dim=1)
     assert (field.query(text, refined=False) - exact @ text.double().T).abs().max() < 1e-4
@@ -147,13 +148,13 @@ def test_queries_near_cancellation_are_right():
 
 def test_relevancy_never_finds_gaussians_without_evidence():
     lifted, means, _ = example()
-    field = SemanticField.build(lifted, means, form="evidence")
+    field = SemanticField.build(lifted, means, storage="evidence")
     text, negatives = unit_rows(3, D, 1).float(), unit_rows(4, D, 2).float()
     empty = ~field.valid()
     for form, least in (("cosine", 0), ("lerf", 0), ("margin", -2)):
-        values = field.relevancy(text, negatives, form=form)
+        values = field.relevancy(text, negatives, rule=form)
         assert (values[empty] == least).all()
-        expected = relevancy(field.query(text), field.query(negatives), form=form)
+        expected = relevancy(field.query(text), field.query(negatives), rule=form)
         assert torch.allclose(values[~empty], expected[~empty], atol=1e-6)
 
 
@@ -177,8 +178,8 @@ def test_a_field_of_other_gaussians_is_refused(tmp_path):
 
 def test_nothing_is_overwritten_unasked(tmp_path):
     lifted, means, source = example()
-    SemanticField.build(lifted, means, source, form="evidence").save(tmp_path)
-    other = SemanticField.build(lifted, means, source, form="float16")
+    SemanticField.build(lifted, means, source, storage="evidence").save(tmp_path)
+    other = SemanticField.build(lifted, means, source, storage="float16")
     with pytest.raises(FileExistsError, match="already holds a semantic field"):
         other.save(tmp_path)
     other.save(tmp_path, overwrite=True)
@@ -214,7 +215,7 @@ def test_a_full_disk_leaves_no_manifest(tmp_path, monkeypatch):
     lifted, means, source = example()
     monkeypatch.setattr("normlift_ns.core.field.save_file", full_disk)
     with pytest.raises(OSError, match="No space"):
-        SemanticField.build(lifted, means, source, form="float16").save(tmp_path / "f")
+        SemanticField.build(lifted, means, source, storage="float16").save(tmp_path / "f")
     assert list((tmp_path / "f").iterdir()) == []
 
 
@@ -238,4 +239,4 @@ def test_bad_arguments_are_named():
         with pytest.raises(ValueError, match=message):
             SemanticField.build(lifted, means, **kwargs)
     with pytest.raises(ValueError, match="no basis keeps every Gaussian within tolerance 1e-05"):
-        SemanticField.build(lifted, means, form="low_rank", tolerance=1e-5)
+        SemanticField.build(lifted, means, storage="low_rank", tolerance=1e-5)

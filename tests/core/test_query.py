@@ -15,30 +15,30 @@ def test_lerf_is_the_least_softmax_over_negatives():
         for b in range(4):
             pair = torch.stack([POSITIVE[:, q], NEGATIVE[:, b]], 1)
             expected[:, q] = torch.minimum(expected[:, q], torch.softmax(10 * pair, dim=1)[:, 0])
-    assert torch.allclose(relevancy(POSITIVE, NEGATIVE, form="lerf"), expected, rtol=1e-13)
+    assert torch.allclose(relevancy(POSITIVE, NEGATIVE, rule="lerf"), expected, rtol=1e-13)
 
 
 def test_margin_is_the_lead_over_the_best_background():
     expected = torch.stack([POSITIVE[:, q] - NEGATIVE.max(1).values for q in range(3)], 1)
-    assert torch.equal(relevancy(POSITIVE, NEGATIVE, form="margin"), expected)
+    assert torch.equal(relevancy(POSITIVE, NEGATIVE, rule="margin"), expected)
 
 
 def test_cosine_is_itself_and_images_work_too():
     assert torch.equal(relevancy(POSITIVE), POSITIVE)
-    image = relevancy(POSITIVE.view(5, 10, 3), NEGATIVE.view(5, 10, 4), form="lerf")
-    assert torch.equal(image.view(50, 3), relevancy(POSITIVE, NEGATIVE, form="lerf"))
+    image = relevancy(POSITIVE.view(5, 10, 3), NEGATIVE.view(5, 10, 4), rule="lerf")
+    assert torch.equal(image.view(50, 3), relevancy(POSITIVE, NEGATIVE, rule="lerf"))
 
 
 def test_forms_that_compare_need_negatives():
     for negative in (None, NEGATIVE[:, :0]):
         with pytest.raises(ValueError, match="give at least one, for example object, things, stuff, texture"):
-            relevancy(POSITIVE, negative, form="lerf")
+            relevancy(POSITIVE, negative, rule="lerf")
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_unknown_form():
-    with pytest.raises(ValueError, match='form must be "cosine", "lerf" or "margin"'):
-        relevancy(POSITIVE, NEGATIVE, form="dot")
+def test_unknown_rule():
+    with pytest.raises(ValueError, match='rule must be "cosine", "lerf" or "margin"'):
+        relevancy(POSITIVE, NEGATIVE, rule="dot")
 
 
 def test_published_word_lists():

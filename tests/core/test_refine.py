@@ -197,15 +197,22 @@ def test_ablation_variants_are_what_their_names_say():
         name: refine_variant(name, means, lifted, config)
         for name in ("none", "knn", "linear", "norm", "support", "full")
     }
-    ones = (lifted.norm > 0).double()
-    support = torch.where(lifted.n_eff > 0, lifted.n_eff / (lifted.n_eff + 1), 0.0)
+    ones = (lifted.scalars.norm > 0).double()
+    support = torch.where(lifted.scalars.n_eff > 0, lifted.scalars.n_eff / (lifted.scalars.n_eff + 1), 0.0)
     assert torch.equal(got["none"], u)
-    for name, r in (("knn", ones), ("norm", lifted.norm), ("support", support), ("full", lifted.reliability)):
+    for name, r in (
+        ("knn", ones),
+        ("norm", lifted.scalars.norm),
+        ("support", support),
+        ("full", lifted.scalars.reliability),
+    ):
         assert torch.equal(got[name], u[refine(means, u, r, config).long()]), name
     near = nearest_neighbors(means, 8)
     group = [7, *near.index[7].tolist()]
     distance = torch.cat([torch.zeros(1).double(), near.distance[7]])
-    weight = torch.exp(-0.5 * (distance / (config.sigma_d * near.spacing.median())) ** 2) * lifted.reliability[group]
+    weight = (
+        torch.exp(-0.5 * (distance / (config.sigma_d * near.spacing.median())) ** 2) * lifted.scalars.reliability[group]
+    )
     assert torch.allclose(got["linear"][7], torch.nn.functional.normalize(weight @ u[group], dim=0))
     assert len({value.sum().item() for value in got.values()}) == 6
 

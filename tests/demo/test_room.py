@@ -96,13 +96,13 @@ def test_lift_finds_the_classes_and_refinement_repairs(room: DemoRoom):
     lifted = lift(evidence, features)
     directions = lifted.directions()
     neighbors = nearest_neighbors(room.scene.means, 36)
-    source = refine(room.scene.means, directions, lifted.reliability, neighbors=neighbors).long()
+    source = refine(room.scene.means, directions, lifted.scalars.reliability, neighbors=neighbors).long()
     before, after = mean_iou(room, directions @ classes.T), mean_iou(room, directions[source] @ classes.T)
     assert 0.88 < before < 0.94
     assert after > before + 0.005
     assert after > 0.9
     known = room.labels >= 0
-    assert 0.02 < (lifted.norm[known] == 0).float().mean() < 0.08
+    assert 0.02 < (lifted.scalars.norm[known] == 0).float().mean() < 0.08
 
 
 def mean_iou(room: DemoRoom, scores: torch.Tensor) -> float:

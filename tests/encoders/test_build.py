@@ -97,7 +97,7 @@ def test_options_reach_sam_and_patches(tmp_path):
         ({"level": "-1", "regions_dir": Path()}, "number of a map, .*got '-1'"),
         ({"features": "lerf"}, "unknown features 'lerf'; --features is one of none, langsplat"),
         ({"features": "langsplat"}, "features 'langsplat' need their folder: give it with --features-dir"),
-        ({"features_dir": Path("f")}, "--features-dir f is without use; add --features langsplat"),
+        ({"features_dir": Path("f")}, "--features-dir f has no effect without --features langsplat; add that flag"),
     ],
 )
 def test_bad_options_say_what_to_do(options, message):

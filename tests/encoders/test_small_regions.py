@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
-from normlift_ns.encoders import small_regions
+from normlift_ns.encoders.sam import small_regions
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from tests.encoders.tiny import DEVICES
 

@@ -49,7 +49,7 @@ def test_truth_needs_purity_and_weight():
     row, column = weight.nonzero(as_tuple=True)
     rows = SparseRows.from_coo(row, column, weight[row, column], 4)
     blank = SparseRows.from_coo(torch.tensor([3]), torch.tensor([1]), torch.tensor([2.0]), 4)
-    evidence = Evidence(rows.offsets, rows.column, rows.weight, torch.tensor([0, 0, 1, 1]).int(), blank, 2)
+    evidence = Evidence(rows, torch.tensor([0, 0, 1, 1]).int(), blank, 2)
     assert gaussian_truth(evidence, 2).tolist() == [0, -1, -1, -1]  # pure; mixed; too light; mostly background
     assert gaussian_truth(evidence, 2, min_weight=0.1, purity=0.5).tolist() == [0, 0, 1, 1]
 

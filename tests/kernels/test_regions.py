@@ -65,7 +65,7 @@ def test_two_views_in_flight_equal_the_reference(weight_power):
     assert expected.nnz > 100
     assert expected.unlabeled.weight.numel() > 10
     assert_same(found, expected, 12)
-    assert torch.equal(found.region, expected.region)
+    assert torch.equal(found.rows.column, expected.rows.column)
 
 
 def hard_scene():
@@ -112,8 +112,8 @@ def test_chunks_of_tiles_change_nothing(monkeypatch):
     whole = kernel_evidence(scene, cameras, labels, [4])
     monkeypatch.setattr(regions, "_MOST_SLOTS", 50)
     parts = kernel_evidence(scene, cameras, labels, [4])
-    assert torch.equal(whole.weight, parts.weight)
-    assert torch.equal(whole.region, parts.region)
+    assert torch.equal(whole.rows.weight, parts.rows.weight)
+    assert torch.equal(whole.rows.column, parts.rows.column)
 
 
 def test_chunks_cover_all_tiles_once():

@@ -17,7 +17,8 @@ def on_device(*tensors):
 
 
 def kernel_norms(evidence, table):
-    arrays = on_device(evidence.offsets, evidence.region, evidence.weight, evidence.region_view, table)
+    rows = evidence.rows
+    arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
     return [x.cpu() for x in sums.row_norms(*arrays, CANCELLED)]
 
 
@@ -32,7 +33,7 @@ def test_segments_are_added_in_float64():
 def test_products_with_a_vector():
     evidence = random_evidence(300, [3, 4], 1, dtype=torch.float32)
     vector = torch.randn(7, generator=generator(1), dtype=torch.float64)
-    found = sums.product(*on_device(evidence.offsets, evidence.region, evidence.weight, vector)).cpu()
+    found = sums.product(*on_device(evidence.rows.offsets, evidence.rows.column, evidence.rows.weight, vector)).cpu()
     expected = evidence.rows.matmul(vector[:, None]).squeeze(1)
     assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
 
@@ -55,7 +56,7 @@ def test_cancelled_sums_are_right():
     weight = torch.tensor([1.0, 1 - 2**-20, 3.0, 3 - 2**-20, 5.0, 5 - 2**-19])
     view = torch.tensor([0, 0, 1, 1], dtype=torch.int32)
     empty = SparseRows(torch.zeros(3, dtype=torch.int64), torch.zeros(0, dtype=torch.int32), torch.zeros(0))
-    evidence = Evidence(offsets, region, weight, view, empty, 2)
+    evidence = Evidence(SparseRows(offsets, region, weight), view, empty, 2)
     total, by_view, *_ = kernel_norms(evidence, table)
     exact = weight.double()
     within = [exact[0] - exact[1], exact[2] - exact[3]]
@@ -71,10 +72,11 @@ def test_directions_equal_those_of_the_cpu(dtype):
     evidence = random_evidence(30, [3, 4], 5, dtype=torch.float32)
     lifted = lift(evidence, unit_rows(7, 20, 6, torch.float32))
     rows = torch.randperm(30, generator=generator(7))
-    arrays = on_device(rows, evidence.offsets, evidence.region, evidence.weight, lifted.features, lifted.norm)
+    given = evidence.rows
+    arrays = on_device(rows, given.offsets, given.column, given.weight, lifted.features, lifted.scalars.norm)
     found = torch.empty(30, 20, dtype=dtype)
     found[rows] = sums.unit_sums(*arrays, dtype, CANCELLED).cpu()
     assert found.dtype == dtype
     assert torch.allclose(found.float(), lifted.directions(), atol=2e-7 if dtype == torch.float32 else 5e-4)
-    assert torch.equal(found[lifted.norm == 0], torch.zeros_like(found[lifted.norm == 0]))
+    assert torch.equal(found[lifted.scalars.norm == 0], torch.zeros_like(found[lifted.scalars.norm == 0]))
     assert torch.equal(lifted.directions(dtype=dtype), lifted.directions().to(dtype))

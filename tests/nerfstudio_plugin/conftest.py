@@ -13,6 +13,8 @@ from benchmarks.captures import SHARED
 from normlift_ns import SemanticField, lift, rasterize_evidence
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
+from normlift_ns.nerfstudio_plugin.write import write_run
+from normlift_ns.runs.files import load_field, run_directory
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
 
 
@@ -65,6 +67,25 @@ def lifted_field(run: NerfstudioScene, views: int | None = None) -> SemanticFiel
     """
     cameras = run.train.cameras[:: 1 if views is None else len(run.train) // views]
     labels = [(torch.arange(c.width) >= c.width // 2).int().expand(c.height, c.width) for c in cameras]
-    evidence = rasterize_evidence(run.scene, cameras, labels, rasterize_mode=run.rasterize_mode)
+    evidence = rasterize_evidence(run.gaussians, cameras, labels, rasterize_mode=run.rasterize_mode)
     features = torch.eye(8)[:2].repeat(len(cameras), 1)
-    return SemanticField.build(lift(evidence, features), run.scene.means, form="float16", tolerance=1e-2)
+    return SemanticField.build(lift(evidence, features), run.gaussians.means, storage="float16", tolerance=1e-2)
+
+
+def write(
+    scene: NerfstudioScene,
+    field: SemanticField,
+    *,
+    output_dir: Path | None = None,
+    timestamp: str | None = None,
+    **rest,
+) -> Path:
+    """Writes a lifted run where ns-normlift would; returns its directory."""
+    run_dir = run_directory(output_dir or scene.runs_dir, scene.name, timestamp)
+    write_run(scene, field, run_dir, **rest)
+    return run_dir
+
+
+def field_of(scene: NerfstudioScene) -> SemanticField:
+    """The field of a lifted run."""
+    return load_field(scene.location.run_dir, scene.gaussians.means, checkpoint=scene.checkpoint_path)

@@ -13,8 +13,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 from benchmarks.captures import SHARED
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
-from normlift_ns.nerfstudio_plugin.write import load_field, write_run
-from tests.nerfstudio_plugin.conftest import lifted_field
+from normlift_ns.raster.rasterize import render_picture
+from tests.nerfstudio_plugin.conftest import field_of, lifted_field, write
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,12 @@ def _psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 def test_the_run_is_loaded_whole(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run = load_scene(capture)
-    found = {"train": len(run.train), "held_out": len(run.held_out), "gaussians": len(run.scene), "step": run.step}
+    found = {
+        "train": len(run.train),
+        "held_out": len(run.held_out),
+        "gaussians": len(run.gaussians),
+        "step": run.checkpoint.step,
+    }
     assert found == {name: value for name, value in EXPECTED[run.location.data.name].items() if name != "psnr"}
     assert run.location.root == SHARED / "captures"
 
@@ -51,18 +56,19 @@ def test_cameras_are_those_that_the_kernels_saw(capture: Path) -> None:
 def test_renderings_are_as_close_to_the_photographs_as_the_training_left_them(capture: Path) -> None:
     run = load_scene(capture)
     measured = [
-        _psnr(run.render(view.camera), view.image) for view in (run.train[i] for i in range(0, len(run.train), 6))
+        _psnr(render_picture(run, view.camera), view.image)
+        for view in (run.train[i] for i in range(0, len(run.train), 6))
     ]
     assert abs(np.mean(measured) - EXPECTED[run.location.data.name]["psnr"]) < 0.7
 
 
 def test_a_lift_is_written_and_loaded_by_stock_nerfstudio(capture: Path, tmp_path: Path, registered: None) -> None:
     run = load_scene(capture)
-    run_dir = write_run(run, lifted_field(run, views=5), output_dir=tmp_path)
+    run_dir = write(run, lifted_field(run, views=5), output_dir=tmp_path)
     config = run_dir / "config.yml"
     pipeline: Any = eval_setup(config, update_config_callback=lambda loaded: rerooted(loaded, config))[1]
-    assert torch.equal(pipeline.model.means, run.scene.means)
-    assert torch.equal(load_field(load_scene(config)).source, pipeline.model.field.source)
+    assert torch.equal(pipeline.model.means, run.gaussians.means)
+    assert torch.equal(field_of(load_scene(config)).source, pipeline.model.field.source)
     camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[0]
     outputs = pipeline.model.get_outputs_for_camera(camera)
     assert _psnr(outputs["rgb"] * 255, batch["image"]) > 25

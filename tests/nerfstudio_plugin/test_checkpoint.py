@@ -44,7 +44,7 @@ def test_a_full_stock_checkpoint_is_read(stock: StockRun, full: Path) -> None:
 
 
 def test_the_scene_is_activated(stock: StockRun) -> None:
-    scene, model = load_scene(stock.config).scene, stock.trainer.pipeline.model
+    scene, model = load_scene(stock.config).gaussians, stock.trainer.pipeline.model
     torch.testing.assert_close(scene.scales, model.scales.data.exp())
     torch.testing.assert_close(scene.opacities, model.opacities.data.sigmoid()[:, 0])
     assert torch.equal(scene.quats, model.quats.data)
@@ -73,10 +73,10 @@ def test_the_last_step_is_taken_and_any_can_be_chosen(workspace: Path) -> None:
     run = train_splatfacto(workspace, Path("scene"), configure=configure, timestamp="steps", steps=3)
     folder = run.config.parent / "nerfstudio_models"
     (folder / "notes.json").write_text("{}")  # crashes nerfstudio's own loader
-    assert load_scene(run.config).step == 2
+    assert load_scene(run.config).checkpoint.step == 2
     earlier = load_scene(run.config, load_step=1)
-    assert earlier.step == 1
-    assert not torch.equal(earlier.scene.means, load_scene(run.config).scene.means)
+    assert earlier.checkpoint.step == 1
+    assert not torch.equal(earlier.gaussians.means, load_scene(run.config).gaussians.means)
     with pytest.raises(FileNotFoundError, match=r"No checkpoint of step 7 in .*; there are 1, 2\. .*--load-step"):
         load_scene(run.config, load_step=7)
 

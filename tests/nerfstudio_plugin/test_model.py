@@ -11,15 +11,14 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
 
-from normlift_ns.asking import answer
+from normlift_ns import asking
+from normlift_ns.asking import Question
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.nerfstudio_plugin.write import write_run
-from normlift_ns.raster.rasterize import render
-from normlift_ns.runs.question import Question
+from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.viewer.display import make_display
-from tests.nerfstudio_plugin.conftest import lifted_field
+from tests.nerfstudio_plugin.conftest import lifted_field, write
 from tests.nerfstudio_plugin.stock_run import SmallLpips, StockRun, rasterization, splatfacto_on_cpu, train_splatfacto
 
 QUESTION = Question(("left", "right"), torch.eye(8)[:2])
@@ -37,7 +36,7 @@ def lifted(stock: StockRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """config.yml of a lifted run with two queries."""
     run = load_scene(stock.config)
     out = tmp_path_factory.mktemp("lifted")
-    return write_run(run, lifted_field(run), question=QUESTION, output_dir=out) / "config.yml"
+    return write(run, lifted_field(run), question=QUESTION, output_dir=out) / "config.yml"
 
 
 @pytest.fixture
@@ -67,7 +66,7 @@ def test_cpu_outputs_are_those_of_stock_splatfacto(pipeline, stock: StockRun, mo
 
 def test_the_run_renders_what_the_model_renders(pipeline, stock: StockRun) -> None:
     run = load_scene(stock.config)
-    picture = run.render(run.train.cameras[2])
+    picture = render_picture(run, run.train.cameras[2])
     torch.testing.assert_close(picture.float() / 255, _outputs(pipeline, 2)["rgb"], atol=0.51 / 255, rtol=0)
 
 
@@ -79,12 +78,14 @@ def test_colours_without_spherical_harmonics(workspace: Path, registered: None, 
 
     trained = train_splatfacto(workspace, Path("scene"), configure=configure, timestamp="flat")
     run = load_scene(trained.config)
-    pipeline = _setup(write_run(run, lifted_field(run), output_dir=tmp_path) / "config.yml")
+    pipeline = _setup(write(run, lifted_field(run), output_dir=tmp_path) / "config.yml")
     model = trained.trainer.pipeline.model.eval()
     with splatfacto_on_cpu():
         theirs = model.get_outputs_for_camera(trained.trainer.pipeline.datamanager.train_cameras[1:2])
     torch.testing.assert_close(_outputs(pipeline, 1)["rgb"], theirs["rgb"], atol=2e-5, rtol=1e-4)
-    torch.testing.assert_close(run.render(run.train.cameras[1]).float() / 255, theirs["rgb"], atol=0.51 / 255, rtol=0)
+    torch.testing.assert_close(
+        render_picture(run, run.train.cameras[1]).float() / 255, theirs["rgb"], atol=0.51 / 255, rtol=0
+    )
 
 
 def test_scalars_are_composited(pipeline, stock: StockRun) -> None:
@@ -92,11 +93,11 @@ def test_scalars_are_composited(pipeline, stock: StockRun) -> None:
     field = lifted_field(run)
     outputs = _outputs(pipeline, 3)
     assert list(outputs) == [*STOCK, "relevancy_0", "relevancy_1", *SEMANTIC]
-    answer = answer(field, QUESTION)
+    answer = asking.answer(field, run.gaussians.means, QUESTION)
     chosen = answer.selected.any(dim=1).float()
     columns = {"relevancy_0": answer.relevancy[:, 0], "relevancy_1": answer.relevancy[:, 1], "selection": chosen}
     columns |= {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
-    expected, _ = render(run.scene, run.train.cameras[3], torch.stack(list(columns.values()), dim=1))
+    expected, _ = render(run.gaussians, run.train.cameras[3], torch.stack(list(columns.values()), dim=1))
     for i, name in enumerate(columns):
         assert outputs[name].shape == (35, 47, 1)
         torch.testing.assert_close(outputs[name][..., 0], expected[..., i], atol=1e-6, rtol=1e-5)
@@ -115,7 +116,8 @@ def test_scalars_by_gsplat_are_those_of_the_cpu(
     model, view = pipeline.model, load_scene(stock.config).train.cameras[0]
     rows = model.means[:, 2] > model.means[:, 2].median() if cropped else None
     values = torch.rand(model.num_points, 2)
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.rasterization", rasterization)
+    monkeypatch.setattr("gsplat.rendering.rasterization", rasterization)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job: None)
     _, expected = model._render_on_cpu(view, values, rows)
     torch.testing.assert_close(model._scalars_by_gsplat(view, values, rows), expected, atol=1e-6, rtol=1e-4)
     assert model._scalars_by_gsplat(view, values[:, :0], rows).shape == (35, 47, 0)
@@ -134,10 +136,10 @@ def test_cuda_outputs_are_those_of_the_cpu(lifted: Path, registered: None) -> No
 
 def test_relevancy_of_stored_queries_uses_their_negatives(pipeline, stock: StockRun) -> None:
     field, negatives = pipeline.model.field, torch.eye(8)[1:2]
-    pipeline.model.attach(field, Question(("left",), torch.eye(8)[:1], ("right",), negatives, form="lerf"))
-    values = field.relevancy(torch.eye(8)[:1], negatives, form="lerf")
+    pipeline.model.attach(field, Question(("left",), torch.eye(8)[:1], ("right",), negatives, rule="lerf"))
+    values = field.relevancy(torch.eye(8)[:1], negatives, rule="lerf")
     run = load_scene(stock.config)
-    expected, _ = render(run.scene, run.train.cameras[0], values)
+    expected, _ = render(run.gaussians, run.train.cameras[0], values)
     torch.testing.assert_close(_outputs(pipeline)["relevancy_0"], expected, atol=1e-6, rtol=1e-5)
 
 
@@ -155,7 +157,8 @@ def test_without_a_question_only_the_relevancies_are_missing(pipeline) -> None:
 
 def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the model take the way of CUDA: stock splatfacto, and gsplat for the scalars."""
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.rasterization", rasterization)
+    monkeypatch.setattr("gsplat.rendering.rasterization", rasterization)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job: None)
     monkeypatch.setattr(type(pipeline.model), "on_cpu", False)
 
 
@@ -163,11 +166,11 @@ def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("on_cpu", [True, False])
 def test_hidden_gaussians_are_not_drawn_at_all(pipeline, stock: StockRun, monkeypatch, part, on_cpu) -> None:
     model = pipeline.model
-    answer = answer(model.field, QUESTION)
+    answer = asking.answer(model.field, model.means, QUESTION)
     drawn = answer.selected[:, 0] == (part == "the selection alone")
     assert 5 < int(drawn.sum()) < 55
     _, alpha = render(
-        _rows(load_scene(stock.config).scene, drawn),
+        _rows(load_scene(stock.config).gaussians, drawn),
         load_scene(stock.config).train.cameras[0],
         torch.ones(int(drawn.sum()), 1),
     )
@@ -202,15 +205,18 @@ def test_an_overlay_costs_one_pass_of_scalars(pipeline, monkeypatch, on_cpu: boo
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)
     ours = counted("scalars", rasterization, lambda args: args[4].shape[1])
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.rasterization", ours)
-    monkeypatch.setattr(
-        "normlift_ns.nerfstudio_plugin.model.render", counted("cpu", render, lambda args: args[2].shape[1])
-    )
+    monkeypatch.setattr("gsplat.rendering.rasterization", ours)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job: None)
+    if on_cpu:
+        counting = counted("cpu", render, lambda args: args[2].shape[1])
+        monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.render", counting)
     question = Question(("left",) * prompts, torch.eye(8)[:1].expand(prompts, 8))
     with splatfacto_on_cpu():
         stock = counted("stock", rasterization, lambda _: 0)
         monkeypatch.setattr("nerfstudio.models.splatfacto.rasterization", stock)
-        model.show(make_display(model.field, None if prompts == 0 else answer(model.field, question)))
+        model.show(
+            make_display(model.field, None if prompts == 0 else asking.answer(model.field, model.means, question))
+        )
         _outputs(pipeline)
         assert passes == ([("cpu", 4 + prompts + 5)] if on_cpu else [("stock", 0), ("scalars", prompts + 5)])
         passes.clear()
@@ -232,7 +238,7 @@ def test_a_crop_box_crops_the_scalars_too(pipeline, monkeypatch, on_cpu) -> None
     above = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, middle + 5]), torch.tensor([10.0, 10.0, 10.0]))
     inside = above.within(model.means).reshape(-1)
     assert 0 < int(inside.sum()) < 60
-    everyone = answer(model.field, Question(("all",), torch.eye(8)[:1], threshold=-2.0))
+    everyone = asking.answer(model.field, model.means, Question(("all",), torch.eye(8)[:1], threshold=-2.0))
     model.show(make_display(model.field, everyone))
     valid = everyone.valid.float()
     with splatfacto_on_cpu():
@@ -259,7 +265,7 @@ def test_what_is_hidden_cannot_be_clicked(pipeline, stock: StockRun) -> None:
     weights = model.in_sight(pose[:3, 3], pose[:3, 2])
     front = int(weights.argmax())
     assert float(weights[front]) > 0.01
-    answer = answer(model.field, QUESTION)
+    answer = asking.answer(model.field, model.means, QUESTION)
     answer.selected[:] = (torch.arange(60) == front)[:, None]
     model.show(make_display(model.field, answer, part="without the selection"))
     behind = model.in_sight(pose[:3, 3], pose[:3, 2])

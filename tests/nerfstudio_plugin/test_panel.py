@@ -22,15 +22,14 @@ from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerElement
 from plyfile import PlyData
 
-from normlift_ns.asking import ENCODER_KEYS, answer
-from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.asking import ENCODER_KEYS, Question, answer
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
-from normlift_ns.nerfstudio_plugin.panel import MOST_PROMPTS
-from normlift_ns.nerfstudio_plugin.write import write_run
-from normlift_ns.runs.question import Question, load_question
-from tests.nerfstudio_plugin.conftest import lifted_field
+from normlift_ns.options import SourceOptions
+from normlift_ns.runs.question import load_question
+from normlift_ns.viewer.session import MOST_PROMPTS
+from tests.nerfstudio_plugin.conftest import lifted_field, write
 from tests.nerfstudio_plugin.stock_run import StockRun
 
 QUESTION = Question(("left",), torch.eye(8)[:1])
@@ -58,7 +57,7 @@ def lifted(stock: StockRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     encoder = {key: getattr(SourceOptions(encoder="colour"), key) for key in ENCODER_KEYS}
     field = lifted_field(run)
     field = replace(field, manifest={**field.manifest, "encoder": encoder})
-    return write_run(run, field, question=QUESTION, output_dir=tmp_path_factory.mktemp("panel")) / "config.yml"
+    return write(run, field, question=QUESTION, output_dir=tmp_path_factory.mktemp("panel")) / "config.yml"
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +120,7 @@ def test_the_viewer_finds_the_elements_in_order(panel: Any, pipeline: Any) -> No
     assert {path.rsplit("/", 1)[0] for path, _ in found} == {"Custom Elements/model/normlift"}
     assert [element.name for _, element in found] == [
         "Prompts", "Negatives", "Relevancy", "Refined", "Query", "Clear", "Click: more like this", "",
-        "Prompt shown", "Threshold", "Min reliability", "Draw", "Overlay colours", "Export selection",
+        "Prompt shown", "Threshold", "Minimum reliability", "Draw", "Overlay colours", "Export selection",
         "Save queries in run",
     ]  # fmt: skip
     assert not any(element.disabled or getattr(element.gui_handle, "disabled", False) for _, element in found)
@@ -132,7 +131,7 @@ def test_the_stored_question_is_shown_without_an_encoder(pipeline: Any) -> None:
     assert panel._encoder == []
     assert panel.ask_1_prompts.value == "left"
     assert panel.show_2_threshold.value == 0.5
-    expected = answer(pipeline.model.field, QUESTION).selected[:, 0]
+    expected = answer(pipeline.model.field, pipeline.model.means, QUESTION).selected[:, 0]
     assert torch.equal(chosen(pipeline), expected)
     assert f"**{int(expected.sum())}** of 60 Gaussians selected" in panel.ask_8_status.content
     assert not any("normlift" in name for name in pipeline.state_dict())
@@ -143,14 +142,14 @@ def test_a_query_replaces_what_is_shown(panel: Any, pipeline: Any) -> None:
     assert panel.answer.texts == ("left", "right")
     assert list(outputs(pipeline))[4:7] == ["relevancy_0", "relevancy_1", "reliability"]
     assert panel.show_1_prompt.options == ["all prompts", "0: left", "1: right"]
-    both = answer(pipeline.model.field, Question(("a", "b"), torch.eye(8)[:2])).selected
+    both = answer(pipeline.model.field, pipeline.model.means, Question(("a", "b"), torch.eye(8)[:2])).selected
     assert torch.equal(chosen(pipeline), both.any(dim=1))
     panel.show_1_prompt.value = "1: right"
     panel.show_1_prompt.cb_hook(panel.show_1_prompt)
     assert torch.equal(chosen(pipeline), both[:, 1])
-    assert panel.answer.question.form == "cosine"
+    assert panel.answer.question.rule == "cosine"
     ask(panel, "left", "right")
-    assert (panel.answer.question.form, panel.answer.texts) == ("lerf", ("left",))
+    assert (panel.answer.question.rule, panel.answer.texts) == ("lerf", ("left",))
     assert panel._encoder[0].asked[-2:] == [["left"], ["right"]]
     assert panel.show_1_prompt.value == "all prompts"
 
@@ -178,7 +177,7 @@ def test_the_threshold_stays_for_another_query_of_the_same_form(panel: Any) -> N
     panel.show_2_threshold.value = 0.7
     ask(panel, "right")
     assert panel.answer.question.threshold == 0.7
-    panel.ask_3_relevancy.value = "margin"
+    panel.ask_3_rule.value = "margin"
     ask(panel, "right", "left")
     assert panel.answer.question.threshold == panel.show_2_threshold.value == 0.02
 
@@ -222,7 +221,7 @@ def test_what_cannot_be_asked_leaves_nothing_stale(panel: Any, pipeline: Any, pr
 
 
 def test_a_form_without_its_negatives_says_so(panel: Any, pipeline: Any) -> None:
-    panel.ask_3_relevancy.value = "lerf"
+    panel.ask_3_rule.value = "lerf"
     ask(panel, "left", "")
     assert "compares with negative prompts" in panel.ask_8_status.content
     assert panel.answer is None
@@ -233,7 +232,7 @@ def test_clear(panel: Any, pipeline: Any) -> None:
     assert panel.ask_1_prompts.value == "left"
     assert panel.answer is None
     assert not chosen(pipeline).any()
-    assert panel.ask_8_status.content == "Nothing is asked."
+    assert panel.ask_8_status.content == "No query yet."
 
 
 def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
@@ -327,7 +326,7 @@ def test_an_answer_that_comes_too_late_is_not_shown(pipeline: Any, slow: tuple[S
     encoder.go_on.set()
     asking.join(20)
     assert panel.answer is None
-    assert panel.ask_8_status.content == "Nothing is asked."
+    assert panel.ask_8_status.content == "No query yet."
 
 
 @pytest.mark.parametrize("part", ["without the selection", "the selection alone"])
@@ -389,12 +388,12 @@ def test_save_stores_the_question(panel: Any, pipeline: Any) -> None:
     panel.write_2_save.cb_hook(panel.write_2_save)
     stored = load_question(folder)
     assert stored is not None
-    assert (stored.texts, stored.negatives, stored.form) == (("left", "right"), ("up",), "lerf")
+    assert (stored.texts, stored.negatives, stored.rule) == (("left", "right"), ("up",), "lerf")
     assert stored.threshold == 0.625
-    assert torch.equal(answer(pipeline.model.field, stored).selected, panel.answer.selected)
+    assert torch.equal(answer(pipeline.model.field, pipeline.model.means, stored).selected, panel.answer.selected)
     panel.ask_6_clear.cb_hook(panel.ask_6_clear)
     panel.write_2_save.cb_hook(panel.write_2_save)
-    assert "Nothing is asked" in panel.ask_8_status.content
+    assert "No query yet" in panel.ask_8_status.content
 
 
 def test_elements_wait_for_a_field(stock: StockRun, registered: None, pipeline: Any) -> None:
@@ -407,7 +406,7 @@ def test_elements_wait_for_a_field(stock: StockRun, registered: None, pipeline: 
     assert "at the end of the training" in panel.ask_8_status.content
     model.attach(pipeline.model.field)
     assert not any(e.disabled for e in vars(panel).values() if isinstance(e, ViewerElement))
-    assert panel.ask_8_status.content == "Nothing is asked."
+    assert panel.ask_8_status.content == "No query yet."
 
 
 def test_an_answer_to_a_prompt_is_fast(panel: Any, pipeline: Any) -> None:

@@ -170,7 +170,7 @@ def test_seed_points_are_never_read(stock: StockRun, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(Nerfstudio, "_load_3D_points", fail)
     assert "load_3D_points: true" in stock.config.read_text()
-    assert len(load_scene(stock.config).scene) == 60
+    assert len(load_scene(stock.config).gaussians) == 60
 
 
 def test_rasterize_mode_is_that_of_the_run(workspace: Path, stock: StockRun) -> None:

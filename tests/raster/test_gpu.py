@@ -6,6 +6,7 @@ import torch
 from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core import gpu
 from normlift_ns.raster import gsplat
+from normlift_ns.raster.backend import Job
 from tests.kernels.test_regions import hard_scene
 from tests.scenes import dense, generator, orbit, random_labels, random_scene, unit_rows
 
@@ -16,19 +17,23 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA de
 def test_gpu_backends_refuse_other_scenes(backend):
     scene, cameras = random_scene(5, dtype=torch.float32), orbit(1)
     labels = [random_labels(cameras[0], 2)]
-    with pytest.raises(ValueError, match=r"this scene is torch.float32 on cpu; move it .* backend=\"torch\""):
+    with pytest.raises(ValueError, match=r"this scene is torch.float32 on cpu.* Move it .* backend=\"torch\""):
         rasterize_evidence(scene, cameras, labels, backend=backend)
-    with pytest.raises(ValueError, match=f'backend "{backend}" computes in float32, not in torch.float64'):
+    with pytest.raises(ValueError, match=r"computes in float32 on a GPU; .* wanted is torch.float64"):
         rasterize_evidence(scene, cameras, labels, backend=backend, dtype=torch.float64)
 
 
 def test_gradients_are_of_weights_only():
     with pytest.raises(ValueError, match=r'weight_power 2 is not a gradient; use backend="triton"'):
-        gsplat.views_evidence(random_scene(5), [], [], [], False, 2, RasterSettings())
+        gsplat.views_evidence(job(random_scene(5)), [], [], [], 2)
+
+
+def job(scene, **constants):
+    return Job(scene, False, RasterSettings(**constants), torch.float32)
 
 
 class OnGpu:
-    """What `check_usable` looks at, of a scene on a GPU."""
+    """What `check` looks at, of a scene on a GPU."""
 
     means = torch.zeros(1, 3, device="meta")
 
@@ -36,12 +41,12 @@ class OnGpu:
 def test_other_versions_and_constants_of_gsplat_are_refused(monkeypatch, unchecked):
     scene = OnGpu()
     monkeypatch.setattr(type(scene.means), "device", torch.device("cuda"), raising=False)
-    gsplat.check_usable(scene, RasterSettings(eps2d=0.1))
+    gsplat.check(job(scene, eps2d=0.1))
     with pytest.raises(ValueError, match=r"gsplat has compiled its max_alpha"):
-        gsplat.check_usable(scene, RasterSettings(max_alpha=0.99))
+        gsplat.check(job(scene, max_alpha=0.99))
     monkeypatch.setattr(gsplat, "_gsplat_version", lambda: "1.5.2")
     with pytest.raises(ValueError, match=r'gsplat 1\.5\.2 is installed.*pip install "gsplat==1\.4\.0"'):
-        gsplat.check_usable(scene, RasterSettings())
+        gsplat.check(job(scene))
 
 
 def test_a_full_gpu_is_answered_by_smaller_parts():
@@ -91,8 +96,8 @@ def test_all_backends_agree(regions, mode, kind):
     assert_close(found["triton"], found["torch"], tolerance)
     assert_close(found["triton"], found["gsplat"], 1e-5)
     again = rasterize_evidence(scene, cameras, labels, num_regions=counts, rasterize_mode=mode)
-    assert torch.equal(again.weight, found["triton"].weight)
-    assert torch.equal(again.region, found["triton"].region)
+    assert torch.equal(again.rows.weight, found["triton"].rows.weight)
+    assert torch.equal(again.rows.column, found["triton"].rows.column)
 
 
 @needs_gpu
@@ -108,8 +113,10 @@ def test_the_whole_lift_equals_that_of_the_cpu():
         there = scene.to(device)
         lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(device))
         neighbors = nearest_neighbors(there.means, 36)
-        source = refine(there.means, lifted.directions, lifted.reliability, neighbors=neighbors)
-        results.append([x.cpu() for x in (lifted.reliability, neighbors.index, lifted.directions(source.long()))])
+        source = refine(there.means, lifted.directions, lifted.scalars.reliability, neighbors=neighbors)
+        results.append(
+            [x.cpu() for x in (lifted.scalars.reliability, neighbors.index, lifted.directions(source.long()))]
+        )
     (reliability, index, refined), (reliability_gpu, index_gpu, refined_gpu) = results
     assert (reliability - reliability_gpu).abs().max() < 1e-4
     assert torch.equal(index, index_gpu)

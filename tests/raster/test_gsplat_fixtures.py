@@ -27,7 +27,7 @@ def test_float32_weights_are_those_of_the_cuda_kernels(path, backend, record_pro
 
     evidence = rasterize_evidence(scene, [camera], [labels], backend=backend, rasterize_mode=mode)
     found = torch.zeros_like(expected)
-    found[evidence.rows.row_index() * columns + evidence.region + 1] = evidence.weight.double()
+    found[evidence.rows.row_index() * columns + evidence.rows.column + 1] = evidence.rows.weight.double()
     found[evidence.unlabeled.row_index() * columns] = evidence.unlabeled.weight.double()
 
     frobenius = float((found - expected).norm() / expected.norm())
@@ -36,7 +36,7 @@ def test_float32_weights_are_those_of_the_cuda_kernels(path, backend, record_pro
     for key, value in (("frobenius", frobenius), ("one_sided", one_sided), ("total", total)):
         record_property(key, value)
     print(f"{path.stem} {backend}: Frobenius {frobenius:.1e}, one-sided weight {one_sided:.1e}, total {total:.1e}")
-    assert evidence.weight.dtype == torch.float32
+    assert evidence.rows.weight.dtype == torch.float32
     assert frobenius <= 2e-5
     assert one_sided < 1e-6
     assert total < 1e-6

@@ -52,7 +52,7 @@ def test_non_finite_gaussians_are_counted_and_not_drawn(backend, field, value):
     assert evidence.num_gaussians == 20
     assert evidence.rows.row_sums()[0] == 0
     expected = rasterize_evidence(others, [camera], [random_labels(camera, 3)], backend=backend)
-    assert torch.equal(evidence.weight, expected.weight)
+    assert torch.equal(evidence.rows.weight, expected.rows.weight)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -124,7 +124,7 @@ def test_views_without_regions_and_regions_without_pixels(backend):
     evidence = rasterize_evidence(scene, cameras, labels, backend=backend, num_regions=[0, 5, 3])
     assert evidence.num_views == 3
     assert evidence.region_view.tolist() == [1] * 5 + [2] * 3
-    assert set(evidence.region.tolist()) <= {0, 1}
+    assert set(evidence.rows.column.tolist()) <= {0, 1}
     assert dense(evidence.unlabeled, 3).sum(0).min() > 0
     none = rasterize_evidence(scene, cameras, [blank] * 3, backend=backend)
     assert (none.nnz, none.num_regions, none.num_views) == (0, 0, 3)
@@ -198,8 +198,9 @@ def test_bitwise_equal_between_runs_and_invariant_to_order_and_shards(backend):
     again = rasterize_evidence(scene, iter(cameras), (x for x in labels), num_regions=iter(counts), backend=backend)
     shards = [rasterize_evidence(scene, [c], [x], num_regions=[4], backend=backend) for c, x in zip(cameras, labels)]
     for other in (again, Evidence.merge(*shards)):
-        for name in ("offsets", "region", "weight", "region_view"):
-            assert torch.equal(getattr(whole, name), getattr(other, name))
+        for name in ("offsets", "column", "weight"):
+            assert torch.equal(getattr(whole.rows, name), getattr(other.rows, name))
+        assert torch.equal(whole.region_view, other.region_view)
         assert torch.equal(whole.unlabeled.weight, other.unlabeled.weight)
 
     order = torch.randperm(300, generator=torch.Generator().manual_seed(1))

@@ -14,10 +14,8 @@ import torch
 from PIL import Image
 
 from benchmarks.captures import SHARED
-from normlift_ns import render
-from normlift_ns.asking import ask, encoder_of, pixel_relevancy
-from normlift_ns.nerfstudio_plugin.load import NerfstudioScene, load_scene
-from normlift_ns.nerfstudio_plugin.write import load_field
+from normlift_ns import Scene, open_run, render
+from normlift_ns.asking import pixel_relevancy
 from tests.captures import needs_shared
 
 pytestmark = [pytest.mark.slow, needs_shared]
@@ -31,14 +29,13 @@ def command(script: str, *flags: object, cwd: Path) -> str:
     return done.stdout
 
 
-def maps(config: Path, texts: list[str], cameras: str) -> tuple[NerfstudioScene, torch.Tensor]:
+def maps(config: Path, texts: list[str], cameras: str) -> tuple[Scene, torch.Tensor]:
     """Relevancy of the texts in all views of a split, [V, H, W, Q]."""
-    run = load_scene(config)
-    field = load_field(run)
-    relevancy = ask(field, encoder_of(field), texts).relevancy
-    views = getattr(run, cameras).cameras
-    return run, torch.stack(
-        [pixel_relevancy(*render(run.scene, c, relevancy, rasterize_mode=run.rasterize_mode)) for c in views]
+    run = open_run(config)
+    scene, relevancy = run.scene, run.ask(*texts).relevancy
+    views = getattr(scene, cameras).cameras
+    return scene, torch.stack(
+        [pixel_relevancy(*render(scene.gaussians, c, relevancy, rasterize_mode=scene.rasterize_mode)) for c in views]
     )
 
 

@@ -12,15 +12,12 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.asking import ask, encoder_of
+from normlift_ns import lifting, open_run, open_scene
 from normlift_ns.demo import DemoRoom
 from normlift_ns.encoders import RegionFeatures, write_langsplat
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
-from normlift_ns.nerfstudio_plugin import lifting
-from normlift_ns.nerfstudio_plugin.load import load_scene
-from normlift_ns.nerfstudio_plugin.write import load_field
 from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
@@ -29,9 +26,9 @@ from tests.scripts.conftest import SMALL, run_entry
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
-    run = load_scene(lifted)
-    field = load_field(run)
-    answer = encoder_of(field).text(room.names)
+    run = open_run(lifted)
+    field = run.field
+    answer = run.texts.text(room.names)
     before, after = (
         float(iou_per_class(field.query(answer, refined=refined).argmax(1), room.labels, len(room.names)).mean())
         for refined in (False, True)
@@ -69,14 +66,14 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     assert 0.005 < red["fraction"] < 0.1
     assert red["peak"] > 0.9
     assert 0.3 < red["mean_reliability"] < 1
-    run = load_scene(lifted)
+    run = open_scene(lifted)
     scores = np.load(tmp_path / "a.npz")
-    assert scores["relevancy"].shape == (len(run.scene), 2)
+    assert scores["relevancy"].shape == (len(run.gaussians), 2)
     assert scores["names"].tolist() == ["red", "sky blue"]
     assert scores["valid"].dtype == bool
     chosen = (scores["relevancy"][:, 0] > document["threshold"]) & scores["valid"]
     assert chosen.mean() == pytest.approx(red["fraction"])
-    assert np.allclose(red["centroid"], np.average(run.scene.means[chosen], axis=0), atol=0.1)
+    assert np.allclose(red["centroid"], np.average(run.gaussians.means[chosen], axis=0), atol=0.1)
     assert blue["extent"][0] > red["extent"][0]
 
     pictures = sorted((tmp_path / "pictures").iterdir())
@@ -96,7 +93,7 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(trained, monkeypatch, caps
     monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", never)
     flags = ("--load-config", trained, *SMALL, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (load_field(load_scene(trained.parents[2] / "normlift" / t / "config.yml")) for t in ("one", "two"))
+    first, second = (open_run(trained.parents[2] / "normlift" / t / "config.yml").field for t in ("one", "two"))
     assert torch.equal(first.scalars.norm, second.scalars.norm)
     assert (second.scalars.reliability <= first.scalars.reliability).all()
     assert torch.equal(second.source, torch.arange(len(second), dtype=torch.int32))
@@ -116,7 +113,7 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
     flags = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--timestamp", "t")
     monkeypatch.setattr(lifting, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
-    assert "the same command goes on where it stopped" in capsys.readouterr().out
+    assert "rerun the command to resume" in capsys.readouterr().out
     written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
     assert {p.suffix for p in written} == {".safetensors"}
     assert all(".cache" in p.parts for p in written)
@@ -173,7 +170,7 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
         monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
-    fields = [load_field(load_scene(tmp_path / "out" / "room" / "normlift" / t / "config.yml")) for t in ("0", "1")]
+    fields = [open_run(tmp_path / "out" / "room" / "normlift" / t / "config.yml").field for t in ("0", "1")]
     weights = [field.scalars.weight for field in fields]
     assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
     classes, whole = (field.scalars.c_intra for field in fields)
@@ -205,7 +202,7 @@ def test_clip_by_patches_and_questions_without_a_network(trained, clip, tmp_path
     flags = ("--load-config", trained, *clip, "--output-dir", tmp_path, "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     config = tmp_path / "room" / "normlift" / "t" / "config.yml"
-    manifest = load_field(load_scene(config)).manifest
+    manifest = open_run(config).field.manifest
     assert manifest["features"]["kind"] == "patches"
     assert manifest["encoder"]["text_template"] == "{}"
     ask = ("--load-config", config, "--text", "table", "--json")
@@ -228,19 +225,19 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
     for level in ("l", "s"):
         more = () if level == "l" else ("--level", level)
         assert run_entry(monkeypatch, lift.entrypoint, *flags, *more, "--timestamp", level) == 0
-        field = load_field(load_scene(tmp_path / "room" / "normlift" / level / "config.yml"))
+        field = open_run(tmp_path / "room" / "normlift" / level / "config.yml").field
         assert field.manifest["features"]["regions"]["kind"] == "sam"
         assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
         shares.append(field.manifest["statistics"]["zero_evidence_share"])
         monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
-        monkeypatch.setattr("normlift_ns.encoders.sam.SamNetwork", None)
+        monkeypatch.setattr("normlift_ns.encoders.sam.masks.SamNetwork", None)
     assert shares[0] != shares[1] and max(shares) < 1
 
 
 def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
     flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *SMALL, *flags) == 0
-    field = load_field(load_scene(trained.parents[2] / "normlift" / "less" / "config.yml"))
+    field = open_run(trained.parents[2] / "normlift" / "less" / "config.yml").field
     assert field.manifest["statistics"]["views"] == 5
     assert 0 < field.manifest["statistics"]["zero_evidence_share"] < 0.5
 
@@ -271,16 +268,14 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
 
 
 def test_selection_follows_threshold_and_reliability(lifted):
-    run = load_scene(lifted)
-    field = load_field(run)
-    encoder = encoder_of(field)
-    loose, strict = (ask(field, encoder, ["red"], threshold=t).selected for t in (0.2, 0.8))
+    run = open_run(lifted)
+    loose, strict = (run.ask("red", threshold=t).selected for t in (0.2, 0.8))
     assert int(loose.sum()) > int(strict.sum()) > 0
     assert not (strict & ~loose).any()
-    sure = ask(field, encoder, ["red"], threshold=0.2, min_reliability=0.8).selected[:, 0]
-    assert (field.scalars.reliability[sure] >= 0.8).all()
+    sure = run.ask("red", threshold=0.2, min_reliability=0.8)["red"].mask
+    assert (run.field.scalars.reliability[sure] >= 0.8).all()
     assert 0 < int(sure.sum()) < int(loose.sum())
-    lead = ask(field, encoder, ["red"], negatives=["orange", "brown"], form="margin")
+    lead = run.ask("red", negatives=["orange", "brown"], rule="margin")
     assert lead.question.threshold == 0.02
     assert (lead.relevancy[lead.selected] > 0.02).all()
 
@@ -300,7 +295,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     ours, theirs = (tmp_path / "out" / "room" / "normlift" / t / "config.yml" for t in ("ours", "theirs"))
-    first, second = (load_field(load_scene(config)) for config in (ours, theirs))
+    first, second = (open_run(config).field for config in (ours, theirs))
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
         assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
     assert torch.equal(first.source, second.source)
@@ -326,7 +321,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
 
 def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monkeypatch, capsys):
     source = RegionFeatures(Grid(9), ColourEncoder())
-    for view in load_scene(trained).train:
+    for view in open_scene(trained).train:
         write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
     (tmp_path / "features" / "0003_f.npy").unlink()
     np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
@@ -339,7 +334,7 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     with pytest.warns(UserWarning, match=r"1 of 12 images have no features in .*: images/0003\.png; they are left out"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
     assert "1 images without features" in capsys.readouterr().out
-    field = load_field(load_scene(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml"))
+    field = open_run(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml").field
     assert field.manifest["statistics"]["views"] == 11
     assert int(field.scalars.view_count.max()) <= 11
 
@@ -347,9 +342,7 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
 def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, monkeypatch):
     flags = ("--load-config", trained, *SMALL, "--timestamp", "double", "--precision", "double")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    double, single = (
-        load_field(load_scene(config)) for config in (lifted.parents[1] / "double" / "config.yml", lifted)
-    )
+    double, single = (open_run(config).field for config in (lifted.parents[1] / "double" / "config.yml", lifted))
     assert double.manifest["options"]["precision"] == "double"
     difference = (double.scalars.reliability - single.scalars.reliability).abs()
     assert 0 < float(difference.quantile(0.99)) < 1e-6

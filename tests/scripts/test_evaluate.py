@@ -140,7 +140,7 @@ def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
     assert set(CANONICAL_NEGATIVES) <= set(words)
     found = {}
     for rule in ("background", "langsplat", "auto"):
-        flags = ("--rule", rule, "--text-vectors", vectors)
+        flags = ("--masking", rule, "--text-vectors", vectors)
         found[rule] = evaluated(monkeypatch, workspace, "lerf", labels, *flags)
     results = found["background"]["results"]
     assert results["loc_acc"] > 0.6

@@ -13,12 +13,10 @@ import trimesh
 from nerfstudio.configs.method_configs import all_methods
 from plyfile import PlyData
 
-from normlift_ns.asking import ask, encoder_of
+from normlift_ns import open_run
 from normlift_ns.demo import DemoRoom
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
-from normlift_ns.nerfstudio_plugin.load import load_scene
-from normlift_ns.nerfstudio_plugin.write import load_field
 from normlift_ns.scripts import export
 from tests.scripts.conftest import run_entry
 
@@ -64,18 +62,18 @@ def test_the_file_is_that_of_ns_export_and_more(
 
 
 def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> None:
-    run = load_scene(lifted)
-    field = load_field(run)
+    run = open_run(lifted)
+    field = run.field
     vertices, rows = PlyData.read(scene_ply)["vertex"], np.load(scene_ply.with_name("splat_rows.npy"))
     assert (np.diff(rows) > 0).all()
-    answer = ask(field, encoder_of(field), ["red", "yellow"])  # what the run stores
+    answer = run.ask("red", "yellow")  # what the run stores
     assert np.array_equal(vertices["reliability"], field.scalars.reliability.numpy()[rows])
     assert np.array_equal(vertices["n_eff"], field.scalars.n_eff.numpy()[rows])
     assert np.allclose(vertices["relevancy_1"], answer.relevancy[:, 1].numpy()[rows], atol=1e-6)
     label = torch.where(answer.selected.any(1), answer.relevancy.where(answer.selected, -9.0).argmax(1), -1)
     assert np.array_equal(vertices["label"], label.numpy()[rows])
-    assert 0.8 * len(run.scene) < len(rows) <= len(run.scene)
-    assert (run.scene.opacities[rows] > 0.0039).all()
+    assert 0.8 * len(run.scene.gaussians) < len(rows) <= len(run.scene.gaussians)
+    assert (run.scene.gaussians.opacities[rows] > 0.0039).all()
 
 
 def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
@@ -120,8 +118,8 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     sizes = [found["size"] for found in red["objects"]]
     assert sizes == sorted(sizes, reverse=True)
     assert sum(sizes) + red["in_smaller_parts"] == red["gaussians"]
-    ball, run = red["objects"][0], load_scene(lifted)
-    truth = run.scene.means[room.labels == room.names.index("red")]
+    ball, run = red["objects"][0], open_run(lifted)
+    truth = run.scene.gaussians.means[room.labels == room.names.index("red")]
     assert ball["size"] > 0.6 * len(truth)
     assert np.allclose(ball["centroid"], truth.mean(0), atol=0.05)
     assert np.all(np.array(ball["box"]["min"]) <= ball["centroid"])

@@ -17,10 +17,9 @@ from PIL import Image
 from scipy import ndimage
 
 from benchmarks.captures import SHARED
+from normlift_ns import open_run
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.text_vectors import TextVectors
-from normlift_ns.nerfstudio_plugin.load import load_scene
-from normlift_ns.nerfstudio_plugin.write import load_field
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.captures import clip_vectors, needs_shared
@@ -136,7 +135,7 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
         flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
         command(monkeypatch, lift.entrypoint, *flags)
         config = trained.parents[2] / "normlift" / name / "config.yml"
-        field = load_field(load_scene(config))
+        field = open_run(config).field
         scores = []
         for refined in (False, True):
             found = torch.where(field.valid(refined=refined), field.query(texts, refined=refined).argmax(1), -1)

@@ -15,11 +15,9 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInterpolated
 from PIL import Image
 
-from normlift_ns import render
-from normlift_ns.asking import ask, encoder_of
+from normlift_ns import open_run, render
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.load import load_scene
-from normlift_ns.nerfstudio_plugin.write import load_field
 from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry
@@ -39,12 +37,11 @@ def without_encoders(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
     names = [*NAMES, "raw-relevancy_1", "raw-selection", "depth"]
     DatasetRender(lifted, output_path=tmp_path, rendered_output_names=names, split="test", image_format="png").main()
-    run = load_scene(lifted)
-    field = load_field(run)
-    answer = ask(field, encoder_of(field), ["red", "yellow"])  # as stored
+    run = open_run(lifted)
+    answer = run.ask("red", "yellow")  # as stored
     values = torch.stack([answer.relevancy[:, 1], answer.selected.any(dim=1).float()], dim=1)
-    for name, camera in zip(run.held_out.names, run.held_out.cameras):
-        expected, _ = render(run.scene, camera, values)
+    for name, camera in zip(run.scene.held_out.names, run.scene.held_out.cameras):
+        expected, _ = render(run.scene.gaussians, camera, values)
         for i, output in enumerate(("raw-relevancy_1", "raw-selection")):
             with gzip.open(tmp_path / "test" / output / f"{Path(name).stem}.npy.gz") as file:
                 assert np.allclose(np.load(file)[..., 0], expected[..., i].numpy(), atol=1e-5)

@@ -19,7 +19,8 @@ import pytest
 from PIL import Image
 
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
-from normlift_ns.scripts.lift import NormLift, SourceOptions
+from normlift_ns.options import SourceOptions
+from normlift_ns.scripts.lift import NormLift
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +38,7 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_capture(room, folder / "room", views=4, held_out=2, width=80, height=60)
     trained = write_splatfacto_run(room, folder / "room", folder / "outputs")
     source = SourceOptions(encoder="colour", region_count=64)
-    return NormLift(trained, timestamp="t", queries=("red",), source=source).main() / "config.yml"
+    return NormLift(trained, timestamp="t", queries=("red",), source=source).main().config
 
 
 def run(command: str, *flags: object, cwd: Path) -> subprocess.CompletedProcess[str]:

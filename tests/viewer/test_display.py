@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from normlift_ns.asking import Answer
-from normlift_ns.runs.question import Question
+from normlift_ns.asking import Answer, Question
 from normlift_ns.viewer.display import color_scale, colors_of, overlay, palette, segmentation
 from normlift_ns.viewer.status import as_text, clipped, report
 
@@ -57,12 +56,13 @@ def test_colours_of_prompts_differ() -> None:
 
 def test_the_report_counts_and_escapes() -> None:
     relevancy = torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]])
-    answer = Answer(Question(("a|b", "x" * 90), torch.eye(2)), relevancy, torch.ones(3).bool(), relevancy > 0.5)
+    question, unused = Question(("a|b", "x" * 90), torch.eye(2)), None
+    answer = Answer(question, unused, torch.zeros(3, 3), relevancy, torch.ones(3).bool(), relevancy > 0.5)
     lines = report(answer, None).splitlines()
     assert lines[0] == "**3** of 3 Gaussians selected"
     assert "a&#124;b | 2 | 0.90 |" in lines[-2]
     assert f"{'x' * 39}&#8230; | 2 | 0.70 |" in lines[-1]
     assert report(answer, 1).startswith("**2** of 3")
-    assert report(None, None) == "Nothing is asked."
+    assert report(None, None) == "No query yet."
     assert as_text("1 < 2 {}\n") == "1 &#60; 2 &#123;&#125;&#10;"
     assert clipped("a\n  b", 9) == "a b"

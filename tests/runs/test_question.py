@@ -7,7 +7,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from normlift_ns.runs.question import Question, load_question, save_question
+from normlift_ns.asking import Question
+from normlift_ns.runs.question import load_question, save_question
 
 WHOLE = Question(
     ("a; b", "größe\n"), torch.eye(3)[:2], ("c",), torch.ones(1, 3), "margin", 0.02, min_reliability=0.5, refined=False

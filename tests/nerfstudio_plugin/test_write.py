@@ -11,19 +11,19 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
+from normlift_ns.asking import Question
 from normlift_ns.nerfstudio_plugin.config import read_config
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.nerfstudio_plugin.write import load_field, run_directory, write_run
-from normlift_ns.runs.question import Question, load_question
-from tests.nerfstudio_plugin.conftest import lifted_field
+from normlift_ns.runs.question import load_question
+from tests.nerfstudio_plugin.conftest import field_of, lifted_field, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 
 
 def test_a_lifted_run_has_the_files_that_nerfstudio_expects(copied: Path, tmp_path: Path) -> None:
     source = load_scene(copied)
     before = copied.read_bytes()
-    run_dir = write_run(source, lifted_field(source), timestamp="now")
+    run_dir = write(source, lifted_field(source), timestamp="now")
     assert run_dir == tmp_path / "moved" / "outputs" / "scene" / "normlift" / "now"
     assert sorted(os.listdir(run_dir)) == ["config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift"]
     assert os.listdir(run_dir / "nerfstudio_models") == ["step-000000002.ckpt"]
@@ -42,7 +42,7 @@ def test_a_lifted_run_has_the_files_that_nerfstudio_expects(copied: Path, tmp_pa
 
 def test_the_config_is_the_sources_with_another_method_and_model(copied: Path) -> None:
     source = load_scene(copied)
-    run_dir = write_run(source, lifted_field(source), question=Question(("a",), torch.eye(8)[:1]))
+    run_dir = write(source, lifted_field(source), question=Question(("a",), torch.eye(8)[:1]))
     config: Any = read_config(run_dir / "config.yml")
     stored: Any = source.config
     assert config.method_name == "normlift"
@@ -64,29 +64,29 @@ def test_stock_eval_setup_loads_it_from_the_directory_of_the_training(
 ) -> None:
     source = load_scene(copied)
     field = lifted_field(source)
-    run_dir = write_run(source, field)
+    run_dir = write(source, field)
     with working_directory(tmp_path / "moved"):
         _, pipeline, path, step = eval_setup((run_dir / "config.yml").relative_to(tmp_path / "moved"))
     assert step == 2
     assert path.name == "step-000000002.ckpt"
     assert type(pipeline.model) is NormLiftModel
-    assert torch.equal(pipeline.model.means, source.scene.means)
+    assert torch.equal(pipeline.model.means, source.gaussians.means)
     assert pipeline.model.field is not None
     assert torch.equal(pipeline.model.field.scalars.reliability, field.scalars.reliability)
 
 
 def test_our_loader_reads_it_from_anywhere_and_can_lift_it_again(copied: Path, tmp_path: Path) -> None:
     source = load_scene(copied)
-    run_dir = write_run(source, lifted_field(source), timestamp="first")
+    run_dir = write(source, lifted_field(source), timestamp="first")
     with working_directory(tmp_path):
         again = load_scene(run_dir / "config.yml")
-        field = load_field(again)
-        second = write_run(again, field, timestamp="second")
-    assert torch.equal(again.scene.means, source.scene.means)
+        field = field_of(again)
+        second = write(again, field, timestamp="second")
+    assert torch.equal(again.gaussians.means, source.gaussians.means)
     assert again.train.cameras[3].world_to_camera.tolist() == source.train.cameras[3].world_to_camera.tolist()
     assert second == run_dir.parent / "second"
     assert read_config(second / "config.yml").output_dir == Path("outputs")
-    assert torch.equal(load_field(load_scene(second / "config.yml")).source, field.source)
+    assert torch.equal(field_of(load_scene(second / "config.yml")).source, field.source)
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -98,7 +98,7 @@ def test_with_an_output_directory_elsewhere_all_paths_become_absolute(
         data = data.rename(tmp_path / "dataset")
     source = load_scene(copied, data=data if moved else None)
     with working_directory(tmp_path):
-        run_dir = write_run(source, lifted_field(source), output_dir=Path("lifts"))
+        run_dir = write(source, lifted_field(source), output_dir=Path("lifts"))
         config = read_config(run_dir / "config.yml")
         assert run_dir.is_relative_to(tmp_path / "lifts" / "scene" / "normlift")
         assert config.output_dir == tmp_path / "lifts"
@@ -109,26 +109,26 @@ def test_with_an_output_directory_elsewhere_all_paths_become_absolute(
 
 def test_an_output_directory_below_the_training_stays_relative(copied: Path, tmp_path: Path) -> None:
     source = load_scene(copied)
-    run_dir = write_run(source, lifted_field(source), output_dir=tmp_path / "moved" / "lifts")
+    run_dir = write(source, lifted_field(source), output_dir=tmp_path / "moved" / "lifts")
     assert read_config(run_dir / "config.yml").output_dir == Path("lifts")
 
 
 def test_an_existing_directory_is_kept_unless_told(copied: Path, tmp_path: Path) -> None:
     source = load_scene(copied)
     field = lifted_field(source)
-    run_dir = write_run(source, field, timestamp="now")
+    run_dir = write(source, field, timestamp="now")
     (run_dir / "note.txt").touch()
     with pytest.raises(
         FileExistsError, match=rf"{run_dir} exists; give another --timestamp or --output-dir, or --overw"
     ):
-        write_run(source, field, timestamp="now")
+        write(source, field, timestamp="now")
     assert (run_dir / "note.txt").exists()
-    assert write_run(source, field, timestamp="now", overwrite=True) == run_dir
+    assert write(source, field, timestamp="now", overwrite=True) == run_dir
     assert not (run_dir / "note.txt").exists()
     assert os.listdir(run_dir.parent) == ["now"]
     lifted = load_scene(run_dir / "config.yml")  # a run may also replace the one that it was made from
-    write_run(lifted, field, timestamp="now", overwrite=True)
-    assert torch.equal(load_scene(run_dir / "config.yml").scene.means, source.scene.means)
+    write(lifted, field, timestamp="now", overwrite=True)
+    assert torch.equal(load_scene(run_dir / "config.yml").gaussians.means, source.gaussians.means)
 
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
@@ -137,18 +137,18 @@ def test_a_failure_leaves_nothing_and_keeps_what_was_there(
 ) -> None:
     source = load_scene(copied)
     field = lifted_field(source)
-    run_dir = write_run(source, field, timestamp="now")
+    run_dir = write(source, field, timestamp="now")
 
     def fail(*args) -> None:
         raise failure
 
     monkeypatch.setattr(torch, "save", fail)
     with pytest.raises(type(failure)):
-        write_run(source, field, timestamp="other")
+        write(source, field, timestamp="other")
     with pytest.raises(type(failure)):
-        write_run(source, field, timestamp="now", overwrite=True)
+        write(source, field, timestamp="now", overwrite=True)
     assert os.listdir(run_dir.parent) == ["now"]
-    load_field(load_scene(run_dir / "config.yml"))
+    field_of(load_scene(run_dir / "config.yml"))
 
 
 @pytest.mark.parametrize("limit", [500, 4000])  # the first file, the checkpoint
@@ -159,23 +159,23 @@ def test_a_full_disk_is_an_os_error(copied: Path, limit: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:
         with pytest.raises(OSError, match=r"cannot be written|too large"):
-            write_run(source, field, timestamp="now")
+            write(source, field, timestamp="now")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert os.listdir(run_directory(source).parent) == []
+    assert os.listdir(source.runs_dir / "scene" / "normlift") == []
 
 
 def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun) -> None:
     source = load_scene(copied)
     field = lifted_field(source)
-    run_dir = write_run(source, field, timestamp="now")
-    other = source.scene.means.clone()
+    run_dir = write(source, field, timestamp="now")
+    other = source.gaussians.means.clone()
     other[0] += 1
     field.manifest["means_fingerprint"] = "0"  # type: ignore[index]
     with pytest.raises(
         ValueError, match=r"field has 60 Gaussians and was not lifted from the 60 of .*step-000000002\.ckpt"
     ):
-        write_run(source, field)
+        write(source, field)
 
     path = run_dir / "nerfstudio_models" / "step-000000002.ckpt"
     slim = torch.load(path, weights_only=True)
@@ -183,15 +183,13 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun) -> Non
     with pytest.raises(
         ValueError, match=rf"normlift was lifted from other Gaussians than those of {path} \(same number"
     ):
-        load_field(load_scene(run_dir / "config.yml"))
+        field_of(load_scene(run_dir / "config.yml"))
     fewer = {name: value[1:] if "gauss_params" in name else value for name, value in slim["pipeline"].items()}
     torch.save({"step": 2, "pipeline": fewer}, path)
     with pytest.raises(ValueError, match=rf"normlift has 60 Gaussians, but {path} has 59"):
-        load_field(load_scene(run_dir / "config.yml"))
+        field_of(load_scene(run_dir / "config.yml"))
 
 
 def test_a_run_without_semantics_is_named(stock: StockRun) -> None:
-    with pytest.raises(
-        FileNotFoundError, match=r"is a splatfacto run without semantics \(no normlift/ in it\)\. Lift it"
-    ):
-        load_field(load_scene(stock.config))
+    with pytest.raises(FileNotFoundError, match=r"is a run without semantics \(no normlift/ in it\)\. Lift it"):
+        field_of(load_scene(stock.config))

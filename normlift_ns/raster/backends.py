@@ -1,0 +1,66 @@
+"""The table of all ways to rasterize, and which one suits a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import torch
+
+from normlift_ns.core.gpu import has_triton
+from normlift_ns.raster.backend import Backend, Job, TileBackend
+
+BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
+
+
+def _torch() -> Backend:
+    from normlift_ns.raster import reference  # noqa: PLC0415 (each backend loads where it is used)
+
+    return TileBackend("torch", reference)
+
+
+def _numba() -> Backend:
+    from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
+
+    return TileBackend("numba", numba, on="cpu")
+
+
+def _gsplat() -> Backend:
+    from normlift_ns.raster import gsplat  # noqa: PLC0415
+
+    return gsplat
+
+
+def _triton() -> Backend:
+    from normlift_ns.raster import triton  # noqa: PLC0415
+
+    return triton
+
+
+BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
+"""All backends by name, in the order from the most general to the fastest."""
+
+
+def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend]:
+    """The backend of a name, checked; "auto": the fastest that can do the job.
+
+    Args:
+        pictures: composite values; False: sum evidence.
+    Raises:
+        ValueError: an unknown name, or a backend that cannot do the job.
+    """
+    if name == "auto":
+        name = _fastest(job, pictures)
+    if name not in BACKENDS:
+        raise ValueError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
+    backend = BACKENDS[name]()
+    backend.check(job)
+    return name, backend
+
+
+def _fastest(job: Job, pictures: bool) -> str:
+    if job.scene.means.device.type == "cpu":
+        return "numba"
+    if pictures or not job.scene.means.is_cuda or job.dtype != torch.float32 or job.scene.means.dtype != torch.float32:
+        return "torch"
+    return "triton" if has_triton() else "gsplat"
