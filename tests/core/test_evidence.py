@@ -225,7 +225,7 @@ def test_disagreeing_arrays_are_refused():
     with pytest.raises(ValueError, match="one per Gaussian"):
         replace(e, rows=e.rows.select_rows(torch.arange(4)))
     with pytest.raises(ValueError, match="arrays disagree"):
-        replace(e, rows=replace(e.rows, weight=e.rows.weight[1:]))
+        replace(e, rows=replace(e.rows, offsets=e.rows.offsets[:-1]))
     with pytest.raises(ValueError, match="region_view must be non-decreasing"):
         replace(e, region_view=e.region_view.flip(0))
 

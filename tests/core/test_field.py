@@ -233,7 +233,7 @@ def test_bad_arguments_are_named():
             field.query(vectors)
     for kwargs, message in (
         ({"tolerance": 0.0}, "tolerance must be positive"),
-        ({"form": "zip"}, "form must be auto, evidence, float16, low_rank"),
+        ({"storage": "zip"}, "storage must be auto, evidence, float16, low_rank"),
         ({"source": source[1:]}, "one row per lifted Gaussian"),
     ):
         with pytest.raises(ValueError, match=message):

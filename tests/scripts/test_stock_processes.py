@@ -82,19 +82,23 @@ def test_ns_export_writes_the_gaussians(lifted, tmp_path):
 
 
 def test_ns_viewer_answers(lifted, tmp_path):
+    assert b"<html" in viewer_page(lifted, cwd=tmp_path, log=tmp_path / "log")
+
+
+def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
+    """The page that ns-viewer serves, if it still runs two seconds later."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     flags = ("--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    words = [str(BIN / "ns-viewer"), "--load-config", str(lifted), *map(str, flags)]
-    log = tmp_path / "log"
+    words = [str(BIN / "ns-viewer"), "--load-config", str(config), *map(str, flags)]
     with log.open("w") as output:
-        viewer = subprocess.Popen(words, cwd=tmp_path, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
+        viewer = subprocess.Popen(words, cwd=cwd, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
     try:
         page = first_page(f"http://127.0.0.1:{port}/", viewer)
         time.sleep(2)
         assert viewer.poll() is None, log.read_text()
-        assert b"<html" in page, log.read_text()
+        return page
     finally:
         viewer.send_signal(signal.SIGINT)
         try:

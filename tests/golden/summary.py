@@ -1,0 +1,129 @@
+"""A lift and its answers in few numbers, so that two versions of the program can be compared.
+
+python -m tests.golden.summary FOLDER > tests/golden/golden.json
+
+FOLDER/<scene>/ holds what `run_commands` writes. The committed golden.json was made by version 0.1.
+
+Another number of threads, or another kind of processor, rounds the last bits of a vote otherwise. About one Gaussian in
+ten thousand then copies another neighbour, so that `source` is compared exactly only on the machine that golden.json
+names, and by a sample elsewhere.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from plyfile import PlyData
+from safetensors.numpy import load_file
+
+TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
+"""Queries of each scene, stored in its run."""
+SAMPLES = 64
+
+
+def run_commands(scene: str, config: Path, folder: Path) -> None:
+    """Lifts a run (8 views, half resolution, colour encoder), asks it and exports what is found."""
+    lift = ("--encoder", "colour", "--max-views", 8, "--lift-downscale", 2, "--queries", *TEXTS[scene])
+    _command("ns-normlift", "--load-config", config, *lift, "--timestamp", "golden", "--output-dir", folder)
+    (lifted,) = folder.glob("*/normlift/golden/config.yml")
+    files = ("--json", folder / "answers.json", "--output-path", folder / "answers.npz")
+    _command("ns-normlift-query", "--load-config", lifted, "--text", *TEXTS[scene], "brown", *files)
+    _command("ns-normlift-export", "--load-config", lifted, "--output-dir", folder / "export", "--part", "selection")
+
+
+def _command(name: str, *flags: object) -> None:
+    threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": ""}
+    words = [str(Path(sys.executable).with_name(name)), *map(str, flags)]
+    done = subprocess.run(words, env=os.environ | threads, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def summarize(folder: Path) -> dict[str, Any]:
+    """Integers by their digest, or as they are where there are few; floats by a sample and their mean."""
+    (run,) = folder.glob("*/normlift/golden")
+    manifest = json.loads((run / "normlift" / "manifest.json").read_text())
+    answers = np.load(folder / "answers.npz")
+    found: dict[str, Any] = {
+        "machine": machine(),
+        "form": manifest["form"],
+        "forms": {
+            name: {k: v for k, v in way.items() if k != "bound_quantiles"} for name, way in manifest["forms"].items()
+        },
+        "statistics": manifest["statistics"],
+        "answers": json.loads((folder / "answers.json").read_text()),
+        "objects": json.loads((folder / "export" / "splat_objects.json").read_text()),
+    }
+    for file in sorted((run / "normlift").glob("*.safetensors")):
+        found[file.stem] = {name: _array(array, name) for name, array in sorted(load_file(file).items())}
+    found["npz"] = {name: _array(answers[name]) for name in ("relevancy", "reliability", "valid")}
+    vertices = PlyData.read(folder / "export" / "splat.ply")["vertex"]
+    found["ply"] = {p.name: _array(np.asarray(vertices[p.name])) for p in vertices.properties}
+    found["rows"] = _array(np.load(folder / "export" / "splat_rows.npy"))
+    return found
+
+
+def machine() -> dict[str, str]:
+    """What rounding depends on."""
+    return {"torch": torch.__version__, "processor": torch.backends.cpu.get_cpu_capability()}
+
+
+def _array(array: np.ndarray, name: str = "") -> dict[str, Any]:
+    if array.dtype.kind != "f":
+        exact = np.ascontiguousarray(array.astype(np.int64))
+        digest = blake2b(exact.tobytes(), digest_size=16).hexdigest()
+        some = exact.ravel()[:: max(1, exact.size // 512)].tolist() if name == "source" else []
+        return {"shape": list(array.shape), "digest": digest, "sample": some}
+    flat = array.astype(np.float64).ravel()
+    some = flat[np.linspace(0, len(flat) - 1, min(SAMPLES, len(flat))).astype(int)] if len(flat) > 0 else flat
+    mean = float(flat.mean()) if len(flat) > 0 else 0.0
+    return {"shape": list(array.shape), "mean": round(mean, 8), "sample": [round(x, 8) for x in some.tolist()]}
+
+
+def compare(found: dict[str, Any], golden: dict[str, Any], tolerance: float) -> list[str]:
+    """Places where two summaries of a scene differ."""
+    if found["machine"] != golden["machine"]:
+        ours, theirs = found["field"].pop("source"), golden["field"].pop("source")
+        same = np.mean(np.equal(ours["sample"], theirs["sample"]))
+        share = found["statistics"].pop("refined_share") - golden["statistics"].pop("refined_share")
+        del found["machine"], golden["machine"]
+        if same < 0.99 or abs(share) > 1e-3:
+            return [f"source: {same:.2%} of a sample are equal, the refined share differs by {share:.1e}"]
+    return differences(found, golden, tolerance)
+
+
+def differences(found: Any, golden: Any, tolerance: float, path: str = "") -> list[str]:
+    """Places where two values differ: floats by more than the tolerance (relative to values above 1), all else at
+    all."""
+    if isinstance(found, dict) and isinstance(golden, dict):
+        names = sorted({*found, *golden})
+        return [
+            line
+            for name in names
+            for line in differences(found.get(name), golden.get(name), tolerance, f"{path}/{name}")
+        ]
+    if isinstance(found, list) and isinstance(golden, list) and len(found) == len(golden):
+        return [
+            line for i, (a, b) in enumerate(zip(found, golden)) for line in differences(a, b, tolerance, f"{path}/{i}")
+        ]
+    if isinstance(found, float) and isinstance(golden, float):
+        return [] if abs(found - golden) <= tolerance * max(1.0, abs(golden)) else [f"{path}: {found} is not {golden}"]
+    return [] if found == golden else [f"{path}: {found} is not {golden}"]
+
+
+def main(folders: Sequence[str]) -> None:
+    """Prints the summaries of all scenes below a folder."""
+    found = {name: summarize(Path(folders[0]) / name) for name in TEXTS}
+    print("{\n" + ",\n".join(f'"{name}": {json.dumps(summary)}' for name, summary in found.items()) + "\n}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,156 @@
+"""The front door: a run lifted, opened, asked, drawn and exported from Python."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+import normlift_ns as nl
+from normlift_ns.demo import DemoRoom
+from normlift_ns.scripts import query
+from tests.scripts.conftest import run_entry
+
+
+@pytest.fixture(scope="module")
+def run(lifted: Path) -> nl.LiftedRun:
+    return nl.open_run(lifted)
+
+
+def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None:
+    answer = run.ask("red", "yellow", min_reliability=0.3)
+    red, yellow = answer
+    assert (red.text, yellow.text) == answer.texts == ("red", "yellow")
+    assert torch.equal(answer["yellow"].mask, yellow.mask)
+    assert torch.equal(answer.mask, red.mask | yellow.mask)
+    assert (run.field.scalars.reliability[answer.mask] >= 0.3).all()
+    assert (red.relevancy[red.mask] > 0.5).all()
+
+    truth = room.labels == room.names.index("red")
+    assert float(truth[red.mask].float().mean()) > 0.8
+    means, weight = run.scene.gaussians.means[red.mask].double(), run.field.scalars.weight[red.mask].double()
+    assert red.centroid == pytest.approx(((weight[:, None] * means).sum(0) / weight.sum()).tolist(), rel=1e-9)
+    ball = red.objects[0]
+    assert ball.size > 0.6 * int(truth.sum())
+    assert np.all(np.array(ball.box["min"]) <= ball.centroid) and np.all(np.array(ball.centroid) <= ball.box["max"])
+    with pytest.raises(KeyError, match="'blue' was not asked; the texts are 'red', 'yellow'"):
+        answer["blue"]
+
+
+def test_nothing_found_has_no_place(run: nl.LiftedRun) -> None:
+    nothing = run.ask("red", threshold=2.0)["red"]
+    assert (nothing.fraction, nothing.centroid, nothing.extent, nothing.objects) == (0.0, None, None, [])
+    assert nothing.mean_reliability is None
+    assert nothing.peak is not None and nothing.peak > 0.5
+
+
+def test_parts_are_exported(run: nl.LiftedRun, tmp_path: Path) -> None:
+    answer = run.ask("red", "yellow")
+    parts = {"red": answer["red"], "both": answer, "mask": answer["red"].mask, "all": None}
+    rows = {name: run.export(tmp_path / f"{name}.ply", part) for name, part in parts.items()}
+    assert np.array_equal(rows["red"], rows["mask"])
+    assert set(rows["red"]) < set(rows["both"]) < set(rows["all"])
+    assert set(rows["red"]) <= set(answer["red"].mask.nonzero().squeeze(1).tolist())
+    columns = {name: set(PlyData.read(tmp_path / f"{name}.ply")["vertex"].data.dtype.names) for name in parts}
+    assert "relevancy_1" in columns["red"] and "relevancy_1" in columns["both"]
+    assert "relevancy_0" not in columns["mask"] | columns["all"]
+    with pytest.raises(FileExistsError, match=r"red\.ply exists; give another name, or overwrite=True"):
+        run.export(tmp_path / "red.ply", answer)
+    assert len(run.export(tmp_path / "red.ply", answer, overwrite=True)) == len(rows["both"])
+
+
+def test_pictures_show_the_answer(run: nl.LiftedRun) -> None:
+    answer = run.ask("red", "yellow")
+    plain, red, both = (run.render("0003", found) for found in (None, answer["red"], answer))
+    photo = run.scene.train[3].image
+    assert (plain.int() - photo.int()).abs().float().mean() < 3
+    coloured = {
+        name: int((np.ptp(x.numpy().astype(int), axis=2) > 60).sum()) for name, x in (("red", red), ("both", both))
+    }
+    assert 20 < coloured["red"] < coloured["both"] < 0.5 * plain[:, :, 0].numel()
+    assert torch.equal(run.render(3), plain)
+    assert torch.equal(run.render(run.scene.train.cameras[3]), plain)
+    assert torch.equal(run.render("images/0003.png"), plain)
+    with pytest.raises(KeyError, match=r"no training image 'x'; there are 12, from images/0000\.png to"):
+        run.render("x")
+
+
+def test_features_of_ones_own(trained: Path, room: DemoRoom, tmp_path: Path, monkeypatch, capsys) -> None:
+    """Masks of the capture with made-up vectors: the run can be asked from Python and on the command line."""
+    scene = nl.open_scene(trained)
+    vectors = torch.nn.functional.normalize(torch.randn(len(room.names), 6, generator=torch.Generator().manual_seed(0)))
+    masks = [nl_mask(trained, view.name) for view in scene.train]
+    features = [(mask - 1, vectors) for mask in masks]
+    texts = {name: 3 * vector for name, vector in zip(room.names, vectors)} | {"file": vectors[0]}
+    run = nl.lift_run(scene, features=features, texts=texts, output_dir=tmp_path, timestamp="own", queries=["red"])
+    assert run.folder == tmp_path / "room" / "normlift" / "own"
+    found = run.ask("red", threshold=0.9)["red"].mask
+    truth = room.labels == room.names.index("red")
+    assert (found & truth).sum() / (found | truth).sum() > 0.7
+
+    opened = nl.open_run(run.config)
+    assert torch.equal(opened.ask("red", threshold=0.9)["red"].mask, found)
+    stored = opened.ask_stored()
+    assert stored is not None and stored.texts == ("red",)
+    assert opened.field.manifest["features"]["kind"] == "given"
+    (tmp_path / "room" / "normlift" / "own").rename(tmp_path / "moved")  # the texts go with the run
+    flags = ("--load-config", tmp_path / "moved" / "config.yml", "--text", "red", "file", "--json", tmp_path / "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
+    assert "near names: red" in " ".join(capsys.readouterr().out.split())
+
+
+def nl_mask(trained: Path, name: str) -> torch.Tensor:
+    """Labels of a training image: 0 for nothing, else 1 + class."""
+    from PIL import Image  # noqa: PLC0415
+
+    return torch.from_numpy(
+        np.array(Image.open(trained.parents[3].parent / "room" / "instance" / Path(name).name))
+    ).int()
+
+
+def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> None:
+    scene = nl.open_scene(trained)
+    half = (torch.arange(160).expand(120, 160) // 80, np.eye(2, dtype=np.float32))
+    some = {name: half for name in scene.train.names[::3]}
+    run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
+    assert run.field.manifest["statistics"]["views"] == 4
+    assert run.field.manifest["statistics"]["left_out"] == 8
+    assert run.seconds["lift"] > 0
+    with pytest.raises(ValueError, match=r"features of its own, without texts; name a file of texts"):
+        run.ask("left")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f[:3], "3 pairs of labels and vectors were given for 12 training images"),
+        (lambda f: {"nowhere.png": f[0]}, r"no training image 'nowhere\.png' for the features given"),
+        (
+            lambda f: [(f[0][0][:, :80], f[0][1])] * 12,
+            r"labels of images/0000\.png are \(120, 80\), but the undistorted",
+        ),
+        (lambda f: [(f[0][0] + 1, f[0][1])] * 12, r"labels of images/0000\.png must be .* in -1\.\.1, got .* up to 2"),
+        (lambda f: [(f[0][0], 0 * f[0][1])] * 12, r"vectors of images/0000\.png must be \[regions, D\], finite"),
+        (lambda f: [*f[:11], (f[0][0], torch.eye(3))], r"must have the same length, found \[2, 3\]"),
+    ],
+)
+def test_features_that_do_not_fit_are_named(trained: Path, tmp_path: Path, change, message: str) -> None:
+    half = (torch.arange(160).expand(120, 160) // 80, torch.eye(2))
+    with pytest.raises(ValueError, match=message):
+        nl.lift_run(trained, features=change([half] * 12), output_dir=tmp_path)
+    assert not list(tmp_path.rglob("config.yml"))
+
+
+def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
+    with pytest.raises(FileExistsError, match="exists; give another --timestamp"):
+        nl.lift_run(trained, source=nl.SourceOptions(encoder="colour"), timestamp="one")
+    with pytest.raises(TypeError, match=r"lift_run takes the config\.yml of a run or a scene of open_scene, got int"):
+        nl.lift_run(3, features=[])  # type: ignore[arg-type]
+    with pytest.raises(FileNotFoundError, match="is a run without semantics"):
+        nl.open_run(trained)
