@@ -33,7 +33,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.given import GivenFeatures, features_by_name
 from normlift_ns.encoders.source import FeatureSource, TextEncoder
-from normlift_ns.lifting import Export, Report, lift_scene
+from normlift_ns.lifting import Export, lift_scene
 from normlift_ns.options import LiftOptions, Rule, SourceOptions
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.runs.files import (
@@ -48,6 +48,7 @@ from normlift_ns.runs.files import (
 )
 from normlift_ns.runs.question import load_question, save_question
 from normlift_ns.runs.splats import write_splats
+from normlift_ns.stages import Report
 from normlift_ns.viewer.display import draw, make_display
 
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import resource
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.lift import Scalars, lift
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.core.lift import Lifted, Scalars, lift
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import refine, unsupported
 from normlift_ns.core.scene import Scene, View
@@ -23,10 +22,8 @@ from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.langsplat.source import write_langsplat
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.observing import BLOCK, block_evidence, observe_views, spread
-from normlift_ns.options import LiftOptions
-
-Report = Callable[[str, int, int], None]
-"""Called with (stage, steps done, steps in all)."""
+from normlift_ns.options import LiftOptions, RefineConfig
+from normlift_ns.stages import Report, Stages, cost
 
 
 class Export(NamedTuple):
@@ -68,17 +65,48 @@ def lift_scene(
         ValueError, FileNotFoundError: an image, a label map or an option that does not fit; the message names it.
         MemoryError: the GPU's memory does not hold the lift.
     """
-    stages = _Stages(report)
-    gaussians = scene.gaussians.to(device)
+    stages = Stages(report)
+    gaussians, views = scene.gaussians.to(device), scene.train
+    names = set(source.available(views.names))
+    usable = [index for index, name in enumerate(views.names) if name in names]
+    used = [usable[i] for i in spread(len(usable), options.max_views)]
+    evidence, features = _observe(scene, gaussians, used, source, options, cache, export, stages)
+    with stages("lift") as step:
+        lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+        step()
+    counts = {"views": len(used), "left_out": len(views) - len(usable), "excluded": evidence.num_excluded}
+    copied, shares = _vote(gaussians, lifted, options.vote, stages) if options.refine else (None, {})
+    with stages("store") as step:
+        provenance = {
+            **scene.identity,
+            "encoder": dict(encoder),
+            "features": source.identity,
+            "options": asdict(options),
+            "statistics": {**counts, **_statistics(lifted.scalars), **shares},
+            "cost": cost(stages.seconds, device),
+        }
+        rule = {"tolerance": options.tolerance, "storage": options.storage}
+        built = SemanticField.build(lifted, gaussians.means, copied, provenance=provenance, **rule)
+        step()
+    return LiftResult(built, stages.seconds)
+
+
+def _observe(
+    scene: Scene,
+    gaussians: GaussianScene,
+    used: Sequence[int],
+    source: FeatureSource,
+    options: LiftOptions,
+    cache: Path,
+    export: Export | None,
+    stages: Stages,
+) -> tuple[Evidence, Float[Tensor, "s d"]]:
+    """Evidence and feature table of some training views, block by block, so that an interrupted lift can resume."""
     dtype = torch.float64 if options.precision == "double" else torch.float32
-    names = set(source.available(scene.train.names))
-    usable = [index for index, name in enumerate(scene.train.names) if name in names]
-    indices = [usable[i] for i in spread(len(usable), options.max_views)]
     seen = cached(source, cache) if options.reuse_evidence else source
     parts, tables = [], []
-    for start in range(0, len(indices), BLOCK):
-        chosen = indices[start : start + BLOCK]
-        with stages("features", len(indices)) as step:
+    for start in range(0, len(used), BLOCK):
+        with stages("features", len(used)) as step:
 
             def done(view: View, step: Callable[[], None] = step) -> None:
                 if export is not None:
@@ -86,9 +114,10 @@ def lift_scene(
                 step()
 
             rendered = options.image_source == "render"
+            chosen = used[start : start + BLOCK]
             block = observe_views(scene, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
             tables.extend(block.features)
-        with stages("evidence", len(indices)) as step:
+        with stages("evidence", len(used)) as step:
             evidence = block_evidence(
                 gaussians,
                 block,
@@ -100,79 +129,23 @@ def lift_scene(
                 done=step,
             )
             parts.append(evidence)
-    with stages("lift") as step:
-        evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device, dtype)
-        lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+    return Evidence.merge(*parts), torch.cat(tables).to(gaussians.means.device, dtype)
+
+
+def _vote(
+    gaussians: GaussianScene, lifted: Lifted, config: RefineConfig, stages: Stages
+) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
+    """Whose direction every Gaussian takes, and the shares of Gaussians that change theirs and that nobody supports."""
+    with stages("neighbors") as step:
+        neighbors = nearest_neighbors(gaussians.means, config.k)
         step()
-    left_out = len(scene.train) - len(usable)
-    statistics = {
-        "views": len(indices),
-        "left_out": left_out,
-        "excluded": evidence.num_excluded,
-        **_statistics(lifted.scalars),
-    }
-    copied = None
-    if options.refine:
-        with stages("neighbors") as step:
-            neighbors = nearest_neighbors(gaussians.means, options.vote.k)
-            step()
-        with stages("vote") as step:
-            reliability = lifted.scalars.reliability
-            copied = refine(gaussians.means, lifted.directions, reliability, options.vote, neighbors=neighbors)
-            step()
-        changed = copied != torch.arange(len(copied), device=copied.device)
-        statistics["refined_share"] = float(changed.float().mean())
-        statistics["unsupported_share"] = float(unsupported(neighbors, reliability).float().mean())
-    with stages("store") as step:
-        provenance = {
-            **scene.identity,
-            "encoder": dict(encoder),
-            "features": source.identity,
-            "options": asdict(options),
-            "statistics": statistics,
-            "cost": _cost(stages.seconds, device),
-        }
-        built = SemanticField.build(
-            lifted, gaussians.means, copied, tolerance=options.tolerance, storage=options.storage, provenance=provenance
-        )
+    with stages("vote") as step:
+        reliability = lifted.scalars.reliability
+        copied = refine(gaussians.means, lifted.directions, reliability, config, neighbors=neighbors)
         step()
-    return LiftResult(built, stages.seconds)
-
-
-class _Stages:
-    """Adds up the seconds of each stage and passes on how far it is."""
-
-    def __init__(self, report: Report) -> None:
-        self.seconds: dict[str, float] = {}
-        self._report = report
-        self._done: dict[str, int] = {}
-
-    @contextmanager
-    def __call__(self, stage: str, total: int = 1) -> Iterator[Callable[[], None]]:
-        def step() -> None:
-            self._done[stage] = self._done.get(stage, 0) + 1
-            self._report(stage, self._done[stage], total)
-
-        start = time.perf_counter()
-        self._report(stage, self._done.get(stage, 0), total)
-        try:
-            yield step
-        except torch.OutOfMemoryError as error:
-            raise MemoryError(
-                f"the GPU's memory is full in stage {stage} ({error}); lift on the CPU: --device cpu"
-            ) from error
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
-def _cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
-    """Seconds of the stages so far and in all, and the most memory of this process and of the GPU, GiB."""
-    unit = 2**30 if sys.platform == "darwin" else 2**20
-    memory = {"memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
-    if torch.device(device).type == "cuda":
-        memory["gpu_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
-    return {**{f"{stage}_s": value for stage, value in seconds.items()}, "total_s": sum(seconds.values()), **memory}
+    changed = copied != torch.arange(len(copied), device=copied.device)
+    lost = unsupported(neighbors, reliability)
+    return copied, {"refined_share": float(changed.float().mean()), "unsupported_share": float(lost.float().mean())}
 
 
 def _statistics(scalars: Scalars) -> dict[str, Any]:

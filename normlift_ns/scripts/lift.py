@@ -18,7 +18,7 @@ from normlift_ns.scripts.shared import CONSOLE, run_command
 
 if TYPE_CHECKING:
     from normlift_ns.lifted_run import LiftedRun
-    from normlift_ns.lifting import Report
+    from normlift_ns.stages import Report
 
 
 @dataclass

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from dataclasses import fields, is_dataclass
-from importlib.metadata import version
 from typing import Annotated, Any, Protocol, get_type_hints
 
 import docstring_parser
 import tyro
 from rich.console import Console
+
+import normlift_ns
 
 CONSOLE = Console(width=120)
 
@@ -28,7 +29,7 @@ def run_command(command: type[Command]) -> None:
     Errors of flags, input, files, disks and memory become a message and exit code 1, Ctrl-C exit code 130.
     """
     if "--version" in sys.argv[1:]:
-        print(f"normlift_ns {version('normlift-ns')}")
+        print(f"normlift_ns {normlift_ns.__version__}")
         return
     tyro.extras.set_accent_color("bright_yellow")
     try:
