@@ -115,7 +115,9 @@ class NormLiftModel(SplatfactoModel):
             outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
             outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
-            outputs["background"] = outputs["background"].expand(view.height, view.width, 3)  # [3] where all is cropped
+            # where all is cropped away, splatfacto's outputs are on the CPU and its background is [3]
+            outputs = {name: value.to(self.device) for name, value in outputs.items()}
+            outputs["background"] = outputs["background"].expand(view.height, view.width, 3)
             scalars = self._scalars_by_gsplat(view, values, rows)
         self.set_crop(obb_box)
         if display is None:
