@@ -99,8 +99,8 @@ class RefineConfig:
     k: int = 36
     """Number of neighbours K in the vote, at least 1."""
     sigma_d: float = 1.0
-    """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest one at
-    another place, because scenes are rescaled."""
+    """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest
+    one at another place, because scenes are rescaled."""
     tau: float = 0.95
     """Cosine at which two directions half agree in the vote, in -1..1."""
     gamma: float = 0.4
