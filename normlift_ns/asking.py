@@ -106,6 +106,17 @@ class Finding:
     """What a field says of one text. Places are in the scene's own units; None where nothing is selected.
 
     Means are weighted by W_j, what the views saw of each Gaussian.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, SemanticField, lift
+    >>> from normlift_ns.asking import Question, answer
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 2]), torch.tensor([3.0, 1.0, 1.0]), (2,))
+    >>> means = torch.tensor([[0.0, 0, 0], [4, 0, 0], [9, 9, 9]])
+    >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
+    >>> fox = answer(field, means, Question(("fox",), torch.tensor([[1.0, 0]])))["fox"]
+    >>> fox.mask.tolist(), [round(x, 3) for x in fox.centroid], fox.peak, fox.mean_reliability
+    ([True, True, False], [1.0, 0.0, 0.0], 1.0, 0.5)
     """
 
     answer: Answer

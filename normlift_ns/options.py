@@ -37,7 +37,14 @@ REACH, MIN_SIZE = 4.0, 20
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What the images show: an encoder, and the regions that it looks at."""
+    """What the images show: an encoder, and the regions that it looks at.
+
+    >>> from normlift_ns import LiftOptions, SourceOptions, lift_run
+    >>> source = SourceOptions(encoder="colour", regions="grid", region_count=192)
+    >>> run = lift_run(config, source=source, lift=LiftOptions(max_views=3), output_dir=folder)
+    >>> run.field.manifest["encoder"]["encoder"], run.ask("red")["red"].peak > 0.9
+    ('colour', True)
+    """
 
     encoder: EncoderName = "open_clip"
     """open_clip: CLIP features of masked crops, or of patches. colour: mean colours against colour names, without

@@ -33,6 +33,15 @@ def refine_variant(
         beta: as in `lift`.
     Raises:
         ValueError: an unknown variant.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, RefineConfig, lift, refine_variant
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 2, 1]), torch.ones(3), (2,))
+    >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
+    >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    >>> [refine_variant(name, means, lifted, RefineConfig(k=2))[1] for name in ("none", "linear", "full")]
+    [tensor([0., 1.]), tensor([0.7716, 0.6361]), tensor([1., 0.])]
     """
     config = config or RefineConfig()
     reliability, directions = variant_reliability(variant, lifted.scalars, beta), lifted.directions()

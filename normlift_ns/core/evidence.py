@@ -43,6 +43,17 @@ class Evidence:
     Columns s number the regions of all views one after the other, like the rows of the feature table. Within a row
     they ascend, so the
     order is the same on every run. Raises ValueError on construction if the arrays do not fit each other.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence
+    >>> from normlift_ns.core.evidence import Entries
+    >>> first = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.tensor([0.5, 2.0]), num_regions=(2,))
+    >>> second = Entries(torch.tensor([0, 1]), torch.tensor([1, 0]), torch.tensor([3.0, 1.0]), num_regions=(1,))
+    >>> evidence = Evidence.from_entries([first, second], num_gaussians=2)
+    >>> evidence.region_view.tolist(), evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()
+    ([0, 0, 1], [3.5, 2.0], [0.0, 1.0])
+    >>> evidence.select_views([1]).rows.row_sums().tolist()
+    [3.0, 0.0]
     """
 
     rows: SparseRows

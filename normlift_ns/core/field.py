@@ -30,7 +30,18 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class SemanticField:
-    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three ways of storage."""
+    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three ways of storage.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, SemanticField, lift
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
+    >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
+    >>> field = SemanticField.build(lifted, torch.zeros(3, 3), source=torch.tensor([0, 1, 1]))
+    >>> texts = torch.tensor([[3.0, 4.0]])
+    >>> field.query(texts, refined=False)[:, 0], field.query(texts)[:, 0]
+    (tensor([0.6000, 0.8000, 0.0000]), tensor([0.6000, 0.8000, 0.8000]))
+    """
 
     scalars: Scalars
     source: Int32[Tensor, " n"]

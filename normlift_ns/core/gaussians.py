@@ -21,6 +21,14 @@ class GaussianScene:
     Raises:
         ValueError: wrong shapes, no floating point, mixed devices, a negative scale or an opacity outside 0..1 in a
             finite row.
+
+    >>> import torch
+    >>> from normlift_ns import GaussianScene
+    >>> means, quats = torch.tensor([[0.0, 0, 2], [0, 0, torch.nan]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> logarithms, logits = torch.zeros(2, 3), torch.zeros(2)  # as splatfacto trains them
+    >>> scene = GaussianScene(means, quats, scales=logarithms.exp(), opacities=logits.sigmoid())
+    >>> scene.scales[0].tolist(), scene.opacities.tolist(), scene.drawable.tolist()
+    ([1.0, 1.0, 1.0], [0.5, 0.5], [True, False])
     """
 
     means: Float[Tensor, "n 3"]
@@ -74,6 +82,15 @@ class Camera:
 
     Raises:
         ValueError: wrong shapes, non-finite or skewed intrinsics, a pose that is not rigid, a size below one pixel.
+
+    >>> import torch
+    >>> from normlift_ns import Camera
+    >>> pose = torch.eye(4)
+    >>> pose[2, 3] = 2.0  # the origin of the world lies two units before the camera
+    >>> camera = Camera(torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), pose, width=160, height=120)
+    >>> x, y, depth = (camera.K @ (camera.world_to_camera @ torch.tensor([0.5, 0.25, 0.0, 1.0]))[:3]).tolist()
+    >>> x / depth, y / depth, depth
+    (105.0, 72.5, 2.0)
     """
 
     K: Float[Tensor, "3 3"]

@@ -29,7 +29,19 @@ from normlift_ns.options import Unlabeled
 
 @dataclass(frozen=True)
 class Scalars:
-    """The numbers of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all are 0 but `view_count` and `weight`."""
+    """The numbers of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all are 0 but `view_count` and `weight`.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, lift
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 2, 1, 4]), torch.ones(4), num_regions=(2, 1))
+    >>> features = torch.tensor([[0.6, 0.8], [0.6, -0.8], [0.6, -0.8]])  # two regions of view 0, one of view 1
+    >>> scalars = lift(Evidence.from_entries([seen], 2), features).scalars
+    >>> scalars.norm, scalars.c_intra, scalars.c_inter
+    (tensor([0.6000, 0.6000]), tensor([0.6000, 1.0000]), tensor([1.0000, 0.6000]))
+    >>> scalars.n_eff, scalars.reliability
+    (tensor([1., 2.]), tensor([0.3000, 0.4000]))
+    """
 
     norm: Float[Tensor, " n"]
     """||f_j||, in 0..1."""
@@ -53,7 +65,16 @@ class Scalars:
 
 @dataclass(frozen=True)
 class Lifted:
-    """What a lift knows of every Gaussian: its numbers, and all that its direction is made of."""
+    """What a lift knows of every Gaussian: its numbers, and all that its direction is made of.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, lift
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 0, 1]), torch.tensor([1, 2, 2]), torch.tensor([3.0, 4.0, 1.0]), (2,))
+    >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
+    >>> lifted.directions(torch.tensor([0])), lifted.scalars.weight
+    (tensor([[0.6000, 0.8000]]), tensor([7., 1., 0.]))
+    """
 
     scalars: Scalars
     evidence: Evidence
@@ -130,6 +151,16 @@ def lift(
         `Lifted`, in float64 if the evidence or the features are, else in float32.
     Raises:
         ValueError: a table of another length; zero, non-finite or non-unit rows; beta < 0; an unknown `unlabeled`.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, lift, rasterize_evidence
+    >>> means, quats = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]])
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(1, 3), opacities=torch.ones(1))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> evidence = rasterize_evidence(scene, [camera, camera], [torch.tensor([[0]]), torch.tensor([[0]])])
+    >>> lifted = lift(evidence, torch.tensor([[0.6, 0.8], [0.6, -0.8]]))
+    >>> lifted.directions(), lifted.scalars.norm, lifted.scalars.reliability  # of 2 views: 0.6 * 2 / (2 + 1)
+    (tensor([[1., 0.]]), tensor([0.6000]), tensor([0.4000]))
     """
     if unlabeled not in ("ignore", "dilute"):
         raise ValueError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')

@@ -17,7 +17,16 @@ _MOST_UNSURE = 1000
 
 
 class Neighbors(NamedTuple):
-    """The K nearest other Gaussians of each Gaussian, nearest first, equal distances by index."""
+    """The K nearest other Gaussians of each Gaussian, nearest first, equal distances by index.
+
+    >>> import torch
+    >>> from normlift_ns import nearest_neighbors
+    >>> found = nearest_neighbors(torch.tensor([[0.0, 0, 0], [0, 0, 0], [2, 0, 0]]), k=3)
+    >>> found.index.tolist()
+    [[1, 2, -1], [0, 2, -1], [0, 1, -1]]
+    >>> found.distance[0].tolist(), found.spacing.tolist()
+    ([0.0, 2.0, inf], [2.0, 2.0, 2.0])
+    """
 
     index: Int32[Tensor, "n k"]  # pyright: ignore[reportIncompatibleMethodOverride]
     """-1 where there are fewer than K others with finite means."""
@@ -37,6 +46,12 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
 
     Raises:
         ValueError: k < 1.
+
+    >>> import torch
+    >>> from normlift_ns import nearest_neighbors
+    >>> found = nearest_neighbors(torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), k=1)
+    >>> found.index.tolist(), found.distance.tolist()
+    ([[1], [0], [1]], [[1.0], [1.0], [2.0]])
     """
     if k < 1:
         raise ValueError(f"k must be at least 1, got {k}")

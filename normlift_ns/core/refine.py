@@ -46,6 +46,14 @@ def refine(
         neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes.
     Raises:
         ValueError: shapes that disagree, neighbours of another K.
+
+    >>> import torch
+    >>> from normlift_ns import RefineConfig, refine
+    >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    >>> directions = torch.tensor([[1.0, 0], [0, 1], [1, 0]])
+    >>> source = refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2))
+    >>> source.tolist(), directions[source.long()].tolist()
+    ([0, 0, 2], [[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
     """
     config = config or RefineConfig()
     n = means.shape[0]
@@ -176,6 +184,12 @@ def voting_weights(
 def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
     """True where neither a Gaussian nor any neighbour has R > 0: the regions that voting cannot repair (limitation 4
     of the paper).
+
+    >>> import torch
+    >>> from normlift_ns import nearest_neighbors, unsupported
+    >>> neighbors = nearest_neighbors(torch.tensor([[0.0, 0, 0], [1, 0, 0], [8, 0, 0], [9, 0, 0]]), k=1)
+    >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
+    [False, False, True, True]
     """
     return (reliability <= 0) & (_gather(reliability, neighbors.index) <= 0).all(dim=1)
 

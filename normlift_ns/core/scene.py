@@ -14,7 +14,16 @@ from normlift_ns.options import RasterizeMode
 
 
 class View(NamedTuple):
-    """One photograph."""
+    """One photograph.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, View
+    >>> camera = Camera(torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), torch.eye(4), width=160, height=120)
+    >>> image = torch.full((120, 160, 3), 255, dtype=torch.uint8)
+    >>> view = View(camera, image, mask=None, name="images/0000.png")
+    >>> view.name, tuple(view.image.shape) == (view.camera.height, view.camera.width, 3)
+    ('images/0000.png', True)
+    """
 
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
@@ -51,7 +60,15 @@ class Views(Protocol):
 
 @runtime_checkable
 class Scene(Protocol):
-    """A trained splat and the photographs that it was trained with."""
+    """A trained splat and the photographs that it was trained with.
+
+    >>> from normlift_ns import Scene, open_scene
+    >>> scene = open_scene(config)
+    >>> isinstance(scene, Scene), scene.rasterize_mode, scene.train[1].name
+    (True, 'classic', 'images/0001.png')
+    >>> len(scene.colors(scene.train.cameras[1])) == len(scene.gaussians)
+    True
+    """
 
     @property
     def name(self) -> str:

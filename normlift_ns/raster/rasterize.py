@@ -70,6 +70,15 @@ def rasterize_evidence(
     Raises:
         ValueError: an unknown option, labels of another size or type than their camera, an id below -2 or not below
             its `num_regions`, or iterables of different lengths; the message names the view.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
+    >>> means, quats = torch.tensor([[0.0, 0, 1], [0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> evidence = rasterize_evidence(scene, [camera, camera], [torch.tensor([[0]]), torch.tensor([[-1]])])
+    >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25: seen through the first
+    ([0.5, 0.25], [0.5, 0.25])
     """
     if weight_power not in (0, 1, 2):
         raise ValueError(f"weight_power must be 0, 1 or 2, got {weight_power}")
@@ -124,6 +133,15 @@ def render(
         The image without background (add background * (1 - alpha)), and alpha in 0..1.
     Raises:
         ValueError: values of another length, an unknown option.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, render
+    >>> means, quats = torch.tensor([[0.0, 0, 1], [0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> image, alpha = render(scene, camera, torch.tensor([[1.0, 0, 0], [0, 0, 1]]))  # red before blue
+    >>> image.tolist(), alpha.tolist()
+    ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
     if values.ndim != 2 or len(values) != len(scene):
         raise ValueError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")

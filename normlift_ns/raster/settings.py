@@ -9,6 +9,15 @@ from dataclasses import dataclass
 class RasterSettings:
     """Constants of gsplat 1.4.0's kernels, as splatfacto calls them (fully_fused_projection_fwd.cu, isect_tiles.cu,
     rasterize_to_pixels_fwd.cu).
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, RasterSettings, render
+    >>> means, quats = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]])
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(1, 3), opacities=torch.ones(1))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> choices = RasterSettings(), RasterSettings(max_alpha=0.75), RasterSettings(near_plane=2.0)
+    >>> [render(scene, camera, torch.ones(1, 1), settings=settings)[1] for settings in choices]
+    [tensor([[0.9990]]), tensor([[0.7500]]), tensor([[0.]])]
     """
 
     near_plane: float = 0.01

@@ -1,0 +1,62 @@
+"""A small demo room, trained and lifted, for the tests of the commands and for the examples that open a run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from normlift_ns.demo import DemoRoom
+
+# Imports stand inside the fixtures: the other tests need not wait for them.
+_OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")
+
+
+@pytest.fixture(scope="session")
+def room() -> DemoRoom:
+    """The room itself."""
+    from normlift_ns.demo import demo_room  # noqa: PLC0415
+
+    return demo_room(6000)
+
+
+@pytest.fixture(scope="session")
+def trained(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """config.yml of a run of stock splatfacto in the room."""
+    from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+
+    folder = tmp_path_factory.mktemp("room")
+    write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
+    return write_splatfacto_run(room, folder / "room", folder / "outputs")
+
+
+@pytest.fixture(scope="session")
+def lifted(trained: Path) -> Path:
+    """config.yml of the lifted run."""
+    from normlift_ns.scripts import lift  # noqa: PLC0415
+    from tests.scripts.conftest import SMALL, run_entry  # noqa: PLC0415
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        flags = ("--load-config", trained, *SMALL, "--timestamp", "one", "--queries", "red", "yellow")
+        assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    return trained.parents[2] / "normlift" / "one" / "config.yml"
+
+
+@pytest.fixture
+def opened(lifted: Path, tmp_path: Path, doctest_namespace: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What examples that open a run work with: its `config`, a `folder` to write to, and silence from nerfstudio."""
+    from nerfstudio.utils.rich_utils import CONSOLE  # noqa: PLC0415
+
+    monkeypatch.setitem(doctest_namespace, "config", lifted)
+    monkeypatch.setitem(doctest_namespace, "folder", tmp_path)
+    monkeypatch.setattr(CONSOLE, "quiet", True)
+
+
+@pytest.fixture(autouse=True)
+def _examples(request: pytest.FixtureRequest) -> None:
+    item = request.node
+    if isinstance(item, pytest.DoctestItem) and any(_OPENS_A_RUN.search(x.source) for x in item.dtest.examples):
+        request.getfixturevalue("opened")
