@@ -29,6 +29,7 @@ from normlift_ns.asking import (
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.gpu import choose_device
+from normlift_ns.core.query import CANONICAL_NEGATIVES
 from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.given import GivenFeatures, features_by_name
@@ -335,4 +336,7 @@ def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str
             f"the vectors of --queries have {length} numbers, the features {field.dimension}; name the model that made "
             "the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
         )
-    return make_question(field, source, queries)
+    negatives = None
+    if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
+        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
+    return make_question(field, source, queries, negatives=negatives)

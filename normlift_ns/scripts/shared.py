@@ -33,7 +33,8 @@ def run_command(command: type[Command]) -> None:
         return
     tyro.extras.set_accent_color("bright_yellow")
     try:
-        tyro.cli(tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]).main()  # pyright: ignore[reportAttributeAccessIssue]
+        flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
+        tyro.cli(flags, description=summary(command)).main()
     except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read
         sys.exit(1 if stop.code == 2 else stop.code)
     except (ValueError, OSError, MemoryError) as error:
@@ -58,7 +59,11 @@ def with_help(options: Any, *, nested: bool = False) -> Any:
         hint, text, name = hints[field.name], texts.get(field.name, ""), None
         if is_dataclass(hint):
             with_help(hint, nested=True)
-            text, name = hint.__doc__ or "", "" if nested else None
+            text, name = summary(hint), "" if nested else None
         options.__annotations__[field.name] = Annotated[hint, tyro.conf.arg(name=name, help=" ".join(text.split()))]
-    options.__doc__ = " ".join((options.__doc__ or "").split("\n\n")[0].split())
     return options
+
+
+def summary(options: Any) -> str:
+    """The first paragraph of a docstring, in one line."""
+    return " ".join((options.__doc__ or "").split("\n\n")[0].split())

@@ -163,7 +163,7 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
 
     assert "xxxx" in other.status()
     tab.press("Clear")
-    other.until(lambda: "xxxx" not in other.status() and "Nothing is asked." in other.status(), "cleared")
+    other.until(lambda: "xxxx" not in other.status() and "No query yet." in other.status(), "cleared")
     tab.type("Prompts", "red")
     tab.press("Query")
     other.until(lambda: tab.selected() == other.selected() == alone, "the same as before")

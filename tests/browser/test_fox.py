@@ -27,7 +27,7 @@ def test_a_person_finds_the_fox(fox_run: Path, tmp_path: Path, pictures: Path) -
         tab.settle()
         photo = tab.picture()
         tab.page.screenshot(path=pictures / "fox.png")
-        assert "Nothing is asked." in tab.status()
+        assert "No query yet." in tab.status()
 
         tab.choose("Output type", "overlay")
         tab.until(lambda: coloured(tab.picture()).mean() < 0.001, "grey, as nothing is asked", timeout=60)
