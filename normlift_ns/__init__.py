@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from normlift_ns.core.refine import unsupported as unsupported
     from normlift_ns.core.scene import Scene as Scene
     from normlift_ns.core.scene import View as View
+    from normlift_ns.front_door import lift_run as lift_run
+    from normlift_ns.front_door import open_run as open_run
+    from normlift_ns.front_door import open_scene as open_scene
     from normlift_ns.lifted_run import LiftedRun as LiftedRun
-    from normlift_ns.lifted_run import lift_run as lift_run
-    from normlift_ns.lifted_run import open_run as open_run
-    from normlift_ns.lifted_run import open_scene as open_scene
     from normlift_ns.options import LiftOptions as LiftOptions
     from normlift_ns.options import RefineConfig as RefineConfig
     from normlift_ns.options import SourceOptions as SourceOptions
@@ -50,7 +50,8 @@ _HOMES = {
     "core.query": ("BACKGROUND_WORDS", "CANONICAL_NEGATIVES", "relevancy"),
     "core.refine": ("refine", "unsupported"),
     "core.scene": ("Scene", "View"),
-    "lifted_run": ("LiftedRun", "lift_run", "open_run", "open_scene"),
+    "front_door": ("lift_run", "open_run", "open_scene"),
+    "lifted_run": ("LiftedRun",),
     "options": ("LiftOptions", "RefineConfig", "SourceOptions"),
     "raster.rasterize": ("rasterize_evidence", "render"),
     "raster.settings": ("RasterSettings",),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Int32
@@ -26,6 +26,8 @@ class Job:
     settings: RasterSettings
     dtype: torch.dtype
     """Precision of the computation."""
+    weight_power: int = 1
+    """Evidence sums A_ij ** weight_power."""
 
     @cached_property
     def world(self) -> World:
@@ -38,6 +40,14 @@ class Job:
         return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
 
 
+class Batch(NamedTuple):
+    """Some views of one size."""
+
+    cameras: Sequence[Camera]
+    labels: Sequence[Int32[Tensor, "h w"]]
+    num_regions: Sequence[int]
+
+
 class Backend(Protocol):
     """One way to rasterize. `raster.gsplat` and `raster.triton` are backends as they stand, as modules."""
 
@@ -45,15 +55,8 @@ class Backend(Protocol):
         """Raises ValueError, with what to use instead, where the backend cannot do the job."""
         ...
 
-    def views_evidence(
-        self,
-        job: Job,
-        cameras: Sequence[Camera],
-        labels: Sequence[Int32[Tensor, "h w"]],
-        num_regions: Sequence[int],
-        weight_power: int,
-    ) -> Entries:
-        """Sums of A_ij ** weight_power by (Gaussian, region) of some views of one size."""
+    def views_evidence(self, job: Job, batch: Batch) -> Entries:
+        """Sums of A_ij ** weight_power by (Gaussian, region)."""
         ...
 
     def composite(
@@ -81,16 +84,9 @@ class TileBackend:
                 'use backend="torch"'
             )
 
-    def views_evidence(  # noqa: D102 (as in the protocol)
-        self,
-        job: Job,
-        cameras: Sequence[Camera],
-        labels: Sequence[Int32[Tensor, "h w"]],
-        num_regions: Sequence[int],
-        weight_power: int,
-    ) -> Entries:
-        (camera,), (label_map,), (count,) = cameras, labels, num_regions
-        return self.kernels.view_evidence(*job.seen_by(camera), label_map, count, weight_power, job.settings)
+    def views_evidence(self, job: Job, batch: Batch) -> Entries:  # noqa: D102 (as in the protocol)
+        (camera,), (labels,), (count,) = batch
+        return self.kernels.view_evidence(*job.seen_by(camera), labels, count, job.weight_power, job.settings)
 
     def composite(  # noqa: D102 (as in the protocol)
         self, job: Job, camera: Camera, values: Float[Tensor, "n c"]

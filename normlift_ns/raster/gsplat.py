@@ -19,7 +19,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
-from normlift_ns.raster.backend import Job
+from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.settings import RasterSettings
 
 _CHANNELS = 32
@@ -88,29 +88,23 @@ def _gsplat_version() -> str:
     return version("gsplat")
 
 
-def views_evidence(
-    job: Job,
-    cameras: Sequence[Camera],
-    labels: Sequence[Int32[Tensor, "h w"]],
-    num_regions: Sequence[int],
-    weight_power: int,
-) -> Entries:
+def views_evidence(job: Job, batch: Batch) -> Entries:
     """Entries of some views, from gsplat's forward and backward pass alone.
 
     Raises:
         ValueError: weight_power other than 1, which a gradient cannot give.
     """
-    if weight_power != 1:
+    if job.weight_power != 1:
         raise ValueError(
-            f'backend "gsplat" sums A_ij alone, weight_power {weight_power} is not a gradient; use backend="triton"'
+            f'backend "gsplat" sums A_ij alone, weight_power {job.weight_power} is not a gradient; use backend="triton"'
         )
     parts, before = [], 0
-    for camera, label_map, count in zip(cameras, labels, num_regions):
+    for camera, label_map, count in zip(*batch):
         for first, gradient in _gradients(job, camera, label_map, count):
             gaussian, column = gradient.nonzero(as_tuple=True)
             parts.append((gaussian, before + first + column, gradient[gaussian, column]))
         before += count + 1
-    return Entries(*sum_duplicates(*(torch.cat(part) for part in zip(*parts))), tuple(num_regions))
+    return Entries(*sum_duplicates(*(torch.cat(part) for part in zip(*parts))), tuple(batch.num_regions))
 
 
 def composite(

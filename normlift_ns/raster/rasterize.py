@@ -16,7 +16,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.gpu import in_parts
 from normlift_ns.core.scene import Scene
 from normlift_ns.options import RasterizeMode
-from normlift_ns.raster.backend import Job
+from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.backends import BackendName, choose_backend
 from normlift_ns.raster.settings import RasterSettings
 
@@ -82,7 +82,7 @@ def rasterize_evidence(
     """
     if weight_power not in (0, 1, 2):
         raise ValueError(f"weight_power must be 0, 1 or 2, got {weight_power}")
-    job = _job(scene, rasterize_mode, settings, dtype)
+    job = _job(scene, rasterize_mode, settings, dtype, weight_power)
     name, chosen = choose_backend(backend, job, pictures=False)
     in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS // max(1, len(scene)))) if name in _SEVERAL_VIEWS else 1
     num_excluded = len(scene) - int(scene.drawable.sum())
@@ -103,7 +103,7 @@ def rasterize_evidence(
             def sums(views: Sequence[tuple[Camera, Tensor, int]]) -> Entries:
                 seen, maps, counts = zip(*views)
                 there = [labels.to(scene.means.device, torch.int32) for labels in maps]
-                return chosen.views_evidence(job, seen, there, counts, weight_power)
+                return chosen.views_evidence(job, Batch(seen, there, counts))
 
             parts += in_parts(sums, checked, _ADVICE)
             for _ in flight:
@@ -160,10 +160,17 @@ def render_picture(scene: Scene, camera: Camera) -> UInt8[Tensor, "h w 3"]:
     return (color.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
-def _job(scene: GaussianScene, rasterize_mode: str, settings: RasterSettings | None, dtype: torch.dtype | None) -> Job:
+def _job(
+    scene: GaussianScene,
+    rasterize_mode: str,
+    settings: RasterSettings | None,
+    dtype: torch.dtype | None,
+    weight_power: int = 1,
+) -> Job:
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
-    return Job(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype or scene.means.dtype)
+    antialiased = rasterize_mode == "antialiased"
+    return Job(scene, antialiased, settings or RasterSettings(), dtype or scene.means.dtype, weight_power)
 
 
 def _flights(

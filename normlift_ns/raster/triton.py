@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NoReturn
 
 import torch
-from jaxtyping import Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
@@ -14,7 +12,7 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_equal_keys
 from normlift_ns.kernels.regions import region_sums
 from normlift_ns.raster import gsplat
-from normlift_ns.raster.backend import Job
+from normlift_ns.raster.backend import Batch, Job
 
 check = gsplat.check
 """Raises ValueError where gsplat's projection cannot be used."""
@@ -28,17 +26,11 @@ def composite(job: Job, camera: Camera, values: Tensor) -> NoReturn:
     )
 
 
-def views_evidence(
-    job: Job,
-    cameras: Sequence[Camera],
-    labels: Sequence[Int32[Tensor, "h w"]],
-    num_regions: Sequence[int],
-    weight_power: int,
-) -> Entries:
+def views_evidence(job: Job, batch: Batch) -> Entries:
     """Entries of some views of one size, all in flight at once; bitwise the same on every run."""
-    seen, settings = gsplat.project_views(job, cameras), job.settings
+    seen, settings = gsplat.project_views(job, batch.cameras), job.settings
     offsets = torch.cat([seen.offsets.flatten(), seen.offsets.new_tensor([len(seen.members)])])
-    first = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
+    first = torch.tensor([0, *(count + 1 for count in batch.num_regions)]).cumsum(0)
     columns = int(first[-1])
     key, weight = region_sums(
         seen.means2d.flatten(0, 1),
@@ -46,15 +38,15 @@ def views_evidence(
         seen.opacities.flatten(),
         seen.members,
         offsets,
-        torch.stack(list(labels)),
+        torch.stack(list(batch.labels)),
         first[:-1].int().to(offsets.device),
         columns=columns,
         tile_size=settings.tile_size,
         max_alpha=settings.max_alpha,
         min_alpha=settings.min_alpha,
         min_transmittance=settings.min_transmittance,
-        weight_power=weight_power,
+        weight_power=job.weight_power,
     )
     key, weight = sum_equal_keys(key, weight)
     gaussian = torch.div(key, columns, rounding_mode="floor")
-    return Entries(gaussian.int(), (key - gaussian * columns).int(), weight, tuple(num_regions))
+    return Entries(gaussian.int(), (key - gaussian * columns).int(), weight, tuple(batch.num_regions))

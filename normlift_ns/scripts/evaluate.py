@@ -63,7 +63,7 @@ class NormLiftEval:
         from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
         from normlift_ns.evaluation.studies import study_votes, timing  # noqa: PLC0415
         from normlift_ns.evaluation.votes import ablation, sweeps  # noqa: PLC0415
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.front_door import open_run  # noqa: PLC0415
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []

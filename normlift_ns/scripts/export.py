@@ -50,7 +50,7 @@ class NormLiftExport:
                     f"{path} exists; give another --output-dir or --output-filename, or --overwrite True."
                 )
         from normlift_ns.core.files import atomic_path  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.front_door import open_run  # noqa: PLC0415
         from normlift_ns.objects import find_objects  # noqa: PLC0415
 
         run = open_run(

@@ -49,7 +49,7 @@ class NormLift:
     def main(self) -> LiftedRun:
         """Lifts, and returns the new run."""
         start = time.perf_counter()
-        from normlift_ns.lifted_run import lift_run  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.front_door import lift_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.lifting import Export  # noqa: PLC0415
 
         with progress_bars() as report:

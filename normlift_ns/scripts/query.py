@@ -43,7 +43,7 @@ class NormLiftQuery:
     def main(self) -> list[dict[str, Any]]:
         """Asks, prints and writes; returns the rows of the table."""
         from normlift_ns.asking import summarize  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.front_door import open_run  # noqa: PLC0415
         from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
 
         run = open_run(

@@ -1,12 +1,14 @@
 """The GPU backends: what they refuse, and, where there is a GPU, that they agree."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core import gpu
 from normlift_ns.raster import gsplat
-from normlift_ns.raster.backend import Job
+from normlift_ns.raster.backend import Batch, Job
 from tests.kernels.test_regions import hard_scene
 from tests.scenes import dense, generator, orbit, random_labels, random_scene, unit_rows
 
@@ -25,7 +27,7 @@ def test_gpu_backends_refuse_other_scenes(backend):
 
 def test_gradients_are_of_weights_only():
     with pytest.raises(ValueError, match=r'weight_power 2 is not a gradient; use backend="triton"'):
-        gsplat.views_evidence(job(random_scene(5)), [], [], [], 2)
+        gsplat.views_evidence(replace(job(random_scene(5)), weight_power=2), Batch([], [], []))
 
 
 def job(scene, **constants):

@@ -1,0 +1,178 @@
+"""The front door: opening a trained scene or a lifted run, and lifting."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.asking import Question, encoder_settings, given_settings, make_question, with_texts
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gpu import choose_device
+from normlift_ns.core.query import CANONICAL_NEGATIVES
+from normlift_ns.core.scene import Scene
+from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.given import GivenFeatures, features_by_name
+from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.lifting import Export, lift_scene
+from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.runs.files import (
+    FIELD_FOLDER,
+    TEXTS_FILE,
+    cache_folder,
+    load_field,
+    refuse_existing,
+    run_directory,
+    with_paths,
+)
+from normlift_ns.stages import Report
+
+
+def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
+    """A trained splatfacto run, from any working directory.
+
+    Args:
+        load_config: config.yml of the run.
+        data: where the dataset is now, if it was moved.
+        load_step: step of the checkpoint; None: the last.
+    Raises:
+        FileNotFoundError: config, checkpoint, dataset or an image is missing.
+        ValueError: a config of another method or program, a damaged checkpoint, another dataset than the run's.
+
+    >>> scene = open_scene(config)
+    >>> len(scene.train), scene.train[1].image.shape
+    (12, torch.Size([120, 160, 3]))
+    """
+    from normlift_ns.nerfstudio_plugin.load import load_scene  # noqa: PLC0415 (nerfstudio takes 20 s)
+
+    return load_scene(Path(load_config), data=None if data is None else Path(data), load_step=load_step)
+
+
+def open_run(
+    load_config: str | Path,
+    *,
+    data: str | Path | None = None,
+    device: str = "auto",
+    text_vectors: str | Path | None = None,
+    text_template: str | None = None,
+) -> LiftedRun:
+    """Opens a lifted run, from any working directory.
+
+    Args:
+        load_config: config.yml of the run.
+        data: where the dataset is now, if it was moved.
+        device: where the text encoder works: auto, cpu or cuda.
+        text_vectors: NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with.
+        text_template: what open_clip reads for a text, which takes the place of {}; None: as the run was lifted.
+    Raises:
+        FileNotFoundError, ValueError: as `open_scene`; a run without semantics, or with those of other Gaussians.
+
+    >>> run = open_run(config)
+    >>> answer = run.ask("red", "yellow", min_reliability=0.3)
+    >>> answer["yellow"].objects[0].size > 20
+    True
+    """
+    device, scene = choose_device(device), open_scene(load_config, data=data)
+    folder = Path(os.path.abspath(load_config)).parent
+    loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
+    vectors = None if text_vectors is None else Path(text_vectors)
+    return LiftedRun(folder, scene, with_texts(loaded, vectors=vectors, template=text_template), device)
+
+
+def lift_run(
+    config_or_scene: str | Path | Scene,
+    *,
+    source: SourceOptions | None = None,
+    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None,
+    texts: Mapping[str, Float[Tensor, " d"]] | None = None,
+    lift: LiftOptions | None = None,
+    queries: Sequence[str] = (),
+    data: str | Path | None = None,
+    load_step: int | None = None,
+    output_dir: str | Path | None = None,
+    timestamp: str | None = None,
+    overwrite: bool = False,
+    device: str = "auto",
+    export: Export | None = None,
+    report: Report = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> LiftedRun:
+    """Lifts 2D features onto the Gaussians of a trained run, and writes a lifted run beside it.
+
+    The new run is outputs/<experiment>/normlift/<timestamp>, which ns-viewer, ns-render and the ns-normlift commands
+    open.
+
+    Args:
+        config_or_scene: config.yml of the trained run, or a scene of `open_scene`.
+        source: which 2D features to make of the photographs; None: as ns-normlift does by default.
+        features: features of your own in place of `source`: per training image a label map [H, W] of the undistorted
+            image, with regions 0..R-1 and -1 for none, and vectors [R, D]. One pair per image, or a dictionary by names
+            of images.
+        texts: with `features`: what the run can be asked, with vectors [D]; they are stored in the run.
+        lift: how to lift.
+        queries: texts to store in the run; ns-render and ns-viewer show their relevancy.
+        data, load_step: as in `open_scene`, for a config.
+        output_dir: in place of the run's own outputs folder.
+        timestamp: name of the new run directory; None: the present time.
+        overwrite: replace a run directory of that name, and exported files of other content.
+        device: auto, cpu or cuda.
+        export: where to write the 2D features too, in LangSplat's format.
+        report: called with (stage, steps done, steps in all).
+        say: called with a sentence once the scene is loaded, for example `print`.
+    Raises:
+        FileExistsError: the run directory exists and `overwrite` is False.
+        FileNotFoundError, ValueError: as `open_scene`; an image, a label map or an option that does not fit.
+        MemoryError: the GPU's memory does not hold the lift.
+
+    >>> scene = open_scene(config)
+    >>> left = [(torch.arange(160).expand(120, 160) // 80, torch.eye(2)) for _ in scene.train.names]
+    >>> run = lift_run(scene, features=left, texts={"left": torch.tensor([1.0, 0.0])}, output_dir=folder)
+    >>> 0.2 < run.ask("left")["left"].fraction < 0.8
+    True
+    """
+    device, options = choose_device(device), source or SourceOptions()
+    made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
+    if made is not None and len(queries) > 0:
+        made.text(queries)
+    from normlift_ns.nerfstudio_plugin.load import NerfstudioScene  # noqa: PLC0415 (nerfstudio takes 20 s)
+    from normlift_ns.nerfstudio_plugin.write import write_run  # noqa: PLC0415
+
+    scene = config_or_scene
+    if isinstance(scene, str | Path):
+        scene = open_scene(scene, data=data, load_step=load_step)
+    if not isinstance(scene, NerfstudioScene):
+        raise TypeError(f"lift_run takes the config.yml of a run or a scene of open_scene, got {type(scene).__name__}")
+    run_dir = run_directory(scene.runs_dir if output_dir is None else Path(output_dir), scene.name, timestamp)
+    refuse_existing(run_dir, overwrite)
+    say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
+    settings = encoder_settings(options)
+    if made is None:
+        made = GivenFeatures(features_by_name(features, scene.train.names), texts or {})
+        settings = given_settings(TEXTS_FILE if texts else None)
+    field, seconds = lift_scene(
+        scene, made, lift or LiftOptions(), cache_folder(run_dir), device=device, encoder=settings, export=export,
+        report=report,
+    )  # fmt: skip
+    question = _question(field, made, queries)
+    write_run(scene, field, run_dir, question=question, texts=texts, overwrite=overwrite)
+    return LiftedRun(run_dir, scene, with_paths(field.to("cpu"), run_dir / FIELD_FOLDER), device, seconds)
+
+
+def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str]) -> Question | None:
+    if len(queries) == 0:
+        return None
+    length = source.text(queries).shape[1]
+    if length != field.dimension:
+        raise ValueError(
+            f"the vectors of --queries have {length} numbers, the features {field.dimension}; name the model that made "
+            "the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
+        )
+    negatives = None
+    if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
+        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
+    return make_question(field, source, queries, negatives=negatives)
