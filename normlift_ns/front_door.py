@@ -130,6 +130,7 @@ def lift_run(
         MemoryError: the GPU's memory does not hold the lift.
 
     >>> scene = open_scene(config)
+    >>> import torch
     >>> left = [(torch.arange(160).expand(120, 160) // 80, torch.eye(2)) for _ in scene.train.names]
     >>> run = lift_run(scene, features=left, texts={"left": torch.tensor([1.0, 0.0])}, output_dir=folder)
     >>> 0.2 < run.ask("left")["left"].fraction < 0.8
