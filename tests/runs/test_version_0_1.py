@@ -79,7 +79,10 @@ def test_stock_commands_run_on_them(config: Path, tmp_path: Path) -> None:
     environment = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(words, cwd=old, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    pictures = sorted((old / "out" / "train" / "overlay").iterdir())
-    assert len(pictures) == 6
-    assert all(np.asarray(Image.open(path)).std() > 5 for path in pictures)
+    for name in ("rgb", "overlay", "relevancy_0"):
+        pictures = sorted((old / "out" / "train" / name).iterdir())
+        assert len(pictures) == 6
+        assert all(np.asarray(Image.open(path)).std() > 1 for path in pictures), (
+            name
+        )  # two steps of training show little
     assert b"<html" in viewer_page(config.relative_to(old), cwd=old, log=tmp_path / "log")
