@@ -3,8 +3,11 @@
 import re
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
@@ -26,12 +29,18 @@ def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
     assert means["before refinement"] >= 0.85
     assert means["after refinement"] >= 0.9
     assert (tmp_path / "demo" / "pictures" / "overview.png").stat().st_size > 10_000
-    (script,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    assert len([line for line in script.splitlines() if line.strip() and not line.startswith(("from", "import"))]) <= 12
+    script, own = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     capsys.readouterr()
-    exec(compile(script, "README.md", "exec"), {})
+    names: dict[str, Any] = {}
+    exec(compile(script, "README.md", "exec"), names)
     shown = capsys.readouterr().out
     assert "sky blue" in shown
+    assert (tmp_path / "demo" / "red.ply").exists()
+    assert names["picture"].shape == (240, 320, 3)
+    (trained,) = Path("demo/outputs/room/splatfacto").glob("*/config.yml")
+    names |= {"labels": np.zeros((240, 320), int), "vectors": np.eye(1, 8), "vector": torch.eye(8)[0]}
+    exec(compile(own.replace("outputs/…/splatfacto/…/config.yml", str(trained)), "README.md", "exec"), names)
+    assert names["run"].ask("fox")["fox"].fraction > 0.9
 
 
 FRONT_ENDS = (ROOT / "docs" / "front_ends.md").read_text()
