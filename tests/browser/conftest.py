@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks.captures import SHARED
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
-from normlift_ns.encoders.build import SourceOptions
-from normlift_ns.lifting import LiftOptions
+from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.scripts.lift import NormLift
 
 TEXTS = ("red", "yellow", "sky blue", "dark green")
@@ -34,7 +33,7 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_capture(room, folder / "room", views=12)
     config = write_splatfacto_run(room, folder / "room", folder / "outputs")
     lifted = NormLift(config, source=SourceOptions(encoder="colour"), queries=TEXTS, timestamp="demo").main()
-    return lifted / "config.yml"
+    return lifted.config
 
 
 @pytest.fixture(scope="session")
@@ -43,5 +42,5 @@ def fox_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     options, folder = LiftOptions(max_views=12, lift_downscale=2), tmp_path_factory.mktemp("fox")
     colour = SourceOptions(encoder="colour")
-    lifted = NormLift(source, source=colour, options=options, output_dir=folder, timestamp="seen").main()
-    return lifted / "config.yml"
+    lifted = NormLift(source, source=colour, lift=options, output_dir=folder, timestamp="seen").main()
+    return lifted.config
