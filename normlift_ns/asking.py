@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -50,11 +51,13 @@ class Question:
     """Use refined features."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Answer:
     """What a field answers to Q texts. `answer["fox"]` is what it says of one of them; see `Finding`.
 
+    >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
+    >>> from normlift_ns.asking import Question, answer
     >>> from normlift_ns.core.evidence import Entries
     >>> seen = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
@@ -90,6 +93,13 @@ class Answer:
     def __iter__(self) -> Iterator[Finding]:
         return (Finding(self, index) for index in range(len(self)))
 
+    def __contains__(self, text: object) -> bool:
+        return text in self.texts
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{found.text!r}: {int(found.mask.sum()):,}" for found in self)
+        return f"Answer of {len(self.valid):,} Gaussians, selected {counts}"
+
     def __getitem__(self, text: str) -> Finding:
         """What the field says of one text.
 
@@ -101,7 +111,7 @@ class Answer:
         return Finding(self, self.texts.index(text))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Finding:
     """What a field says of one text. Places are in the scene's own units; None where nothing is selected.
 
@@ -122,6 +132,9 @@ class Finding:
     answer: Answer
     index: int
     """Of the text."""
+
+    def __repr__(self) -> str:
+        return f"Finding {self.text!r}: {int(self.mask.sum()):,} of {len(self.mask):,} Gaussians"
 
     @property
     def text(self) -> str:
@@ -229,8 +242,8 @@ def _options(field: SemanticField) -> SourceOptions:
     vectors = stored["text_vectors"]
     if stored["encoder"] == GIVEN and vectors is None:
         raise ValueError(
-            "this run was lifted from features of its own, without texts; name a file of texts and their vectors with "
-            "--text-vectors, or lift again with texts={...}"
+            "this run was lifted from features of your own, without texts; name a file of texts and their vectors "
+            "(--text-vectors), or lift again and give texts"
         )
     return SourceOptions(**{**stored, "text_vectors": None if vectors is None else Path(vectors)})
 
@@ -267,6 +280,14 @@ def make_question(
     Raises:
         ValueError: a text that is empty or that the encoder does not understand.
     """
+    if isinstance(negatives, str):
+        raise ValueError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
+    if rule not in ("auto", *get_args(Rule)):
+        raise ValueError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
+    if not 0 <= min_reliability <= 1 or (threshold is not None and not math.isfinite(threshold)):
+        raise ValueError(
+            f"the minimum reliability must be in 0..1 and the threshold finite, got {min_reliability} and {threshold}"
+        )
     negatives = tuple(default_negatives(field) if negatives is None else negatives)
     if rule == "auto":
         rule = "cosine" if len(negatives) == 0 else "lerf"

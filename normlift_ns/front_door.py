@@ -16,7 +16,7 @@ from normlift_ns.core.gpu import choose_device
 from normlift_ns.core.query import CANONICAL_NEGATIVES
 from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.build import make_source
-from normlift_ns.encoders.given import GivenFeatures, features_by_name
+from normlift_ns.encoders.given import GivenFeatures, given_features
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.lifting import Export, lift_scene
@@ -111,8 +111,8 @@ def lift_run(
         config_or_scene: config.yml of the trained run, or a scene of `open_scene`.
         source: which 2D features to make of the photographs; None: as ns-normlift does by default.
         features: features of your own in place of `source`: per training image a label map [H, W] of the undistorted
-            image, with regions 0..R-1 and -1 for none, and vectors [R, D]. One pair per image, or a dictionary by names
-            of images.
+            image, at the size that `lift_downscale` leaves, with regions 0..R-1 and -1 for none, and vectors [R, D].
+            One pair per image, or a dictionary by names of images, which may leave some out.
         texts: with `features`: what the run can be asked, with vectors [D]; they are stored in the run.
         lift: how to lift.
         queries: texts to store in the run; ns-render and ns-viewer show their relevancy.
@@ -128,6 +128,7 @@ def lift_run(
         FileExistsError: the run directory exists and `overwrite` is False.
         FileNotFoundError, ValueError: as `open_scene`; an image, a label map or an option that does not fit.
         MemoryError: the GPU's memory does not hold the lift.
+        TypeError: neither a config nor a scene of `open_scene`.
 
     >>> scene = open_scene(config)
     >>> import torch
@@ -136,6 +137,12 @@ def lift_run(
     >>> 0.2 < run.ask("left")["left"].fraction < 0.8
     True
     """
+    if features is None and texts is not None:
+        raise ValueError("texts are for features of your own; give features too, or leave texts out")
+    if features is not None and source is not None:
+        raise ValueError("features of your own take the place of source; give one of the two")
+    if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
+        raise ValueError("data and load_step are for a config; give them to open_scene")
     device, options = choose_device(device), source or SourceOptions()
     made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
     if made is not None and len(queries) > 0:
@@ -153,8 +160,11 @@ def lift_run(
     say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
     settings = encoder_settings(options)
     if made is None:
-        made = GivenFeatures(features_by_name(features, scene.train.names), texts or {})
+        made = given_features(features, texts, scene.train.names)
+        texts = made.texts
         settings = given_settings(TEXTS_FILE if texts else None)
+        if len(queries) > 0:
+            made.text(queries)
     field, seconds = lift_scene(
         scene, made, lift or LiftOptions(), cache_folder(run_dir), device=device, encoder=settings, export=export,
         report=report,

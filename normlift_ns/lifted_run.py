@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,7 +28,7 @@ from normlift_ns.runs.splats import write_splats
 from normlift_ns.viewer.display import draw, make_display
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class LiftedRun:
     """A trained scene with its semantics, on disk and in memory.
 
@@ -48,6 +49,9 @@ class LiftedRun:
     """Where the text encoder works."""
     seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Of each stage of the lift that made the run; empty where it was opened."""
+
+    def __repr__(self) -> str:
+        return f"LiftedRun {self.folder}: {len(self.field):,} Gaussians"
 
     @property
     def config(self) -> Path:
@@ -83,6 +87,8 @@ class LiftedRun:
         Raises:
             ValueError: no text, an empty one, or one that the encoder does not understand.
         """
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError(f'ask takes texts one after the other, as in ask("red", "blue"); got {texts!r}')
         question = make_question(
             self.field,
             self.texts,
@@ -100,8 +106,18 @@ class LiftedRun:
         question = load_question(self.folder / FIELD_FOLDER)
         return None if question is None else answer(self.field, self.scene.gaussians.means, question)
 
-    def save(self, question: Question) -> Path:
-        """Stores a question in the run, in place of an earlier one: ns-render and ns-viewer draw its answer."""
+    def save(self, question: Question | Answer) -> Path:
+        """Stores a question in the run, in place of an earlier one: ns-render and ns-viewer draw its answer.
+
+        Raises:
+            ValueError: vectors of another length than the field's.
+        """
+        question = question.question if isinstance(question, Answer) else question
+        if question.vectors.shape[1] != self.field.dimension:
+            raise ValueError(
+                f"the question has vectors of {question.vectors.shape[1]} numbers, the features of {self.folder} have "
+                f"{self.field.dimension}; ask this run, then save its answer"
+            )
         return save_question(self.folder / FIELD_FOLDER, question)
 
     def export(
@@ -120,17 +136,22 @@ class LiftedRun:
             overwrite: replace files of these names.
         Raises:
             FileExistsError: a file is there and `overwrite` is False.
-            ValueError: no Gaussian of the part is ever drawn.
+            ValueError: no Gaussian of the part is ever drawn; a mask of another type or length.
         """
         path = Path(path)
         for file in (path, path.with_name(f"{path.stem}_rows.npy")):
             if file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        if answer is None and not isinstance(part, Tensor | None):
-            answer = part if isinstance(part, Answer) else part.answer
-        everything = torch.ones(len(self.scene.gaussians), dtype=torch.bool)
-        keep = everything if part is None else part if isinstance(part, Tensor) else part.mask
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(part, Answer | Finding):
+            keep, asked = part.mask, part if isinstance(part, Answer) else part.answer
+            answer = asked if answer is None else answer
+        else:
+            keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else torch.as_tensor(part)
+        if keep.dtype != torch.bool or keep.shape != (len(self.field),):
+            raise ValueError(
+                f"part must be an answer of this run, what it says of one text, or a mask of {len(self.field)} "
+                f"booleans; got {keep.dtype} {tuple(keep.shape)}"
+            )
         return write_splats(
             path,
             self.scene.parameters,
@@ -140,21 +161,29 @@ class LiftedRun:
             spherical_harmonics=self.scene.has_harmonics,
         )
 
-    def camera(self, view: str | int) -> Camera:
-        """The camera of a training image, by its number or its name; the folder and the suffix may be left out.
+    def camera(self, view: str | Path | int) -> Camera:
+        """The camera of a training image, by its number or its name; folder and suffix may be left out.
 
         Raises:
             KeyError, IndexError: no such image.
+            ValueError: a name that several images have; give it with its folder.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
-        if isinstance(view, int):
-            return cameras[view]
-        for name, camera in zip(names, cameras):
-            if view in (name, Path(name).name, Path(name).stem):
-                return camera
-        raise KeyError(f"there is no training image {view!r}; there are {len(names)}, from {names[0]} to {names[-1]}")
+        if not isinstance(view, str | Path):
+            return cameras[operator.index(view)]
+        name = Path(view).as_posix()
+        found = [i for i, known in enumerate(names) if known == name] or [
+            i
+            for i, known in enumerate(names)
+            if name in (str(Path(known).with_suffix("")), Path(known).name, Path(known).stem)
+        ]
+        if len(found) > 1:
+            raise ValueError(f"{len(found)} training images are called {name!r}: {', '.join(names[i] for i in found)}")
+        if len(found) == 0:
+            raise KeyError(f"there is no training image {name!r}; there are {len(names)}, {names[0]} to {names[-1]}")
+        return cameras[found[0]]
 
-    def render(self, view: str | int | Camera, found: Answer | Finding | None = None) -> UInt8[Tensor, "h w 3"]:
+    def render(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> UInt8[Tensor, "h w 3"]:
         """The scene as a camera sees it; with an answer, in grey where nothing is selected, coloured by relevancy.
 
         Args:
@@ -165,6 +194,8 @@ class LiftedRun:
         picture = render_picture(self.scene, camera)
         if found is None:
             return picture
+        if not isinstance(found, Answer | Finding):
+            raise TypeError(f"render draws an answer, or what it says of one text; got {type(found).__name__}")
         shown, answered = (found.index, found.answer) if isinstance(found, Finding) else (None, found)
         display = make_display(self.field, answered, shown=shown)
         values, alpha = render(self.scene.gaussians, camera, display.values, rasterize_mode=self.scene.rasterize_mode)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 RasterizeMode = Literal["classic", "antialiased"]
 """How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
@@ -99,6 +99,7 @@ class RefineConfig:
     Raises:
         ValueError: a value outside its range.
 
+    >>> from normlift_ns import RefineConfig
     >>> RefineConfig(k=12).sigma_d
     1.0
     """
@@ -134,6 +135,7 @@ class LiftOptions:
     Raises:
         ValueError: a number out of range.
 
+    >>> from normlift_ns import LiftOptions
     >>> LiftOptions(max_views=8).storage
     'auto'
     """
@@ -167,6 +169,15 @@ class LiftOptions:
         for name, value in (("max_views", self.max_views), ("lift_downscale", self.lift_downscale)):
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
+        for name, known in (
+            ("image_source", ("photos", "render")),
+            ("unlabeled", get_args(Unlabeled)),
+            ("weight_power", (1, 2)),
+            ("storage", ("auto", *get_args(Storage))),
+            ("precision", ("standard", "double")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Configs of version 0.1 call `storage` `form`."""

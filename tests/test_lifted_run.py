@@ -11,6 +11,7 @@ import torch
 from plyfile import PlyData
 
 import normlift_ns as nl
+from normlift_ns.asking import Question
 from normlift_ns.demo import DemoRoom
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry
@@ -75,7 +76,7 @@ def test_pictures_show_the_answer(run: nl.LiftedRun) -> None:
     assert torch.equal(run.render(3), plain)
     assert torch.equal(run.render(run.scene.train.cameras[3]), plain)
     assert torch.equal(run.render("images/0003.png"), plain)
-    with pytest.raises(KeyError, match=r"no training image 'x'; there are 12, from images/0000\.png to"):
+    with pytest.raises(KeyError, match=r"no training image 'x'; there are 12, images/0000\.png to"):
         run.render("x")
 
 
@@ -122,7 +123,7 @@ def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> No
     assert run.field.manifest["statistics"]["views"] == 4
     assert run.field.manifest["statistics"]["left_out"] == 8
     assert run.seconds["lift"] > 0
-    with pytest.raises(ValueError, match=r"features of its own, without texts; name a file of texts"):
+    with pytest.raises(ValueError, match=r"features of your own, without texts; name a file of texts"):
         run.ask("left")
 
 
@@ -133,9 +134,12 @@ def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> No
         (lambda f: {"nowhere.png": f[0]}, r"no training image 'nowhere\.png' for the features given"),
         (
             lambda f: [(f[0][0][:, :80], f[0][1])] * 12,
-            r"labels of images/0000\.png are \(120, 80\), but the undistorted",
+            r"labels of images/0000\.png are \(120, 80\), but the image is \(120, 160\)",
         ),
-        (lambda f: [(f[0][0] + 1, f[0][1])] * 12, r"labels of images/0000\.png must be .* in -1\.\.1, got .* up to 2"),
+        (
+            lambda f: [(f[0][0] + 1, f[0][1])] * 12,
+            r"labels of images/0000\.png must be .* in -1\.\.1, got .* values in 1\.\.2",
+        ),
         (lambda f: [(f[0][0], 0 * f[0][1])] * 12, r"vectors of images/0000\.png must be \[regions, D\], finite"),
         (lambda f: [*f[:11], (f[0][0], torch.eye(3))], r"must have the same length, found \[2, 3\]"),
     ],
@@ -154,3 +158,85 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match="is a run without semantics"):
         nl.open_run(trained)
+
+
+def test_names_of_runs_are_names_of_folders(trained: Path, tmp_path: Path) -> None:
+    half = [(torch.zeros(120, 160, dtype=torch.int64), torch.ones(1, 2))] * 12
+    for stamp in (".", "..", "a/b", "/x", "", "../splatfacto/run", ".cache"):
+        with pytest.raises(ValueError, match="is not the name of a folder"):
+            nl.lift_run(trained, features=half, output_dir=tmp_path, timestamp=stamp, overwrite=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("texts", "queries", "message"),
+    [
+        ({"a": np.zeros(2)}, (), r"the vector of text 'a' must be \[D\], finite and not zero"),
+        ({"a": [1.0, float("nan")]}, (), "the vector of text 'a' must be"),
+        ({"a": np.ones((1, 2))}, (), "the vector of text 'a' must be"),
+        ({" ": [1, 2]}, (), "cannot be a text"),
+        ({"fox.npy": [1, 2]}, (), "cannot be a text"),
+        ({"a": [1, 2, 3]}, (), r"must have the same length, found \[2, 3\]"),
+        ({"a": [1, 2]}, ["b"], "text 'b' has no vector in the texts given, which holds 1; near names: a"),
+        (None, ["b"], "which holds none"),
+        ({"a": [1, 2]}, "a", "prompts must be a list of texts"),
+    ],
+)
+def test_texts_that_cannot_be_asked_are_refused_before_the_lift(trained: Path, tmp_path: Path, texts, queries, message):
+    half = [(np.zeros((120, 160), np.uint16), [[1.0, 2.0]])] * 12
+    with pytest.raises(ValueError, match=message):
+        nl.lift_run(trained, features=half, texts=texts, queries=queries, output_dir=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_arguments_that_would_be_ignored_are_refused(trained: Path, run: nl.LiftedRun) -> None:
+    colour, half = nl.SourceOptions(encoder="colour"), [(np.zeros((120, 160), int), np.ones((1, 2)))] * 12
+    for arguments, message in (
+        ({"source": colour, "texts": {"a": [1, 2]}}, "texts are for features of your own"),
+        ({"source": colour, "features": half}, "take the place of source"),
+        ({"features": []}, "0 pairs of labels and vectors were given for 12"),
+        ({"features": {}}, "features are empty"),
+        ({"features": [half[0][0]] * 12}, "must be a pair of labels and vectors, got ndarray"),
+        ({"features": [(half[0][0] * 0.5, half[0][1])] * 12}, "must be integers, got float64"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            nl.lift_run(trained, **arguments)
+    with pytest.raises(ValueError, match="give them to open_scene"):
+        nl.lift_run(run.scene, source=colour, load_step=3)
+    for wrong in (
+        {"precision": "x"},
+        {"image_source": "x"},
+        {"weight_power": 0},
+        {"storage": "zip"},
+        {"unlabeled": "x"},
+    ):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be one of"):
+            nl.LiftOptions(**wrong)
+
+
+def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
+    answer = run.ask("red")
+    assert "red" in answer and "blue" not in answer
+    assert answer != run.ask("red") and len(repr(answer)) < 200 and len(repr(run)) < 300
+    with pytest.raises(ValueError, match="ask takes texts one after the other"):
+        run.ask(["red", "blue"])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"negatives must be a list of texts.*write \['blue'\]"):
+        run.ask("red", negatives="blue")
+    with pytest.raises(ValueError, match="rule must be auto, cosine, lerf, margin; got 'LERF'"):
+        run.ask("red", rule="LERF")  # type: ignore[arg-type]
+    for wrong in ({"min_reliability": 5.0}, {"threshold": float("nan")}, {"min_reliability": float("nan")}):
+        with pytest.raises(ValueError, match=r"must be in 0\.\.1 and the threshold finite"):
+            run.ask("red", **wrong)
+    for part in (answer.mask[:-1], answer.mask.int(), [1, 2]):
+        with pytest.raises(ValueError, match="part must be an answer of this run"):
+            run.export(tmp_path / "new" / "a.ply", part)
+    assert list(tmp_path.iterdir()) == []
+    assert len(run.export(tmp_path / "a.ply", answer["red"].mask.numpy())) > 0
+    with pytest.raises(TypeError, match="render draws an answer, or what it says of one text; got str"):
+        run.render(0, "red")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"the question has vectors of 3 numbers, the features of .* have 343"):
+        run.save(Question(("a",), torch.ones(1, 3)))
+    stored = run.ask_stored()
+    assert stored is not None
+    assert run.save(stored).name == "queries.safetensors"  # other tests expect it as it was
+    assert torch.equal(run.render(np.int64(3)), run.render(Path("images/0003")))

@@ -47,6 +47,7 @@ def choose_device(device: str) -> str:
     Raises:
         ValueError: an unknown device, or one that this machine lacks.
     """
+    device = str(device)
     if device not in ("auto", "cpu") and not device.startswith("cuda"):
         raise ValueError(f"--device must be auto, cpu or cuda, got {device!r}")
     if device.startswith("cuda") and not torch.cuda.is_available():

@@ -33,6 +33,8 @@ def relevancy(
     Raises:
         ValueError: an unknown rule, or no negatives where the rule needs them.
 
+    >>> import torch
+    >>> from normlift_ns import relevancy
     >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), rule="margin")
     tensor([[0.1000]])
     """

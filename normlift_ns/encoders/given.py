@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
@@ -34,13 +35,19 @@ class GivenFeatures:
         for name, (labels, vectors) in self.views.items():
             if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
                 raise ValueError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
-            if labels.ndim != 2 or labels.dtype.is_floating_point or int(labels.max()) >= len(vectors):
+            low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
+            if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
                 raise ValueError(
                     f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
-                    f"{labels.dtype} {tuple(labels.shape)} up to {labels.max()}"
+                    f"{tuple(labels.shape)} with values in {low}..{high}"
                 )
             lengths.add(vectors.shape[1])
-        lengths |= {len(vector) for vector in self.texts.values()}
+        for text, vector in self.texts.items():
+            if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
+                raise ValueError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
+            if text.strip() == "" or text.endswith(".npy") or "\0" in text:
+                raise ValueError(f"{text!r} cannot be a text: it is empty, ends in .npy, or holds a zero character")
+            lengths.add(len(vector))
         if len(lengths) > 1:
             raise ValueError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
 
@@ -67,8 +74,8 @@ class GivenFeatures:
         labels, vectors = self.views[name]
         if labels.shape != image.shape[:2]:
             raise ValueError(
-                f"labels of {name} are {tuple(labels.shape)}, but the undistorted image is {tuple(image.shape[:2])} "
-                "(height x width)"
+                f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
+                "width, undistorted, after lift_downscale); give labels of that size"
             )
         return ViewFeatures(labels.int().cpu(), normalize(vectors.double().cpu(), dim=1).float())
 
@@ -77,20 +84,41 @@ class GivenFeatures:
         return look_up(prompts, self.texts, "the texts given")
 
 
-def features_by_name(features: Any, names: Sequence[str]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Pairs of labels and vectors by the name of their image, as tensors.
+def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> GivenFeatures:
+    """Features of one's own from tensors, arrays or lists.
 
     Args:
-        features: one pair per training image, in order; or a mapping from names of images, which may leave some out.
+        features: one pair of labels and vectors per training image, in order; or a mapping from names of images, which
+            may leave some out.
+        texts: vectors by text.
         names: of all training images.
     Raises:
-        ValueError: a list of another length.
+        ValueError: a list of another length, no pair at all, or what `GivenFeatures` refuses.
     """
     if not isinstance(features, Mapping):
+        features = list(features)
         if len(features) != len(names):
             raise ValueError(
                 f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; give one "
                 "pair per image in the order of scene.train.names, or a dictionary by those names"
             )
         features = dict(zip(names, features))
-    return {name: (torch.as_tensor(labels), torch.as_tensor(vectors)) for name, (labels, vectors) in features.items()}
+    if len(features) == 0:
+        raise ValueError("features are empty; give labels and vectors of at least one training image")
+    views = {name: _pair(name, pair) for name, pair in features.items()}
+    return GivenFeatures(views, {text: _floats(vector) for text, vector in (texts or {}).items()})
+
+
+def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise ValueError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
+    labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
+    if labels.dtype.kind not in "iub":
+        raise ValueError(f"labels of {name} must be integers, got {labels.dtype}")
+    return torch.from_numpy(labels.astype(np.int64)), _floats(pair[1])
+
+
+def _floats(values: Any) -> Tensor:
+    """Detached, on the CPU, in float32 or float64."""
+    tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
+    return tensor if tensor.dtype == torch.float64 else tensor.float()

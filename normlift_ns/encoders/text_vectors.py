@@ -94,9 +94,10 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -
     for prompt in prompts:
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
-            raise ValueError(
-                f"text {prompt!r} has no vector in {where}, which holds {len(vectors)}; near names: {', '.join(near)}"
+            hint = (
+                f"which holds {len(vectors)}; near names: {', '.join(near)}" if len(vectors) > 0 else "which holds none"
             )
+            raise ValueError(f"text {prompt!r} has no vector in {where}, {hint}")
     return torch.stack([normalize(vectors[prompt].double().cpu(), dim=0).float() for prompt in prompts])
 
 

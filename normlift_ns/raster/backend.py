@@ -51,8 +51,12 @@ class Batch(NamedTuple):
 class Backend(Protocol):
     """One way to rasterize. `raster.gsplat` and `raster.triton` are backends as they stand, as modules."""
 
-    def check(self, job: Job) -> None:
-        """Raises ValueError, with what to use instead, where the backend cannot do the job."""
+    def check(self, job: Job, *, pictures: bool) -> None:
+        """Raises ValueError, with what to use instead, where the backend cannot do the job.
+
+        Args:
+            pictures: the job is to composite values; False: to sum evidence.
+        """
         ...
 
     def views_evidence(self, job: Job, batch: Batch) -> Entries:
@@ -76,7 +80,7 @@ class TileBackend:
     on: str | None = None
     """The only type of device that it works on; None: any."""
 
-    def check(self, job: Job) -> None:  # noqa: D102 (as in the protocol)
+    def check(self, job: Job, *, pictures: bool) -> None:  # noqa: D102 (as in the protocol)
         device = job.scene.means.device
         if self.on is not None and device.type != self.on:
             raise ValueError(

@@ -54,7 +54,7 @@ def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend
     if name not in BACKENDS:
         raise ValueError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
     backend = BACKENDS[name]()
-    backend.check(job)
+    backend.check(job, pictures=pictures)
     return name, backend
 
 

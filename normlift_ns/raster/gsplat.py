@@ -63,7 +63,7 @@ def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
     return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
 
 
-def check(job: Job) -> None:
+def check(job: Job, *, pictures: bool = False) -> None:
     """Raises ValueError for a scene that is not float32 on a GPU, another gsplat than 1.4, or other constants than
     those that gsplat has compiled."""
     means = job.scene.means

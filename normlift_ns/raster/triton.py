@@ -14,16 +14,20 @@ from normlift_ns.kernels.regions import region_sums
 from normlift_ns.raster import gsplat
 from normlift_ns.raster.backend import Batch, Job
 
-check = gsplat.check
-"""Raises ValueError where gsplat's projection cannot be used."""
+
+def check(job: Job, *, pictures: bool) -> None:
+    """Raises ValueError for pictures, and where gsplat's projection cannot be used."""
+    if pictures:
+        raise ValueError(
+            'backend "triton" sums evidence and draws no pictures; render with backend="torch" or "gsplat" on a GPU, '
+            '"numba" on a CPU, or "auto"'
+        )
+    gsplat.check(job)
 
 
 def composite(job: Job, camera: Camera, values: Tensor) -> NoReturn:
-    """Raises ValueError: there is no kernel for pictures."""
-    raise ValueError(
-        'backend "triton" sums evidence and draws no pictures; render with backend="torch" or "gsplat" on a GPU, '
-        '"numba" on a CPU, or "auto"'
-    )
+    """There is no kernel for pictures; `check` says so."""
+    raise NotImplementedError
 
 
 def views_evidence(job: Job, batch: Batch) -> Entries:

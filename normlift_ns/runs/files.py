@@ -26,8 +26,15 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
 
     Args:
         timestamp: None: now, as 2024-05-01_120000.
+    Raises:
+        ValueError: a timestamp or a name that is not the name of one folder.
     """
-    stamp = timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    stamp = datetime.now().strftime("%Y-%m-%d_%H%M%S") if timestamp is None else timestamp
+    for what, folder in (("timestamp", stamp), ("experiment name", name)):
+        if folder.startswith(".") or folder.strip() == "" or {"/", "\\", "\0"} & set(folder):
+            raise ValueError(
+                f"the {what} {folder!r} is not the name of a folder; give one without slashes, such as 'run'"
+            )
     return Path(os.path.abspath(output_dir)) / name / "normlift" / stamp
 
 

@@ -93,6 +93,7 @@ def write_splats(
     texts = () if answer is None else answer.texts
     comments = ["Written by normlift_ns", "Vertical Axis: z"]
     comments += [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
     with atomic_path(path.with_name(f"{path.stem}_rows.npy")) as temporary, temporary.open("wb") as file:

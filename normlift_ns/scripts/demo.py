@@ -36,6 +36,7 @@ class Demo:
     def main(self) -> dict[str, float]:
         """Runs the demo; returns mIoU before and after refinement."""
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
+        from normlift_ns.observing import spread  # noqa: PLC0415
 
         CONSOLE.rule("A room made in code")
         room = demo_room(self.num_gaussians)
@@ -52,8 +53,9 @@ class Demo:
         flags = ("--render-dir", pictures, "--json", answers)
         _show("ns-normlift-query", "--load-config", run.config, "--text", *TEXTS, *flags)
         NormLiftQuery(run.config, TEXTS, render_dir=pictures, json=answers).main()
+        middle = f"{spread(self.views, 3)[1]:04d}"
         side_by_side(
-            [pictures / f"0012_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures
+            [pictures / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures
         )
 
         CONSOLE.rule("Comparing it with the truth")

@@ -42,7 +42,10 @@ class NormLiftExport:
 
     def main(self) -> Path:
         """Writes the files; returns the path of the PLY file."""
-        target = self.output_dir / Path(self.output_filename).name
+        name = Path(self.output_filename).name
+        if name == "":
+            raise ValueError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
+        target = self.output_dir / name
         objects = target.with_name(f"{target.stem}_objects.json")
         for path in (target, target.with_name(f"{target.stem}_rows.npy"), objects):
             if path.exists() and not self.overwrite:

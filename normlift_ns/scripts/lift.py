@@ -42,7 +42,8 @@ class NormLift:
     queries: tuple[str, ...] = ()
     """Texts to store in the run; ns-render and ns-viewer show their relevancy."""
     export_langsplat: Path | None = None
-    """Write regions and features of all images into this folder too, in the format of LangSplat's preprocessing."""
+    """Write regions and features of the images that are lifted into this folder too, in the format of LangSplat's
+    preprocessing."""
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
 

@@ -75,6 +75,7 @@ def _write_json(path: Path, rows: list[dict[str, Any]], answer: Answer) -> None:
 
     question = answer.question
     facts = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
 
@@ -90,6 +91,7 @@ def _write_arrays(path: Path, answer: Answer) -> None:
         "valid": answer.valid,
     }
     arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez(file, names=np.array(answer.texts), **arrays)
 

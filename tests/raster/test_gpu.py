@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine
+from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.core import gpu
 from normlift_ns.raster import gsplat
 from normlift_ns.raster.backend import Batch, Job
@@ -23,6 +23,12 @@ def test_gpu_backends_refuse_other_scenes(backend):
         rasterize_evidence(scene, cameras, labels, backend=backend)
     with pytest.raises(ValueError, match=r"computes in float32 on a GPU; .* wanted is torch.float64"):
         rasterize_evidence(scene, cameras, labels, backend=backend, dtype=torch.float64)
+
+
+def test_triton_draws_no_pictures():
+    scene = random_scene(5, dtype=torch.float32)
+    with pytest.raises(ValueError, match='backend "triton" sums evidence and draws no pictures'):
+        render(scene, orbit(1)[0], torch.ones(5, 1), backend="triton")
 
 
 def test_gradients_are_of_weights_only():
