@@ -16,18 +16,20 @@ GOLDEN = Path(__file__).with_name("golden.json")
 pytestmark = pytest.mark.slow
 
 
-def _check(scene: str, config: Path, folder: Path) -> None:
+def differences_from_golden(scene: str, config: Path, folder: Path) -> list[str]:
     run_commands(scene, config, folder)
-    assert compare(summarize(folder), json.loads(GOLDEN.read_text())[scene], 1e-5) == []
+    return compare(summarize(folder), json.loads(GOLDEN.read_text())[scene], 1e-5)
 
 
 def test_the_demo_room(tmp_path: Path) -> None:
     room = demo_room()
     write_capture(room, tmp_path / "room")
-    _check("demo", write_splatfacto_run(room, tmp_path / "room", tmp_path / "outputs"), tmp_path / "lifted")
+    config = write_splatfacto_run(room, tmp_path / "room", tmp_path / "outputs")
+    assert differences_from_golden("demo", config, tmp_path / "lifted") == []
 
 
 @needs_shared
 @pytest.mark.parametrize("scene", ["fox", "tabletop"])
 def test_real_captures(scene: str, tmp_path: Path) -> None:
-    _check(scene, SHARED / "captures" / "outputs" / scene / "splatfacto" / "run" / "config.yml", tmp_path)
+    config = SHARED / "captures" / "outputs" / scene / "splatfacto" / "run" / "config.yml"
+    assert differences_from_golden(scene, config, tmp_path) == []
