@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -73,7 +75,10 @@ def summarize(folder: Path) -> dict[str, Any]:
 
 def machine() -> dict[str, str]:
     """What rounding depends on."""
-    return {"torch": torch.__version__, "processor": torch.backends.cpu.get_cpu_capability()}
+    facts = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*: (.*)", facts.read_text()) if facts.exists() else []
+    model = names[0] if len(names) > 0 else platform.processor()
+    return {"torch": torch.__version__, "instructions": torch.backends.cpu.get_cpu_capability(), "processor": model}
 
 
 def _array(array: np.ndarray, name: str = "") -> dict[str, Any]:
