@@ -76,8 +76,12 @@ def summarize(folder: Path) -> dict[str, Any]:
 def machine() -> dict[str, str]:
     """What rounding depends on."""
     facts = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", facts.read_text()) if facts.exists() else []
-    model = names[0] if len(names) > 0 else platform.processor()
+    lines = (
+        re.findall(r"^(?:cpu family|model|model name|stepping)\s*: (.*)", facts.read_text(), re.M)
+        if facts.exists()
+        else []
+    )
+    model = " ".join(lines[:4]) or platform.processor()
     return {"torch": torch.__version__, "instructions": torch.backends.cpu.get_cpu_capability(), "processor": model}
 
 
