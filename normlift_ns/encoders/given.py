@@ -1,4 +1,4 @@
-"""Features of one's own: label maps and vectors that are in memory already."""
+"""Features of your own: label maps and vectors that are in memory already."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ class GivenFeatures:
     """A `FeatureSource` of (labels, vectors) per image, and of texts with their vectors.
 
     Raises:
-        ValueError: vectors that are not [regions, D] with the same D everywhere, zero or not finite; labels that are
-            no integer matrix or name a region without a vector. The message names the image.
+        ValueError: vectors that are not [regions, D], or [D] for a text, with the same D everywhere, zero or not
+            finite; labels that are no integer matrix or name a region without a vector; a text that is empty or cannot
+            be the name of a file in an archive. The message names the image or the text.
     """
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
@@ -85,7 +86,7 @@ class GivenFeatures:
 
 
 def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> GivenFeatures:
-    """Features of one's own from tensors, arrays or lists.
+    """Features of your own from tensors, arrays or lists.
 
     Args:
         features: one pair of labels and vectors per training image, in order; or a mapping from names of images, which

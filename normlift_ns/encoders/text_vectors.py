@@ -102,8 +102,9 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -
 
 
 def write_text_vectors(file: Path, vectors: Mapping[str, Tensor]) -> None:
-    """Writes what `TextVectors` reads, complete or not at all."""
+    """Writes what `TextVectors` reads, as unit vectors in float32, complete or not at all."""
     with atomic_path(file) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for text, vector in vectors.items():  # numpy.savez takes no text that is called "file"
+            unit = normalize(vector.double().cpu(), dim=0).float()  # float32 would lose tiny and huge ones
             with archive.open(f"{text}.npy", "w") as entry:
-                np.lib.format.write_array(entry, vector.detach().float().cpu().numpy(), allow_pickle=False)
+                np.lib.format.write_array(entry, unit.numpy(), allow_pickle=False)
