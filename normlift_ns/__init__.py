@@ -33,9 +33,11 @@ if TYPE_CHECKING:
     from normlift_ns.options import LiftOptions as LiftOptions
     from normlift_ns.options import RefineConfig as RefineConfig
     from normlift_ns.options import SourceOptions as SourceOptions
+    from normlift_ns.options import SplatOptions as SplatOptions
     from normlift_ns.raster.rasterize import rasterize_evidence as rasterize_evidence
     from normlift_ns.raster.rasterize import render as render
     from normlift_ns.raster.settings import RasterSettings as RasterSettings
+    from normlift_ns.scenes.opening import open_splat as open_splat
 
 __version__ = "0.1.0"
 
@@ -52,9 +54,10 @@ _HOMES = {
     "core.scene": ("Scene", "View"),
     "front_door": ("lift_run", "open_run", "open_scene"),
     "lifted_run": ("LiftedRun",),
-    "options": ("LiftOptions", "RefineConfig", "SourceOptions"),
+    "options": ("LiftOptions", "RefineConfig", "SourceOptions", "SplatOptions"),
     "raster.rasterize": ("rasterize_evidence", "render"),
     "raster.settings": ("RasterSettings",),
+    "scenes.opening": ("open_splat",),
 }
 """Modules by the public names that they define."""
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

@@ -30,11 +30,14 @@ from normlift_ns.runs.files import (
     run_directory,
     with_paths,
 )
+from normlift_ns.scenes.match import judge, match_photographs
+from normlift_ns.scenes.opening import SplatScene
+from normlift_ns.scenes.saved import is_saved_splat, open_saved_splat
 from normlift_ns.stages import Report
 
 
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
-    """A trained splatfacto run, from any working directory.
+    """A trained splatfacto run, or a lifted one, from any working directory. For a splat without a run see `open_splat`.
 
     Args:
         load_config: config.yml of the run.
@@ -48,9 +51,13 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     >>> len(scene.train), scene.train[1].image.shape
     (12, torch.Size([120, 160, 3]))
     """
+    config, place = Path(load_config), None if data is None else Path(data)
+    run_dir = Path(os.path.abspath(config)).parent
+    if config.is_file() and is_saved_splat(run_dir):
+        return open_saved_splat(run_dir, data=place, load_step=load_step)
     from normlift_ns.nerfstudio_plugin.load import load_scene  # noqa: PLC0415 (nerfstudio takes 20 s)
 
-    return load_scene(Path(load_config), data=None if data is None else Path(data), load_step=load_step)
+    return load_scene(config, data=place, load_step=load_step)
 
 
 def open_run(
@@ -97,6 +104,7 @@ def lift_run(
     output_dir: str | Path | None = None,
     timestamp: str | None = None,
     overwrite: bool = False,
+    check: bool = True,
     device: str = "auto",
     export: Export | None = None,
     report: Report = lambda stage, done, total: None,
@@ -108,7 +116,7 @@ def lift_run(
     open.
 
     Args:
-        config_or_scene: config.yml of the trained run, or a scene of `open_scene`.
+        config_or_scene: config.yml of the trained run, or a scene of `open_scene` or `open_splat`.
         source: which 2D features to make of the photographs; None: as ns-normlift does by default.
         features: features of your own in place of `source`: per training image a label map [H, W] of the undistorted
             image, at the size that `lift_downscale` leaves, with regions 0..R-1 and -1 for none, and vectors [R, D].
@@ -120,6 +128,8 @@ def lift_run(
         output_dir: in place of the run's own outputs folder.
         timestamp: name of the new run directory; None: the present time.
         overwrite: replace a run directory of that name, and exported files of other content.
+        check: compare three training views with renders of the scene first, and refuse scenes that do not show what
+            their photographs show.
         device: auto, cpu or cuda.
         export: where to write the 2D features too, in LangSplat's format.
         report: called with (stage, steps done, steps in all).
@@ -128,7 +138,7 @@ def lift_run(
         FileExistsError: the run directory exists and `overwrite` is False.
         FileNotFoundError, ValueError: as `open_scene`; an image, a label map or an option that does not fit.
         MemoryError: the GPU's memory does not hold the lift.
-        TypeError: neither a config nor a scene of `open_scene`.
+        TypeError: neither a config nor a scene of `open_scene` or `open_splat`.
 
     >>> scene = open_scene(config)
     >>> import torch
@@ -153,11 +163,16 @@ def lift_run(
     scene = config_or_scene
     if isinstance(scene, str | Path):
         scene = open_scene(scene, data=data, load_step=load_step)
-    if not isinstance(scene, NerfstudioScene):
-        raise TypeError(f"lift_run takes the config.yml of a run or a scene of open_scene, got {type(scene).__name__}")
+    if not isinstance(scene, NerfstudioScene | SplatScene):
+        raise TypeError(
+            "lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got "
+            f"{type(scene).__name__}"
+        )
     run_dir = run_directory(scene.runs_dir if output_dir is None else Path(output_dir), scene.name, timestamp)
     refuse_existing(run_dir, overwrite)
     say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
+    if check and (warning := judge(match_photographs(scene))) is not None:
+        say(f"Warning: {warning}")
     settings = encoder_settings(options)
     if made is None:
         made = given_features(features, texts, scene.train.names)

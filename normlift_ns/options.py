@@ -90,6 +90,59 @@ class SourceOptions:
 
 
 @dataclass(frozen=True)
+class SplatOptions:
+    """Cameras and photographs of a splat that no nerfstudio run holds.
+
+    Raises:
+        ValueError: no file of cameras, or two.
+
+    >>> from normlift_ns import SplatOptions
+    >>> SplatOptions(transforms="capture/transforms.json").views
+    'train'
+    """
+
+    colmap: Path | None = None
+    """Folder of a COLMAP project, with images/ and sparse/0/ in it."""
+    transforms: Path | None = None
+    """transforms.json of nerfstudio, instant-ngp or Blender, instead of --colmap."""
+    images: Path | None = None
+    """Folder of the photographs, or of smaller copies such as images_4. By default images/ of the COLMAP project, or
+    where transforms.json says."""
+    masks: Path | None = None
+    """Folder with one mask per photograph, zero where a pixel does not count."""
+    world_transform: Path | None = None
+    """File of the similarity from the world of the cameras to that of the splat: 4 x 4 numbers, or the
+    dataparser_transforms.json of the run that a PLY file was exported from. By default the worlds are the same."""
+    gsplat_normalize: bool = True
+    """For --load-gsplat: the trainer normalized the world (its default); computed again from the COLMAP project."""
+    views: Literal["train", "all"] = "train"
+    """train: lift the photographs that were not held out. all: lift all of them."""
+    test_every: int | None = None
+    """Every so manieth photograph was held out of the training: 8 for gsplat's trainer, and for Inria's with --eval. By
+    default none, or those that transforms.json names."""
+    holdout: tuple[str, ...] = ()
+    """Photographs held out of the training, instead of --test-every: their names, a text file of names, or a share such
+    as 0.1, which ns-train holds out by default."""
+    rasterize_mode: RasterizeMode | None = None
+    """How the splat was rasterized in its training: classic or antialiased. By default as the PLY file says, else
+    classic."""
+    background: Literal["black", "white"] = "black"
+    """What is behind the splat, and behind photographs with an alpha channel."""
+
+    def __post_init__(self) -> None:
+        for name in ("colmap", "transforms", "images", "masks", "world_transform"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, None if value is None else Path(value))
+        for name, known in (
+            ("views", ("train", "all")),
+            ("rasterize_mode", (None, *get_args(RasterizeMode))),
+            ("background", ("black", "white")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
+
+
+@dataclass(frozen=True)
 class RefineConfig:
     """Parameters of the vote among neighbours.
 

@@ -19,13 +19,14 @@ from normlift_ns.asking import Question
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.picking import ray_weights
-from normlift_ns.nerfstudio_plugin.appearance import shading_degree, view_colors
+from normlift_ns.nerfstudio_plugin.appearance import shading_degree
 from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
 from normlift_ns.nerfstudio_plugin.panel import Panel
-from normlift_ns.nerfstudio_plugin.views import to_camera
+from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.files import with_paths
 from normlift_ns.runs.question import load_question
+from normlift_ns.scenes.photographs import to_camera
 from normlift_ns.viewer.display import Display, draw
 
 

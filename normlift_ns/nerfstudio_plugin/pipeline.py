@@ -19,7 +19,7 @@ from normlift_ns.core.files import atomic_path
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
-from normlift_ns.nerfstudio_plugin.checkpoint import numpy_numbers
+from normlift_ns.scenes.checkpoint import numpy_numbers
 from normlift_ns.nerfstudio_plugin.config import stored_data
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel

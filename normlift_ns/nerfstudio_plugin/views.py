@@ -17,19 +17,9 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
+from normlift_ns.scenes.photographs import to_camera
 
 _DRAWN_AS_PINHOLE = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
-
-
-def to_camera(
-    camera_to_world: Float[Tensor, "3 4"], intrinsics: Float[Tensor, "3 3"], width: int, height: int
-) -> Camera:
-    """nerfstudio's OpenGL pose (x right, y up, z backward) as an OpenCV camera, by splatfacto's own steps."""
-    rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
-    pose = torch.eye(4, dtype=camera_to_world.dtype, device=camera_to_world.device)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ camera_to_world[:, 3]
-    return Camera(intrinsics.to(pose.device), pose, width, height)  # nerfstudio makes intrinsics on the CPU
 
 
 class DatasetViews:

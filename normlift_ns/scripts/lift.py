@@ -13,7 +13,7 @@ from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
 if TYPE_CHECKING:
@@ -23,10 +23,18 @@ if TYPE_CHECKING:
 
 @dataclass
 class NormLift:
-    """Lift 2D features onto the Gaussians of a trained splatfacto run, without training."""
+    """Lift 2D features onto the Gaussians of a trained splat, without training: a splatfacto run, a PLY file or a
+    checkpoint of gsplat's trainer."""
 
-    load_config: Path
+    load_config: Path | None = None
     """Path to config YAML file of the trained run."""
+    load_ply: Path | None = None
+    """Instead of --load-config: PLY file of a splat, with --colmap or --transforms."""
+    load_gsplat: Path | None = None
+    """Instead of --load-config: checkpoint of gsplat's simple_trainer, ckpt_<step>_rank0.pt, with --colmap."""
+    splat: SplatOptions = field(default_factory=SplatOptions)
+    check: bool = True
+    """Compare three training views with renders of the scene before the lift. False: lift whatever they say."""
     data: Path | None = None
     """Where the dataset is now, if it was moved since training."""
     load_step: int | None = None
@@ -50,12 +58,15 @@ class NormLift:
     def main(self) -> LiftedRun:
         """Lifts, and returns the new run."""
         start = time.perf_counter()
+        splat = self._source()
         from normlift_ns.front_door import lift_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.lifting import Export  # noqa: PLC0415
+        from normlift_ns.scenes.opening import open_splat  # noqa: PLC0415
 
+        scene = self.load_config if splat is None else open_splat(splat, self.splat, say=CONSOLE.print)
         with progress_bars() as report:
             run = lift_run(
-                self.load_config,
+                scene,
                 source=self.source,
                 lift=self.lift,
                 queries=self.queries,
@@ -64,6 +75,7 @@ class NormLift:
                 output_dir=self.output_dir,
                 timestamp=self.timestamp,
                 overwrite=self.overwrite,
+                check=self.check,
                 device=self.device,
                 export=None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite),
                 report=report,
@@ -71,6 +83,34 @@ class NormLift:
             )
         CONSOLE.print(summary(run, time.perf_counter() - start, self.queries))
         return run
+
+    def _source(self) -> Path | None:
+        """The splat; None where a run of nerfstudio is lifted.
+
+        Raises:
+            ValueError: none of the three, or more than one; options that do not fit it.
+        """
+        given = [path for path in (self.load_config, self.load_ply, self.load_gsplat) if path is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"Give one trained splat, got {len(given)}: --load-config with the config.yml of a splatfacto run, "
+                "--load-ply with a PLY file, or --load-gsplat with a checkpoint of gsplat's trainer."
+            )
+        if self.load_config is None:
+            for name in ("data", "load_step"):
+                if getattr(self, name) is not None:
+                    raise ValueError(
+                        f"--{name.replace('_', '-')} is for --load-config; for a splat say where the photographs are "
+                        "with --images."
+                    )
+            return given[0]
+        changed = [name for name, value in vars(self.splat).items() if value != getattr(SplatOptions(), name)]
+        if changed:
+            raise ValueError(
+                f"--{changed[0].replace('_', '-')} is for --load-ply and --load-gsplat; a run of nerfstudio brings its "
+                "own cameras."
+            )
+        return None
 
 
 @contextmanager

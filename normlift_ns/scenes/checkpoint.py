@@ -55,31 +55,11 @@ def _is_step(path: Path) -> bool:
 def read_checkpoint(path: Path) -> Checkpoint:
     """Reads step and model of a splatfacto checkpoint, full or slim; the optimizers' state stays on disk.
 
-    Only tensors, plain containers and numpy's numbers are unpickled (`weights_only=True` plus the allow-list below), so
-    that a checkpoint from a stranger runs no code.
-
     Raises:
         ValueError: a truncated or damaged file, other content, or not the Gaussians of splatfacto.
     """
-    if not zipfile.is_zipfile(path):
-        raise ValueError(
-            f"{path} is truncated or no checkpoint: its {path.stat().st_size:,} bytes are not the zip archive that "
-            "torch.save writes. Copy it again, or give another checkpoint with --load-step."
-        )
-    try:
-        with torch.serialization.safe_globals(numpy_numbers()):
-            loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL (\S+)", str(error))
-        raise ValueError(
-            f"{path} is not read, because it holds Python objects{f' ({found[1]})' if found else ''}: only tensors and "
-            "numbers are expected, as ns-train splatfacto writes them. Give another checkpoint with --load-step."
-        ) from error
-    except (RuntimeError, EOFError, OSError) as error:
-        raise ValueError(
-            f"{path} is damaged ({str(error).strip().split('. ')[0]}). "
-            "Copy it again, or give another checkpoint with --load-step."
-        ) from error
+    advice = "give another checkpoint with --load-step"
+    loaded = read_tensors(path, "as ns-train splatfacto writes them", advice)
     state = loaded.get("pipeline") if isinstance(loaded, dict) else None
     if not isinstance(state, dict) or not isinstance(loaded.get("step"), int):
         keys = sorted(map(str, loaded)) if isinstance(loaded, dict) else type(loaded).__name__
@@ -92,6 +72,37 @@ def read_checkpoint(path: Path) -> Checkpoint:
             "Train the capture with: ns-train splatfacto --data ..."
         )
     return Checkpoint(path, loaded["step"], model)
+
+
+def read_tensors(path: Path, writer: str, advice: str) -> Any:
+    """What torch.save wrote, memory-mapped on the CPU.
+
+    Only tensors, plain containers and numpy's numbers are unpickled (`weights_only=True` plus the allow-list below), so
+    that a file from a stranger runs no code.
+
+    Args:
+        writer, advice: parts of messages: who writes such files, and what to do besides copying the file again.
+    Raises:
+        ValueError: a truncated or damaged file, or one that holds other Python objects.
+    """
+    if not zipfile.is_zipfile(path):
+        raise ValueError(
+            f"{path} is truncated or no checkpoint: its {path.stat().st_size:,} bytes are not the zip archive that "
+            f"torch.save writes. Copy it again, or {advice}."
+        )
+    try:
+        with torch.serialization.safe_globals(numpy_numbers()):
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        found = re.search(r"GLOBAL (\S+)", str(error))
+        raise ValueError(
+            f"{path} is not read, because it holds Python objects{f' ({found[1]})' if found else ''}: only tensors and "
+            f"numbers are expected, {writer}. {advice[0].upper()}{advice[1:]}."
+        ) from error
+    except (RuntimeError, EOFError, OSError) as error:
+        raise ValueError(
+            f"{path} is damaged ({str(error).strip().split('. ')[0]}). Copy it again, or {advice}."
+        ) from error
 
 
 def _model_state(pipeline: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:

@@ -1,0 +1,26 @@
+"""Colours of Gaussians as one camera sees them, on any device."""
+
+from __future__ import annotations
+
+import torch
+from gsplat.cuda._torch_impl import _spherical_harmonics
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera
+
+
+def view_colors(
+    means: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n k 3"], camera: Camera, degree: int | None
+) -> Float[Tensor, "n 3"]:
+    """RGB >= 0 of every Gaussian, as splatfacto and gsplat.rasterization compute it.
+
+    Args:
+        coefficients: features_dc and features_rest of a checkpoint, [N, 1 + rest, 3].
+        degree: of the spherical harmonics, with (degree + 1) ** 2 <= K; None: coefficients are logits.
+    """
+    if degree is None:
+        return torch.sigmoid(coefficients[:, 0])
+    pose = camera.world_to_camera.to(means)
+    centre = -pose[:3, :3].T @ pose[:3, 3]
+    return (_spherical_harmonics(degree, means - centre, coefficients) + 0.5).clamp(min=0)

@@ -1,0 +1,134 @@
+"""Checkpoints of gsplat's simple_trainer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.scenes.checkpoint import read_tensors
+from normlift_ns.scenes.splat import Splat, check_splat, from_parameters
+
+_RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")
+_ADVICE = "give another file with --load-gsplat"
+_REFUSED = {
+    "app_module": "a network of appearances (--app_opt), without which its Gaussians have no colours",
+}
+
+
+class GsplatCheckpoint(NamedTuple):
+    """What the trainer has learned."""
+
+    files: tuple[Path, ...]
+    """One per GPU of the training."""
+    step: int
+    splat: Splat
+    pose_adjust: Float[Tensor, "v 9"] | None
+    """Translation and rotation in six numbers by which the training moved the camera of every training view."""
+
+
+def read_gsplat(path: Path) -> GsplatCheckpoint:
+    """Reads ckpt_<step>_rank<r>.pt; where a training on several GPUs left several files, all of them, in their order.
+
+    Raises:
+        FileNotFoundError: no such file, or a rank is missing.
+        ValueError: a damaged file or one of another trainer, one that needs a network of appearances, ranks of
+            different trainings, values that nothing could draw.
+    """
+    files = _rank_files(path)
+    loaded = [_read_rank(file) for file in files]
+    steps = {step for step, _, _ in loaded}
+    if len(steps) > 1:
+        raise ValueError(
+            f"{files[0].parent} has ranks of different steps: {', '.join(map(str, sorted(steps)))}. Expected the files "
+            "of one training; keep those in a folder of their own."
+        )
+    harmonics = {tensors["features_rest"].shape[1:] for _, tensors, _ in loaded}
+    if len(harmonics) > 1:
+        raise ValueError(
+            f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training; keep "
+            "those in a folder of their own."
+        )
+    names = loaded[0][1]
+    splats = [from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
+    merged = Splat(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
+    check_splat(merged, files[0])
+    return GsplatCheckpoint(files, steps.pop(), merged, loaded[0][2])
+
+
+def _rank_files(path: Path) -> tuple[Path, ...]:
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"There is no checkpoint at {path}. Give a file that gsplat's simple_trainer wrote with --load-gsplat, "
+            "for example results/garden/ckpts/ckpt_29999_rank0.pt."
+        )
+    match = _RANK.fullmatch(path.name)
+    if match is None:
+        return (path,)
+    ranks = {
+        int(found[2]): file
+        for file in path.parent.glob(f"{match[1]}*{match[3]}")
+        if (found := _RANK.fullmatch(file.name)) is not None
+    }
+    missing = sorted(set(range(max(ranks) + 1)) - set(ranks))
+    if missing:
+        raise FileNotFoundError(
+            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {', '.join(map(str, missing))}. Every rank "
+            "holds a share of the Gaussians; copy all files of the training."
+        )
+    return tuple(ranks[rank] for rank in sorted(ranks))
+
+
+def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
+    """Step, parameters by splatfacto's names, and how the poses were moved."""
+    loaded = read_tensors(path, "as gsplat's simple_trainer writes them", _ADVICE)
+    splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
+    if not isinstance(splats, Mapping):
+        keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
+        hint = "; for a run of nerfstudio give its config.yml with --load-config" if "pipeline" in keys else ""
+        raise ValueError(f"{path} is no checkpoint of gsplat: expected `splats` in it, found {keys}{hint}.")
+    for key, meaning in _REFUSED.items():
+        if key in loaded:
+            raise ValueError(
+                f"{path} holds `{key}`: {meaning}. Train it again without that option, or export a PLY file with the "
+                "trainer's --save_ply and give that with --load-ply."
+            )
+    missing = [name for name in ("means", "quats", "scales", "opacities", "sh0", "shN") if name not in splats]
+    if missing or not all(isinstance(value, Tensor) for value in splats.values()):
+        raise ValueError(
+            f"{path} has no {', '.join(missing) or 'tensors'} in its `splats`, which holds "
+            f"{', '.join(sorted(map(str, splats)))}. Expected those of 3D Gaussians with spherical harmonics, as "
+            "gsplat's simple_trainer writes them."
+        )
+    if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
+        raise ValueError(
+            f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
+            "expected (N, 1, 3) and (N,)."
+        )
+    parameters = {name: splats[name] for name in ("means", "quats", "scales")}
+    parameters["opacities"] = splats["opacities"][:, None]
+    parameters["features_dc"], parameters["features_rest"] = splats["sh0"][:, 0], splats["shN"]
+    return _step(loaded), parameters, _pose_adjust(path, loaded)
+
+
+def _step(loaded: Mapping[str, Any]) -> int:
+    step = loaded.get("step")
+    return step if isinstance(step, int) else 0
+
+
+def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] | None:
+    state = loaded.get("pose_adjust")
+    if state is None:
+        return None
+    moved = state.get("embeds.weight") if isinstance(state, Mapping) else None
+    if not isinstance(moved, Tensor) or moved.ndim != 2 or moved.shape[1] != 9 or not bool(moved.isfinite().all()):
+        raise ValueError(
+            f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected finite numbers "
+            f"embeds.weight (views, 9); {_ADVICE}."
+        )
+    return moved.double()

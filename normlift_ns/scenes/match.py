@@ -1,0 +1,147 @@
+"""Do photographs, cameras and Gaussians belong together? A few renders tell, before a lift takes minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.scene import Scene, View
+from normlift_ns.raster.rasterize import render_picture
+
+_LONGEST = 400
+"""Longer side of the renders in pixels."""
+LEAST_PSNR = 24.0
+"""Scenes of people reach 25 to 40 dB on the photographs of their training."""
+_FOCAL_STEP, _FOCAL_GAIN = 1.02, 1.0
+"""A focal length that is wrong by 2 % costs about 15 dB on a sharp scene: 1 dB is well beyond chance."""
+_LEAST_IN_VIEW = 0.001
+"""Share of the Gaussians that one of the views must see."""
+
+
+class Match(NamedTuple):
+    """How well renders and photographs agree."""
+
+    psnr: float
+    """Mean over the views, in dB."""
+    in_view: float
+    """Largest share of the Gaussians that lie in a view, in 0..1."""
+    grey_psnr: float
+    """What pictures of one colour, the mean of each photograph, would reach."""
+    focal: float
+    """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; else 1."""
+
+
+def match_photographs(scene: Scene) -> Match:
+    """Renders three training views at no more than 400 pixels and compares them with their photographs.
+
+    Raises:
+        FileNotFoundError, ValueError: a photograph that is missing or cannot be read.
+    """
+    views = _some_views(scene)
+    in_view = max(_share_in_view(scene, view.camera) for view in views)
+    plain = _mean_psnr(scene, views, 1.0)
+    grey = sum(_psnr(view, _mean_color(view)) for view in views) / len(views)
+    others = {factor: _mean_psnr(scene, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
+    best = max(others, key=lambda factor: others[factor])
+    return Match(plain, in_view, grey, best if others[best] > plain + _FOCAL_GAIN else 1.0)
+
+
+def mean_psnr(scene: Scene) -> float:
+    """`Match.psnr` alone, in dB."""
+    return _mean_psnr(scene, _some_views(scene), 1.0)
+
+
+def judge(match: Match) -> str | None:
+    """None where all is well, or a warning in whole sentences.
+
+    Raises:
+        ValueError: Gaussians and cameras have nothing to do with each other.
+    """
+    causes = (
+        "Likely causes: cameras of another capture; cameras in another world than the splat's (give "
+        "--world-transform; for gsplat's trainer see --gsplat-normalize); other photographs, or distorted ones under "
+        "cameras of undistorted ones; another --rasterize-mode"
+    )
+    if match.in_view < _LEAST_IN_VIEW:
+        raise ValueError(
+            f"The cameras do not look at this splat: at most {match.in_view:.2%} of its Gaussians are in any of three "
+            f"training views. {causes}. --check False lifts nevertheless."
+        )
+    if match.psnr < match.grey_psnr:
+        raise ValueError(
+            f"The splat does not show what its photographs show: rendered from three of their cameras, it is further "
+            f"from them ({match.psnr:.1f} dB) than their mean colour is ({match.grey_psnr:.1f} dB). {causes}; another "
+            "--background. --check False lifts nevertheless."
+        )
+    if match.focal != 1.0:
+        return (
+            f"Focal lengths that are {abs(match.focal - 1):.0%} {'longer' if match.focal > 1 else 'shorter'} fit the "
+            f"photographs better by more than 1 dB. The cameras may not be those of the training: has their file "
+            "changed since, or were the images rescaled?"
+        )
+    if match.psnr < LEAST_PSNR:
+        return (
+            f"The splat reaches {match.psnr:.1f} dB on three photographs of its training, less than the "
+            f"{LEAST_PSNR:.0f} dB that one expects. Semantics will be as inexact. {causes}; another --background, or a "
+            "training that was stopped early."
+        )
+    return None
+
+
+def _some_views(scene: Scene) -> list[View]:
+    last = len(scene.train) - 1
+    return [_small(scene.train[index]) for index in sorted({0, last // 2, last})]
+
+
+def _small(view: View) -> View:
+    """Pixels are averaged, so that what is left needs no filter."""
+    camera = view.camera
+    divisor = max(1.0, max(camera.width, camera.height) / _LONGEST)
+    width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
+    channels = view.image.permute(2, 0, 1)[None].float()
+    image = torch.nn.functional.interpolate(channels, (height, width), mode="area")[0].permute(1, 2, 0)
+    mask = view.mask
+    if mask is not None:
+        share = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
+        mask = share > 0.999
+    smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
+    return View(smaller, image.round().to(torch.uint8), mask, view.name)
+
+
+def _mean_psnr(scene: Scene, views: Sequence[View], factor: float) -> float:
+    return sum(_psnr(view, render_picture(scene, _zoomed(view.camera, factor))) for view in views) / len(views)
+
+
+def _zoomed(camera: Camera, factor: float) -> Camera:
+    scale = torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    return Camera(camera.K * scale, camera.world_to_camera, camera.width, camera.height)
+
+
+def _psnr(view: View, picture: UInt8[Tensor, "h w 3"]) -> float:
+    gap = (view.image.float() - picture.float()) / 255
+    if view.mask is not None:
+        gap = gap[view.mask]
+    return float(-10 * gap.square().mean().clamp(min=1e-9).log10()) if gap.numel() > 0 else 0.0
+
+
+def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
+    pixels = view.image.float() if view.mask is None else view.image[view.mask].float()
+    color = pixels.reshape(-1, 3).mean(dim=0).nan_to_num()
+    return color.round().to(torch.uint8).expand_as(view.image)
+
+
+def _share_in_view(scene: Scene, camera: Camera) -> float:
+    """Of the Gaussians, those whose centres lie in the image and before the camera."""
+    means = scene.gaussians.means
+    pose = camera.world_to_camera.to(means)
+    places = means @ pose[:3, :3].T + pose[:3, 3]
+    pixels = places @ camera.K.to(means).T
+    x, y, depth = (pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2], places[:, 2])
+    inside = (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return float(inside.float().mean())

@@ -1,0 +1,303 @@
+"""Opening a splat that no nerfstudio run holds: a PLY file or a checkpoint of gsplat, and a file of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.options import RasterizeMode, SplatOptions
+from normlift_ns.raster.colors import view_colors
+from normlift_ns.scenes.colmap import model_folder, read_cameras, read_images, read_points
+from normlift_ns.scenes.frames import Frame, World, check_frames, find_masks, find_photographs, moved, sized
+from normlift_ns.scenes.gsplat_checkpoint import GsplatCheckpoint, read_gsplat
+from normlift_ns.scenes.match import LEAST_PSNR, mean_psnr
+from normlift_ns.scenes.photographs import PhotographViews
+from normlift_ns.scenes.ply import read_ply
+from normlift_ns.scenes.similarity import gsplat_normalization, read_world_transform
+from normlift_ns.scenes.splat import Splat
+from normlift_ns.scenes.split import held_out_names
+from normlift_ns.scenes.transforms import read_transforms, relative_name
+
+BACKGROUNDS = {"black": torch.zeros(3), "white": torch.ones(3)}
+_FEW_POINTS = 4
+_CHECKPOINTS = (".pt", ".pth", ".ckpt")
+
+
+@dataclass(frozen=True)
+class SplatScene:
+    """A `Scene`: a splat and its photographs, without any nerfstudio run."""
+
+    splat: Splat
+    train: PhotographViews
+    held_out: PhotographViews
+    name: str
+    checkpoint_path: Path
+    """The PLY file, the first checkpoint of gsplat, or the checkpoint of a lifted run."""
+    step: int
+    """Of the training; 0 where nothing tells."""
+    runs_dir: Path
+    photographs: Path
+    """Folder that names of photographs are relative to."""
+    identity: Mapping[str, Any]
+    rasterize_mode: RasterizeMode
+    background_name: str
+    """black or white."""
+
+    renderer = None
+    """normlift_ns draws it."""
+    has_harmonics = True
+
+    @property
+    def gaussians(self) -> GaussianScene:
+        """The N Gaussians, activated."""
+        return self.splat.activated
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """As trained, by splatfacto's names."""
+        return self.splat.parameters
+
+    @property
+    def background(self) -> Float[Tensor, " 3"]:
+        """RGB in 0..1 behind the Gaussians."""
+        return BACKGROUNDS[self.background_name]
+
+    def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
+        """RGB >= 0 of every Gaussian as the camera sees it."""
+        coefficients = torch.cat([self.splat.features_dc[:, None], self.splat.features_rest], dim=1)
+        return view_colors(self.splat.means, coefficients, camera, self.splat.degree)
+
+
+class _Cameras(NamedTuple):
+    """What a file of cameras says."""
+
+    frames: list[Frame]
+    """All photographs in the order of their files, in the file's world."""
+    held_out: frozenset[str]
+    source: Path
+    folder: Path
+    """Of the dataset."""
+    to_splat: World | None
+    """By --world-transform."""
+
+
+def open_splat(
+    path: str | Path, options: SplatOptions, *, say: Callable[[str], None] = lambda text: None
+) -> SplatScene:
+    """A trained splat and its photographs.
+
+    Args:
+        path: a PLY file of Inria's trainer, gsplat or ns-export, or ckpt_<step>_rank<r>.pt of gsplat's simple_trainer.
+        options: where its cameras and photographs are.
+        say: called with a sentence for everything that had to be assumed, for example `print`.
+    Raises:
+        FileNotFoundError: a file or photograph is missing.
+        ValueError: a file that cannot be read, that does not fit the others or that is no splat.
+
+    >>> from normlift_ns import SplatOptions, open_run, open_splat
+    >>> run = open_run(config)
+    >>> rows = run.export(folder / "splat.ply")
+    >>> transforms, world = run.scene.location.folder / "transforms.json", config.parent / "dataparser_transforms.json"
+    >>> scene = open_splat(folder / "splat.ply", SplatOptions(transforms=transforms, world_transform=world))
+    >>> len(scene.gaussians) == len(rows), len(scene.train)
+    (True, 14)
+    """
+    path = Path(path).absolute()
+    cameras = _read_camera_file(options)
+    frames = [sized(frame, cameras.source) for frame in cameras.frames]
+    checkpoint = read_gsplat(path) if path.suffix in _CHECKPOINTS else None
+    splat, mode = read_ply(path) if checkpoint is None else (checkpoint.splat, None)
+    held_out = cameras.held_out
+    if options.test_every is not None or len(options.holdout) > 0:
+        names = [frame.name for frame in frames]
+        held_out = held_out_names(names, test_every=options.test_every, holdout=options.holdout)
+    if len(held_out) == len(frames) and options.views == "train":
+        raise ValueError(f"All {len(frames)} photographs are held out, none is left to lift; give --views all.")
+    for text in _assumptions(path, options, mode, held_out, frames, cameras):
+        say(text)
+    worlds = _worlds(checkpoint, options, cameras)
+
+    def placed(world: World) -> SplatScene:
+        there = moved(frames, world)
+        if checkpoint is not None and checkpoint.pose_adjust is not None:
+            there = _adjusted(there, held_out, checkpoint.pose_adjust, path)
+        background = BACKGROUNDS[options.background]
+        kept = [frame for frame in there if options.views == "all" or frame.name not in held_out]
+        rest = [frame for frame in there if options.views == "train" and frame.name in held_out]
+        step = 0 if checkpoint is None else checkpoint.step
+        return SplatScene(
+            splat,
+            PhotographViews(kept, background),
+            PhotographViews(rest, background),
+            cameras.folder.name or "splat",
+            path,
+            step,
+            Path("outputs").absolute(),
+            cameras.folder,
+            {"source_splat": str(path), "source_cameras": str(cameras.source), "source_step": step},
+            options.rasterize_mode or mode or "classic",
+            options.background,
+        )
+
+    return _best(placed, worlds, say)
+
+
+def _best(
+    placed: Callable[[World], SplatScene],
+    worlds: Sequence[World],
+    say: Callable[[str], None],
+) -> SplatScene:
+    """The scene in the first world that its photographs confirm; if none does, in that which fits best."""
+    scene = placed(worlds[0])
+    if len(worlds) == 1 or (best := mean_psnr(scene)) >= LEAST_PSNR:
+        return scene
+    for world in worlds[1:]:
+        other = placed(world)
+        if (psnr := mean_psnr(other)) > best + 1:
+            scene, best = other, psnr
+            say("The trainer's axes point the other way; turned by half a turn, the splat fits its photographs.")
+    return scene
+
+
+def _read_camera_file(options: SplatOptions) -> _Cameras:
+    given = {"--colmap": options.colmap, "--transforms": options.transforms}
+    count = sum(value is not None for value in given.values())
+    if count != 1:
+        raise ValueError(
+            f"A splat needs one file of cameras, got {'two' if count else 'none'}: give the folder of a COLMAP project "
+            "with --colmap, or a transforms.json with --transforms."
+        )
+    for name, folder in (("--images", options.images), ("--masks", options.masks)):
+        if folder is not None and not folder.is_dir():
+            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give the folder of the files.")
+    cameras = _colmap(options, options.colmap) if options.colmap is not None else _transforms(options)
+    check_frames(cameras.frames, cameras.source)
+    return cameras
+
+
+def _transforms(options: SplatOptions) -> _Cameras:
+    path = Path(options.transforms or "").absolute()
+    path = path / "transforms.json" if path.is_dir() else path
+    found = read_transforms(path, options.images, options.masks)
+    world = options.world_transform
+    to_splat = None if world is None else read_world_transform(world, found.applied, found.applied_scale)
+    return _Cameras(found.frames, found.held_out, path, path.parent, to_splat)
+
+
+def _colmap(options: SplatOptions, folder: Path) -> _Cameras:
+    folder = folder.absolute()
+    model = model_folder(folder)
+    cameras, registered = read_cameras(model), read_images(model)
+    lost = [image for image in registered if image.camera not in cameras]
+    if lost or len(registered) == 0:
+        what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
+        raise ValueError(
+            f"{model} has {len(cameras)} cameras and {len(registered)} registered images: {what}. Expected a camera "
+            "for every image; copy the whole reconstruction again."
+        )
+    place = options.images or folder / "images"
+    if not place.is_dir():
+        raise FileNotFoundError(f"There is no folder {place} of photographs. Say where they are with --images.")
+    listed = [image.name for image in registered]
+    files = find_photographs(listed, place.absolute(), model, "say where the photographs are with --images")
+    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
+    base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
+    frames = [
+        Frame(file, relative_name(file, base), image.pose, cameras[image.camera], mask)
+        for image, file, mask in zip(registered, files, masks)
+    ]
+    to_splat = None if options.world_transform is None else read_world_transform(options.world_transform)
+    return _Cameras(frames, frozenset(), model, base, to_splat)
+
+
+def _worlds(
+    checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: _Cameras
+) -> Sequence[World]:
+    """From the world of the cameras to that of the splat; several where only photographs can tell."""
+    if cameras.to_splat is not None:
+        return [cameras.to_splat]
+    if checkpoint is None or not options.gsplat_normalize:
+        return [World(np.eye(4)[:3], 1.0)]
+    if options.colmap is None:
+        raise ValueError(
+            "gsplat's trainer normalized the world of the splat by the points of its COLMAP project, so a "
+            "transforms.json is not enough. Give the project with --colmap; or --world-transform with the map that you "
+            "know; or --gsplat-normalize False, if the training had --no-normalize-world-space."
+        )
+    try:
+        points = read_points(cameras.source)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error} gsplat's trainer normalized the world by points3D.") from error
+    if len(points) < _FEW_POINTS:
+        raise ValueError(
+            f"{cameras.source} has {len(points)} points, so the normalization of gsplat's trainer cannot be computed "
+            "again. Give the project that the splat was trained with; or --gsplat-normalize False, if the training had "
+            "--no-normalize-world-space."
+        )
+    return gsplat_normalization(cameras.frames, points)
+
+
+def _adjusted(
+    frames: Sequence[Frame], held_out: frozenset[str], moves: Float[Tensor, "v 9"], path: Path
+) -> list[Frame]:
+    """The training views where gsplat's --pose_opt moved them."""
+    trained = [frame for frame in frames if frame.name not in held_out]
+    if len(trained) != len(moves):
+        eighth = len(frames) - len(range(0, len(frames), 8))
+        hint = " The trainer holds out every eighth: give --test-every 8." if len(moves) == eighth else ""
+        raise ValueError(
+            f"{path} moved the cameras of {len(moves)} training views (--pose_opt), but there are {len(trained)} of "
+            f"{len(frames)} photographs. Say which were held out with --test-every or --holdout.{hint}"
+        )
+    by_name = {}
+    for frame, move in zip(trained, moves.numpy()):
+        first, second = move[3:6] + [1, 0, 0], move[6:9] + [0, 1, 0]
+        x = first / np.linalg.norm(first)
+        y = second - (x @ second) * x
+        y /= np.linalg.norm(y)
+        rotation = np.stack([x, y, np.cross(x, y)])
+        opencv = frame.pose * [1, -1, -1, 1]
+        pose = np.concatenate(
+            [opencv[:, :3] @ rotation * [1, -1, -1], opencv[:, :3] @ move[:3, None] + opencv[:, 3:]], axis=1
+        )
+        by_name[frame.name] = replace(frame, pose=pose)
+    return [by_name.get(frame.name, frame) for frame in frames]
+
+
+def _assumptions(
+    path: Path,
+    options: SplatOptions,
+    mode: RasterizeMode | None,
+    held_out: frozenset[str],
+    frames: Sequence[Frame],
+    cameras: _Cameras,
+) -> list[str]:
+    """What nothing in the files says."""
+    texts = []
+    if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
+        texts.append(f"{path.name} says SplatRenderMode {mode}; --rasterize-mode {options.rasterize_mode} counts.")
+    if options.rasterize_mode is None and mode is None:
+        texts.append(f"{path.name} does not say how it was rasterized: taken for classic, see --rasterize-mode.")
+    texts.append(
+        "Weights are those of gsplat 1.4: a Gaussian covers at most 0.999 of a pixel. Inria's trainer stops at 0.99 and "
+        "puts the principal point in the middle; photographs with distortion are undistorted as ns-train does it."
+    )
+    if len(held_out) > 0:
+        lifted = "lifted too" if options.views == "all" else "not lifted"
+        texts.append(f"{len(held_out)} of {len(frames)} photographs were held out of the training; they are {lifted}.")
+    else:
+        texts.append(f"All {len(frames)} photographs are lifted; see --test-every and --holdout.")
+    if options.colmap is not None:
+        folder = options.images or cameras.folder / "images"
+        unused = sum(file.is_file() for file in folder.iterdir()) - len({f.file for f in frames if f.file.parent == folder})
+        if unused > 0:
+            texts.append(f"{unused} files in {folder} have no camera and are left out.")
+    return texts

@@ -1,0 +1,123 @@
+"""Splats in PLY files, as Inria's trainer, gsplat, ns-export and this package write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyParseError
+
+from normlift_ns.options import RasterizeMode
+from normlift_ns.scenes.splat import DEGREES, Splat, check_splat
+
+_ROWS = 2**18
+"""Gaussians read at a time: what is read lies in memory once, and this much twice."""
+_NEEDED = (
+    *"xyz",
+    *(f"f_dc_{i}" for i in range(3)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+_MODES: dict[str, RasterizeMode] = {"mip": "antialiased", "antialiased": "antialiased", "classic": "classic"}
+
+
+class PlySplat(NamedTuple):
+    """What a PLY file says."""
+
+    splat: Splat
+    rasterize_mode: RasterizeMode | None
+    """As the comment SplatRenderMode says; None: there is none."""
+
+
+def read_ply(path: Path) -> PlySplat:
+    """Reads a splat; properties may stand in any order, others than a splat's are ignored.
+
+    Memory: the Gaussians once, and the pages of the file that the system keeps.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no PLY file, a truncated one, no splat, a number of harmonics that fits no degree, values that
+            nothing could draw.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
+    try:
+        found = PlyData.read(str(path), mmap="c")
+    except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in the PLY "
+            "format; splat-transform turns other formats into it, for example: splat-transform scene.sog scene.ply"
+        ) from error
+    elements = {element.name: element for element in found.elements}
+    vertex = elements.get("vertex")
+    if vertex is None or vertex.count == 0:
+        raise ValueError(f"{path} has no vertices, so it is no splat. Give the PLY file of a trained splat.")
+    names = {item.name for item in vertex.properties}
+    if "packed_position" in names:
+        raise ValueError(
+            f"{path} is a compressed PLY file. Expand it first: splat-transform {path.name} scene.ply, then give that."
+        )
+    missing = [name for name in _NEEDED if name not in names]
+    if missing:
+        raise ValueError(
+            f"{path} is no splat: its {vertex.count:,} vertices have no {', '.join(missing)}. Expected the properties "
+            f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found {', '.join(sorted(names)[:12])}. Give the "
+            "PLY file that the splat's trainer or ns-export gaussian-splat wrote, not the point cloud it began with."
+        )
+    lists = [item.name for item in vertex.properties if item.name in _NEEDED and hasattr(item, "len_dtype")]
+    if lists:
+        raise ValueError(f"{path} is no splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+    splat = _read_columns(path, vertex.data, _rest_names(path, names))
+    check_splat(splat, path)
+    return PlySplat(splat, _mode(path, [*found.comments, *vertex.comments]))
+
+
+def _rest_names(path: Path, names: set[str]) -> list[str]:
+    """f_rest_0, f_rest_1, … in their order."""
+    count = sum(name.startswith("f_rest_") for name in names)
+    wanted = [f"f_rest_{i}" for i in range(count)]
+    if count % 3 != 0 or count // 3 not in DEGREES or not set(wanted) <= names:
+        fitting = ", ".join(f"{3 * k} (degree {degree})" for k, degree in DEGREES.items())
+        raise ValueError(
+            f"{path} has {count} properties f_rest_*, which fits no degree of spherical harmonics. Expected "
+            f"f_rest_0, f_rest_1, … and so on, as many as {fitting}. Export the scene again."
+        )
+    return wanted
+
+
+def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> Splat:
+    n, k = len(table), len(rest) // 3
+    groups = {
+        "means": ["x", "y", "z"],
+        "quats": [f"rot_{i}" for i in range(4)],
+        "scales": [f"scale_{i}" for i in range(3)],
+        "opacities": ["opacity"],
+        "features_dc": [f"f_dc_{i}" for i in range(3)],
+    }
+    columns = {name: torch.empty(n, len(group)) for name, group in groups.items()}
+    harmonics = torch.empty(n, k, 3)
+    for start in range(0, n, _ROWS):
+        rows = table[start : start + _ROWS]
+        for name, group in groups.items():
+            for i, column in enumerate(group):
+                columns[name].numpy()[start : start + len(rows), i] = rows[column]
+        for i, column in enumerate(rest):  # all of red, then green, then blue
+            harmonics.numpy()[start : start + len(rows), i % k, i // k] = rows[column]
+    return Splat(**columns, features_rest=harmonics)
+
+
+def _mode(path: Path, comments: list[str]) -> RasterizeMode | None:
+    for comment in comments:
+        key, _, value = comment.partition(":")
+        if key.strip().lower() == "splatrendermode":
+            mode = value.strip().lower()
+            if mode not in _MODES:
+                raise ValueError(
+                    f"{path} says SplatRenderMode: {value.strip()}, expected one of {', '.join(_MODES)}. Say how the "
+                    "scene was rasterized in its training with --rasterize-mode classic or antialiased."
+                )
+            return _MODES[mode]
+    return None

@@ -1,0 +1,104 @@
+"""A splat and its cameras in the directory of a lifted run: what opens it again without the files it came from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import torch
+
+from normlift_ns.options import RasterizeMode
+from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
+from normlift_ns.scenes.frames import check_frames
+from normlift_ns.scenes.opening import BACKGROUNDS, SplatScene
+from normlift_ns.scenes.photographs import PhotographViews
+from normlift_ns.scenes.splat import from_parameters
+from normlift_ns.scenes.transforms import read_json, read_transforms, write_transforms
+
+SCENE_FILE, TRANSFORMS_FILE, CHECKPOINT_FOLDER = "splat.json", "transforms.json", "nerfstudio_models"
+_EXPECTED = "the file that ns-normlift wrote beside config.yml; copy the whole run again"
+
+
+class _Saved(msgspec.Struct):
+    name: str
+    rasterize_mode: RasterizeMode
+    background: Literal["black", "white"]
+    photographs: str
+    identity: dict[str, Any]
+
+
+def save_splat(folder: Path, scene: SplatScene) -> None:
+    """Writes splat.json and the cameras, transforms.json, into the folder of a run."""
+    write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
+    saved = _Saved(
+        scene.name, scene.rasterize_mode, scene.background_name, str(scene.photographs), dict(scene.identity)
+    )
+    (folder / SCENE_FILE).write_text(json.dumps(msgspec.to_builtins(saved), indent=2) + "\n", "utf8")
+
+
+def checkpoint_of(scene: SplatScene) -> dict[str, Any]:
+    """What splatfacto loads: step and parameters.
+
+    Without spherical harmonics splatfacto takes colours for logits, so the first degree is added, all zeros.
+    """
+    parameters = scene.parameters
+    if scene.splat.degree == 0:
+        parameters["features_rest"] = torch.zeros(len(scene.splat), 3, 3)
+    return {
+        "step": scene.step,
+        "pipeline": {f"_model.gauss_params.{name}": parameters[name] for name in GAUSSIAN_PARAMETERS},
+    }
+
+
+def is_saved_splat(run_dir: Path) -> bool:
+    """Whether the run came from a splat without a nerfstudio run."""
+    return (run_dir / SCENE_FILE).is_file()
+
+
+def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int | None = None) -> SplatScene:
+    """The splat of a lifted run.
+
+    Args:
+        data: folder where the photographs are now, if they were moved.
+        load_step: step of the checkpoint; None: the last.
+    Raises:
+        FileNotFoundError, ValueError: a file that is missing or damaged; the message names it.
+    """
+    path = run_dir / SCENE_FILE
+    try:
+        saved = msgspec.convert(read_json(path, _EXPECTED), _Saved)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{path} has another form than expected: {error}. Expected {_EXPECTED}.") from error
+    checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_FOLDER, load_step))
+    parameters = {name: checkpoint.model[f"gauss_params.{name}"] for name in GAUSSIAN_PARAMETERS}
+    if data is not None and not data.is_dir():
+        raise FileNotFoundError(
+            f"There is no folder {data}, given with --data. Expected the folder that {saved.photographs} was before."
+        )
+    found = read_transforms(
+        run_dir / TRANSFORMS_FILE,
+        None if data is None else data.absolute(),
+        base=Path(saved.photographs),
+        advice="say where their folder is with --data",
+    )
+    check_frames(found.frames, run_dir / TRANSFORMS_FILE)
+    background = BACKGROUNDS[saved.background]
+    train, held_out = (
+        PhotographViews([frame for frame in found.frames if (frame.name in found.held_out) == out], background)
+        for out in (False, True)
+    )
+    return SplatScene(
+        from_parameters(parameters, checkpoint.path),
+        train,
+        held_out,
+        saved.name,
+        checkpoint.path,
+        checkpoint.step,
+        run_dir.parents[2] if len(run_dir.parents) > 2 else run_dir.parent,
+        Path(saved.photographs) if data is None else data.absolute(),
+        saved.identity,
+        saved.rasterize_mode,
+        saved.background,
+    )

@@ -1,0 +1,127 @@
+"""Maps from the world of the cameras to the world of the splat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from normlift_ns.scenes.frames import Frame, World
+from normlift_ns.scenes.transforms import read_json
+
+_TOLERANCE = 1e-3
+"""How far a similarity may be from one: files round."""
+_EXPECTED = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
+
+
+def read_world_transform(
+    path: Path, applied: Float[np.ndarray, "4 4"] | None = None, applied_scale: float = 1.0
+) -> World:
+    """The similarity that a file holds.
+
+    Args:
+        applied, applied_scale: for dataparser_transforms.json, which starts from the world of the capture: from there
+            to the world of the cameras, as their own file says.
+    Raises:
+        FileNotFoundError, ValueError: no such file, other content, or no similarity.
+    """
+    try:
+        if path.suffix == ".npy" and path.is_file():
+            values: Any = np.load(path, allow_pickle=False).tolist()
+        elif path.suffix == ".txt" and path.is_file():
+            values = np.loadtxt(path).tolist()
+        else:
+            values = read_json(path, _EXPECTED)
+        if not isinstance(values, dict):
+            return similarity(np.array(values, dtype=float), str(path))
+        matrix = np.eye(4)
+        matrix[:3] = np.array(values["transform"], dtype=float)[:3]
+        if applied is not None:
+            matrix = matrix @ np.linalg.inv(applied)
+        scale = float(values["scale"]) / applied_scale
+    except (KeyError, TypeError, IndexError, EOFError, OverflowError, np.linalg.LinAlgError) as error:
+        raise ValueError(f"{path} holds no transform ({type(error).__name__}: {error}). Expected {_EXPECTED}.") from error
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{path} holds no transform ({error}). Expected {_EXPECTED}.") from error
+    similarity(matrix * scale + np.diag([0, 0, 0, 1 - scale]), str(path))
+    return World(matrix[:3], scale, single=True)
+
+
+def similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World:
+    """A matrix in its parts.
+
+    Raises:
+        ValueError: it is no rotation, scale and translation.
+    """
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"{source} holds numbers of shape {matrix.shape} or not finite. Expected {_EXPECTED}.")
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    last = np.abs(matrix[3] - [0, 0, 0, 1]).max()
+    if scale <= 0 or last > _TOLERANCE or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > _TOLERANCE:
+        raise ValueError(
+            f"{source} holds no similarity: {matrix.tolist()}. Expected one rotation without mirror, one scale for all "
+            "axes and a translation, with 0 0 0 1 in the last row."
+        )
+    return World(matrix[:3] / scale, scale)
+
+
+def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) -> list[World]:
+    """How gsplat's simple_trainer turns, scales and flips the world of a COLMAP project, which it does not save.
+
+    The steps of its datasets/normalize.py and datasets/colmap.py (1.5): cameras stand upright around the origin at a
+    median distance of 1, the points' principal axes become the axes, and the half with more points goes to the bottom.
+
+    Args:
+        frames: all registered images, in the order of their names.
+        points: of the reconstruction, at least four.
+    Returns:
+        The trainer's similarity, and then the three others that differ by half a turn about an axis: gsplat before
+        1.5 did not flip, and the signs of the axes depend on the linear algebra library of the training.
+    """
+    poses = np.array([np.concatenate([frame.pose, [[0, 0, 0, 1]]]) for frame in frames]) * [1, -1, -1, 1]
+    upright = _upright(poses)
+    turned = _principal_axes(_apply(upright, points.astype(np.float32))) @ upright
+    height = _apply(turned, points.astype(np.float32))[:, 2]
+    half_turns = [np.diag(signs) for signs in ([1, 1, 1, 1], [1, -1, -1, 1], [-1, 1, -1, 1], [-1, -1, 1, 1])]
+    if np.median(height) > np.mean(height):
+        half_turns[:2] = half_turns[1::-1]
+    return [similarity(half_turn @ turned, "the normalization") for half_turn in half_turns]
+
+
+def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The mean up axis of cameras in OpenCV convention goes to -y, what they look at to the origin."""
+    up = -poses[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    axis, cosine = np.cross(up, [0.0, -1.0, 0.0]), -up[1]
+    if cosine > -1:
+        skew = np.cross(np.eye(3), axis)
+        rotation = np.eye(3) + skew + skew @ skew / (1 + cosine)
+    else:
+        rotation = np.diag([-1.0, 1.0, 1.0])
+    centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
+    nearest = centres - (forward * centres).sum(axis=1)[:, None] * forward  # of the viewing ray to the origin
+    shift = -np.median(nearest, axis=0)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, shift
+    matrix[:3] /= np.median(np.linalg.norm(centres + shift, axis=1))
+    return matrix
+
+
+def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
+    """The median of the points goes to the origin, their widest direction to x, their narrowest to z."""
+    centre = np.median(points, axis=0)
+    axes = np.linalg.eigh(np.cov(points - centre, rowvar=False))[1][:, ::-1].copy()
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = axes.T, -axes.T @ centre
+    return matrix

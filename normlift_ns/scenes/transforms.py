@@ -1,0 +1,245 @@
+"""transforms.json: cameras in the format of nerfstudio, instant-ngp and Blender's synthetic scenes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from normlift_ns.scenes.frames import Frame, Intrinsics, find_masks, find_photographs, photograph_size
+
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+
+
+class _Camera(msgspec.Struct):
+    """What may stand in the file for all frames, or in a frame."""
+
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    distortion_params: list[float] | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    camera_model: str | None = None
+
+
+class _Frame(_Camera, kw_only=True):
+    file_path: str
+    transform_matrix: list[list[float]]
+    mask_path: str | None = None
+
+
+class _File(_Camera, kw_only=True):
+    frames: list[_Frame]
+    applied_transform: list[list[float]] | None = None
+    applied_scale: float = 1.0
+    train_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+
+
+@dataclass(frozen=True)
+class TransformsFile:
+    """What a transforms.json says."""
+
+    frames: list[Frame]
+    """In the order of their files, as nerfstudio sorts them."""
+    held_out: frozenset[str]
+    """Names of the frames that the file keeps from the training; most files keep none."""
+    applied: Float[np.ndarray, "4 4"]
+    """From the world of the capture to that of the file, as ns-process-data turned it."""
+    applied_scale: float
+
+
+def read_json(path: Path, expected: str) -> Any:
+    """The values of a JSON file.
+
+    Raises:
+        FileNotFoundError, ValueError: no file, no JSON, or values nested too deeply; the message names it.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file {path}. Expected {expected}.")
+    text = path.read_bytes()
+    try:
+        return msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        found = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
+        reason = str(error) if found is None else f"it contains {found}"
+        raise ValueError(f"{path} is no valid JSON ({reason}). Expected {expected}.") from error
+
+
+def read_transforms(
+    path: Path,
+    images: Path | None = None,
+    masks: Path | None = None,
+    *,
+    base: Path | None = None,
+    advice: str = "say where the images are with --images",
+) -> TransformsFile:
+    """Frames of a transforms.json; photographs are found, but not opened, unless a size is missing.
+
+    Args:
+        path: the file, or the folder that holds it.
+        images, masks: folders to take the photographs and masks from, instead of those that the file names.
+        base: folder that names are relative to; None: that of the file, or the one above `images`.
+        advice: what to do about missing photographs.
+    Raises:
+        FileNotFoundError: no such file, or a photograph or mask is missing.
+        ValueError: no JSON, another schema, a camera model that cannot be undistorted here.
+    """
+    path = path / "transforms.json" if path.is_dir() else path
+    expected = "a transforms.json as nerfstudio, instant-ngp or Blender's synthetic scenes have it"
+    values = read_json(path, expected)
+    try:
+        found = msgspec.convert(values, _File)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise ValueError(f"{path} has another form than expected: {error}. Expected {expected}.") from error
+    place = path.parent if base is None else base
+    listed = [relative_name(Path(frame.file_path), place) for frame in found.frames]
+    files = find_photographs(listed, place if images is None else images, path, advice)
+    names = listed
+    if base is None:
+        names = [relative_name(file, (place if images is None else images.parent).absolute()) for file in files]
+    frames = [
+        Frame(file, name, _pose(entry, path), _intrinsics(found, entry, file, path), mask)
+        for entry, file, name, mask in zip(found.frames, files, names, _masks(found, place, images, masks, path))
+    ]
+    trained = None if found.train_filenames is None else set(map(Path, found.train_filenames))
+    held_out = [trained is not None and Path(entry.file_path) not in trained for entry in found.frames]
+    return TransformsFile(
+        sorted(frames, key=lambda frame: frame.file),
+        frozenset(name for name, out in zip(names, held_out) if out),
+        _applied(found, path),
+        found.applied_scale,
+    )
+
+
+def relative_name(file: Path, folder: Path) -> str:
+    """The file relative to the folder, or as it is if it lies elsewhere; with forward slashes."""
+    return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
+
+
+def _masks(
+    found: _File, place: Path, images: Path | None, masks: Path | None, path: Path
+) -> Sequence[Path] | Sequence[None]:
+    named = [frame.mask_path for frame in found.frames]
+    if masks is not None:
+        return find_masks([frame.file_path for frame in found.frames], masks)
+    given = [name for name in named if name is not None]
+    if len(given) == 0:
+        return [None] * len(named)
+    if len(given) < len(named):
+        bare = next(frame.file_path for frame in found.frames if frame.mask_path is None)
+        raise ValueError(f"{path} names masks for some images, but none for {bare}. Expected one for each, or none.")
+    listed = [relative_name(Path(name), place) for name in given]
+    folder = place if images is None or not (images / listed[0]).is_file() else images
+    return find_photographs(listed, folder, path, "say where the masks are with --masks")
+
+
+def _pose(frame: _Frame, path: Path) -> Float[np.ndarray, "3 4"]:
+    rows = frame.transform_matrix
+    if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows):
+        raise ValueError(
+            f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4. Expected a camera-to-world matrix."
+        )
+    return np.array(rows[:3])
+
+
+def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrinsics:
+    """As nerfstudio takes them: what stands in the file counts for all frames, what is missing there stands in them."""
+
+    def value(name: str) -> Any:
+        found = getattr(common, name)
+        return getattr(frame, name) if found is None else found
+
+    model = value("camera_model") or "OPENCV"
+    if model not in _PERSPECTIVE:
+        raise ValueError(
+            f"{path}: the camera_model is {model}; read are {', '.join(_PERSPECTIVE)}. Undistort the images, train the "
+            "scene on those, and give their cameras."
+        )
+    size = (value("w"), value("h"))
+    width, height = photograph_size(file) if None in size else size
+    if not (float(width).is_integer() and float(height).is_integer()):
+        raise ValueError(f"{path}: w and h of {frame.file_path} are {width} and {height}, expected whole numbers.")
+    fx, fy = value("fl_x"), value("fl_y")
+    if fx is None and value("camera_angle_x") is not None:
+        fx = 0.5 * width / math.tan(0.5 * value("camera_angle_x"))
+    if fy is None and value("camera_angle_y") is not None:
+        fy = 0.5 * height / math.tan(0.5 * value("camera_angle_y"))
+    if fx is None:
+        raise ValueError(f"{path} has neither fl_x nor camera_angle_x for {frame.file_path}. Expected a focal length.")
+    cx, cy = value("cx"), value("cy")
+    return Intrinsics(
+        fx,
+        fx if fy is None else fy,
+        width / 2 if cx is None else cx,
+        height / 2 if cy is None else cy,
+        int(width),
+        int(height),
+        *_distortion(common, frame, path),
+    )
+
+
+def _distortion(common: _File, frame: _Frame, path: Path) -> tuple[float, ...]:
+    """k1, k2, k3, p1, p2: of the file if any stands there, else of the frame."""
+    names = ("k1", "k2", "k3", "k4", "p1", "p2")
+    holder = common if any(getattr(common, name) is not None for name in (*names, "distortion_params")) else frame
+    values = [getattr(holder, name) or 0.0 for name in names]
+    if holder.distortion_params is not None:
+        values = [*holder.distortion_params, *[0.0] * 6][:6]
+    k1, k2, k3, k4, p1, p2 = values
+    if k4 != 0:
+        raise ValueError(
+            f"{path}: {frame.file_path} has the distortion k4 = {k4:g}; only k1, k2, k3, p1 and p2 can be undone. "
+            "Undistort the images, train the scene on those, and give their cameras."
+        )
+    return k1, k2, k3, p1, p2
+
+
+def _applied(found: _File, path: Path) -> Float[np.ndarray, "4 4"]:
+    """nerfstudio's own rule: folders of an old ns-process-data do not say what was applied."""
+    rows = found.applied_transform
+    if rows is None and (path.parent / "colmap/sparse/0").exists():
+        rows = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+    matrix = np.eye(4)
+    if rows is not None:
+        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not np.isfinite(rows).all():
+            raise ValueError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
+        matrix[:3] = rows[:3]
+    return matrix
+
+
+def write_transforms(path: Path, frames: Sequence[Frame], held_out: Sequence[Frame]) -> None:
+    """Writes frames for nerfstudio-data, which sorts them by their files and reads them as float32."""
+    splits = {"train_filenames": frames, "val_filenames": held_out, "test_filenames": held_out}
+    content: dict[str, Any] = {"camera_model": "OPENCV"}
+    if len(held_out) > 0:
+        content |= {name: [str(frame.file) for frame in part] for name, part in splits.items()}
+    content["frames"] = [_entry(frame) for frame in sorted((*frames, *held_out), key=lambda frame: frame.file)]
+    path.write_text(json.dumps(content, indent=1) + "\n", "utf8")
+
+
+def _entry(frame: Frame) -> dict[str, Any]:
+    camera = frame.intrinsics
+    pose = torch.from_numpy(np.concatenate([frame.pose, [[0.0, 0.0, 0.0, 1.0]]])).float().tolist()
+    numbers = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2"), camera))
+    mask = {} if frame.mask is None else {"mask_path": str(frame.mask)}
+    return {"file_path": str(frame.file), **mask, **numbers, "transform_matrix": pose}
