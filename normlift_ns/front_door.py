@@ -37,7 +37,7 @@ from normlift_ns.stages import Report
 
 
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
-    """A trained splatfacto run, or a lifted one, from any working directory. For a splat without a run see `open_splat`.
+    """A trained splatfacto run or a lifted one, from any working directory. A splat without a run: see `open_splat`.
 
     Args:
         load_config: config.yml of the run.
@@ -165,8 +165,7 @@ def lift_run(
         scene = open_scene(scene, data=data, load_step=load_step)
     if not isinstance(scene, NerfstudioScene | SplatScene):
         raise TypeError(
-            "lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got "
-            f"{type(scene).__name__}"
+            f"lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got {type(scene).__name__}"
         )
     run_dir = run_directory(scene.runs_dir if output_dir is None else Path(output_dir), scene.name, timestamp)
     refuse_existing(run_dir, overwrite)

@@ -11,6 +11,8 @@ from typing import Any, Literal, get_args
 
 RasterizeMode = Literal["classic", "antialiased"]
 """How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
+Background = Literal["black", "white"]
+"""What is behind a splat without a nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
 """How directions are stored: the evidence itself (exact), float16, or float16 coordinates in a basis."""
 Rule = Literal["cosine", "lerf", "margin"]
@@ -126,7 +128,7 @@ class SplatOptions:
     rasterize_mode: RasterizeMode | None = None
     """How the splat was rasterized in its training: classic or antialiased. By default as the PLY file says, else
     classic."""
-    background: Literal["black", "white"] = "black"
+    background: Background = "black"
     """What is behind the splat, and behind photographs with an alpha channel."""
 
     def __post_init__(self) -> None:
@@ -136,7 +138,7 @@ class SplatOptions:
         for name, known in (
             ("views", ("train", "all")),
             ("rasterize_mode", (None, *get_args(RasterizeMode))),
-            ("background", ("black", "white")),
+            ("background", get_args(Background)),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")

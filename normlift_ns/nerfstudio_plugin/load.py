@@ -20,11 +20,11 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.nerfstudio_plugin.appearance import LOADED_STEP, background, shading_degree
-from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.nerfstudio_plugin.config import RunLocation, locate, read_config, rerooted, stored_data
 from normlift_ns.nerfstudio_plugin.views import DatasetViews
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
+from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 
 _TRANSFORM_TOLERANCE = 1e-3
 

@@ -19,7 +19,6 @@ from normlift_ns.core.files import atomic_path
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
-from normlift_ns.scenes.checkpoint import numpy_numbers
 from normlift_ns.nerfstudio_plugin.config import stored_data
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
@@ -27,6 +26,7 @@ from normlift_ns.nerfstudio_plugin.views import image_name
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.runs.files import FIELD_FOLDER, cache_folder
 from normlift_ns.runs.question import save_question
+from normlift_ns.scenes.checkpoint import numpy_numbers
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig

@@ -17,7 +17,7 @@ from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, TRANSFORMS_FILE
 
 
 def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
-    """A config by which stock nerfstudio finds the cameras of the run in its own directory, and leaves them as they are.
+    """A config by which stock nerfstudio finds the cameras in the directory of the run, and leaves them as they are.
 
     All paths are absolute: there is no directory of a training that they could be relative to.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from gsplat.cuda._torch_impl import _spherical_harmonics
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,6 +20,8 @@ def view_colors(
     """
     if degree is None:
         return torch.sigmoid(coefficients[:, 0])
+    from gsplat.cuda._torch_impl import _spherical_harmonics  # noqa: PLC0415 (imports slowly)
+
     pose = camera.world_to_camera.to(means)
     centre = -pose[:3, :3].T @ pose[:3, 3]
     return (_spherical_harmonics(degree, means - centre, coefficients) + 0.5).clamp(min=0)

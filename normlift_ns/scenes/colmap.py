@@ -197,9 +197,8 @@ def _images_text(lines: list[str]) -> Iterator[tuple[str, list[float], list[floa
     for line in lines[::2]:  # the points of an image stand in the line after it, which may be empty
         if line == "":
             raise ValueError("an empty line where an image was expected")
-        _, *pose, camera, name = line.split(maxsplit=9)
-        numbers = list(map(float, pose))
-        yield name, numbers[:4], numbers[4:], int(camera)
+        _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+        yield name, list(map(float, (qw, qx, qy, qz))), list(map(float, (tx, ty, tz))), int(camera)
 
 
 def _points_binary(data: _Bytes) -> Iterator[tuple[int, tuple[float, ...]]]:

@@ -112,7 +112,9 @@ def photograph_size(file: Path) -> tuple[int, int]:
         with Image.open(file) as image:
             return image.size
     except FileNotFoundError:
-        raise FileNotFoundError(f"{file} is missing, which the cameras name. Say where the images are: --images.") from None
+        raise FileNotFoundError(
+            f"{file} is missing, which the cameras name. Say where the images are: --images."
+        ) from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"{file} cannot be read as an image ({error}). Copy it again from the capture.") from error
 

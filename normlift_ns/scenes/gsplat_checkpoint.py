@@ -78,8 +78,8 @@ def _rank_files(path: Path) -> tuple[Path, ...]:
     missing = sorted(set(range(max(ranks) + 1)) - set(ranks))
     if missing:
         raise FileNotFoundError(
-            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {', '.join(map(str, missing))}. Every rank "
-            "holds a share of the Gaussians; copy all files of the training."
+            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {', '.join(map(str, missing))}. Every "
+            "rank holds a share of the Gaussians; copy all files of the training."
         )
     return tuple(ranks[rank] for rank in sorted(ranks))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,20 +13,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.options import RasterizeMode, SplatOptions
+from normlift_ns.options import Background, RasterizeMode, SplatOptions
 from normlift_ns.raster.colors import view_colors
-from normlift_ns.scenes.colmap import model_folder, read_cameras, read_images, read_points
-from normlift_ns.scenes.frames import Frame, World, check_frames, find_masks, find_photographs, moved, sized
+from normlift_ns.scenes.cameras import Cameras, read_camera_file
+from normlift_ns.scenes.colmap import read_points
+from normlift_ns.scenes.frames import Frame, World, moved
 from normlift_ns.scenes.gsplat_checkpoint import GsplatCheckpoint, read_gsplat
 from normlift_ns.scenes.match import LEAST_PSNR, mean_psnr
 from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.scenes.ply import read_ply
-from normlift_ns.scenes.similarity import gsplat_normalization, read_world_transform
+from normlift_ns.scenes.similarity import gsplat_normalization
 from normlift_ns.scenes.splat import Splat
 from normlift_ns.scenes.split import held_out_names
-from normlift_ns.scenes.transforms import read_transforms, relative_name
 
-BACKGROUNDS = {"black": torch.zeros(3), "white": torch.ones(3)}
+BACKGROUNDS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
 _FEW_POINTS = 4
 _CHECKPOINTS = (".pt", ".pth", ".ckpt")
 
@@ -48,8 +48,7 @@ class SplatScene:
     """Folder that names of photographs are relative to."""
     identity: Mapping[str, Any]
     rasterize_mode: RasterizeMode
-    background_name: str
-    """black or white."""
+    background_name: Background
 
     renderer = None
     """normlift_ns draws it."""
@@ -76,19 +75,6 @@ class SplatScene:
         return view_colors(self.splat.means, coefficients, camera, self.splat.degree)
 
 
-class _Cameras(NamedTuple):
-    """What a file of cameras says."""
-
-    frames: list[Frame]
-    """All photographs in the order of their files, in the file's world."""
-    held_out: frozenset[str]
-    source: Path
-    folder: Path
-    """Of the dataset."""
-    to_splat: World | None
-    """By --world-transform."""
-
-
 def open_splat(
     path: str | Path, options: SplatOptions, *, say: Callable[[str], None] = lambda text: None
 ) -> SplatScene:
@@ -111,8 +97,8 @@ def open_splat(
     (True, 14)
     """
     path = Path(path).absolute()
-    cameras = _read_camera_file(options)
-    frames = [sized(frame, cameras.source) for frame in cameras.frames]
+    cameras = read_camera_file(options)
+    frames = cameras.frames
     checkpoint = read_gsplat(path) if path.suffix in _CHECKPOINTS else None
     splat, mode = read_ply(path) if checkpoint is None else (checkpoint.splat, None)
     held_out = cameras.held_out
@@ -167,60 +153,7 @@ def _best(
     return scene
 
 
-def _read_camera_file(options: SplatOptions) -> _Cameras:
-    given = {"--colmap": options.colmap, "--transforms": options.transforms}
-    count = sum(value is not None for value in given.values())
-    if count != 1:
-        raise ValueError(
-            f"A splat needs one file of cameras, got {'two' if count else 'none'}: give the folder of a COLMAP project "
-            "with --colmap, or a transforms.json with --transforms."
-        )
-    for name, folder in (("--images", options.images), ("--masks", options.masks)):
-        if folder is not None and not folder.is_dir():
-            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give the folder of the files.")
-    cameras = _colmap(options, options.colmap) if options.colmap is not None else _transforms(options)
-    check_frames(cameras.frames, cameras.source)
-    return cameras
-
-
-def _transforms(options: SplatOptions) -> _Cameras:
-    path = Path(options.transforms or "").absolute()
-    path = path / "transforms.json" if path.is_dir() else path
-    found = read_transforms(path, options.images, options.masks)
-    world = options.world_transform
-    to_splat = None if world is None else read_world_transform(world, found.applied, found.applied_scale)
-    return _Cameras(found.frames, found.held_out, path, path.parent, to_splat)
-
-
-def _colmap(options: SplatOptions, folder: Path) -> _Cameras:
-    folder = folder.absolute()
-    model = model_folder(folder)
-    cameras, registered = read_cameras(model), read_images(model)
-    lost = [image for image in registered if image.camera not in cameras]
-    if lost or len(registered) == 0:
-        what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
-        raise ValueError(
-            f"{model} has {len(cameras)} cameras and {len(registered)} registered images: {what}. Expected a camera "
-            "for every image; copy the whole reconstruction again."
-        )
-    place = options.images or folder / "images"
-    if not place.is_dir():
-        raise FileNotFoundError(f"There is no folder {place} of photographs. Say where they are with --images.")
-    listed = [image.name for image in registered]
-    files = find_photographs(listed, place.absolute(), model, "say where the photographs are with --images")
-    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
-    base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
-    frames = [
-        Frame(file, relative_name(file, base), image.pose, cameras[image.camera], mask)
-        for image, file, mask in zip(registered, files, masks)
-    ]
-    to_splat = None if options.world_transform is None else read_world_transform(options.world_transform)
-    return _Cameras(frames, frozenset(), model, base, to_splat)
-
-
-def _worlds(
-    checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: _Cameras
-) -> Sequence[World]:
+def _worlds(checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: Cameras) -> Sequence[World]:
     """From the world of the cameras to that of the splat; several where only photographs can tell."""
     if cameras.to_splat is not None:
         return [cameras.to_splat]
@@ -259,7 +192,7 @@ def _adjusted(
         )
     by_name = {}
     for frame, move in zip(trained, moves.numpy()):
-        first, second = move[3:6] + [1, 0, 0], move[6:9] + [0, 1, 0]
+        first, second = move[3:6] + np.eye(3)[0], move[6:9] + np.eye(3)[1]
         x = first / np.linalg.norm(first)
         y = second - (x @ second) * x
         y /= np.linalg.norm(y)
@@ -278,7 +211,7 @@ def _assumptions(
     mode: RasterizeMode | None,
     held_out: frozenset[str],
     frames: Sequence[Frame],
-    cameras: _Cameras,
+    cameras: Cameras,
 ) -> list[str]:
     """What nothing in the files says."""
     texts = []
@@ -287,8 +220,8 @@ def _assumptions(
     if options.rasterize_mode is None and mode is None:
         texts.append(f"{path.name} does not say how it was rasterized: taken for classic, see --rasterize-mode.")
     texts.append(
-        "Weights are those of gsplat 1.4: a Gaussian covers at most 0.999 of a pixel. Inria's trainer stops at 0.99 and "
-        "puts the principal point in the middle; photographs with distortion are undistorted as ns-train does it."
+        "Weights are those of gsplat 1.4: a Gaussian covers at most 0.999 of a pixel. Inria's trainer stops at 0.99 "
+        "and puts the principal point in the middle; photographs with distortion are undistorted as ns-train does it."
     )
     if len(held_out) > 0:
         lifted = "lifted too" if options.views == "all" else "not lifted"
@@ -297,7 +230,9 @@ def _assumptions(
         texts.append(f"All {len(frames)} photographs are lifted; see --test-every and --holdout.")
     if options.colmap is not None:
         folder = options.images or cameras.folder / "images"
-        unused = sum(file.is_file() for file in folder.iterdir()) - len({f.file for f in frames if f.file.parent == folder})
+        unused = sum(file.is_file() for file in folder.iterdir()) - len(
+            {f.file for f in frames if f.file.parent == folder}
+        )
         if unused > 0:
             texts.append(f"{unused} files in {folder} have no camera and are left out.")
     return texts

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import torch
 
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import Background, RasterizeMode
 from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
 from normlift_ns.scenes.frames import check_frames
 from normlift_ns.scenes.opening import BACKGROUNDS, SplatScene
@@ -24,7 +24,7 @@ _EXPECTED = "the file that ns-normlift wrote beside config.yml; copy the whole r
 class _Saved(msgspec.Struct):
     name: str
     rasterize_mode: RasterizeMode
-    background: Literal["black", "white"]
+    background: Background
     photographs: str
     identity: dict[str, Any]
 

@@ -42,7 +42,9 @@ def read_world_transform(
             matrix = matrix @ np.linalg.inv(applied)
         scale = float(values["scale"]) / applied_scale
     except (KeyError, TypeError, IndexError, EOFError, OverflowError, np.linalg.LinAlgError) as error:
-        raise ValueError(f"{path} holds no transform ({type(error).__name__}: {error}). Expected {_EXPECTED}.") from error
+        raise ValueError(
+            f"{path} holds no transform ({type(error).__name__}: {error}). Expected {_EXPECTED}."
+        ) from error
     except ValueError as error:
         if str(path) in str(error):
             raise
@@ -79,12 +81,19 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
     Args:
         frames: all registered images, in the order of their names.
         points: of the reconstruction, at least four.
+    Raises:
+        ValueError: the trainer's formula mirrors the world.
     Returns:
         The trainer's similarity, and then the three others that differ by half a turn about an axis: gsplat before
         1.5 did not flip, and the signs of the axes depend on the linear algebra library of the training.
     """
     poses = np.array([np.concatenate([frame.pose, [[0, 0, 0, 1]]]) for frame in frames]) * [1, -1, -1, 1]
     upright = _upright(poses)
+    if np.linalg.det(upright[:3, :3]) < 0:
+        raise ValueError(
+            "The mean up axis of the cameras is exactly +y, and gsplat's trainer mirrors such a world. Train the splat "
+            "again with --no-normalize-world-space, and give --gsplat-normalize False."
+        )
     turned = _principal_axes(_apply(upright, points.astype(np.float32))) @ upright
     height = _apply(turned, points.astype(np.float32))[:, 2]
     half_turns = [np.diag(signs) for signs in ([1, 1, 1, 1], [1, -1, -1, 1], [-1, 1, -1, 1], [-1, -1, 1, 1])]
@@ -106,7 +115,7 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
         skew = np.cross(np.eye(3), axis)
         rotation = np.eye(3) + skew + skew @ skew / (1 + cosine)
     else:
-        rotation = np.diag([-1.0, 1.0, 1.0])
+        rotation = np.diag([-1.0, 1.0, 1.0])  # a mirror, as it stands there
     centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
     nearest = centres - (forward * centres).sum(axis=1)[:, None] * forward  # of the viewing ray to the origin
     shift = -np.median(nearest, axis=0)

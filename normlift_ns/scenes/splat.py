@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -43,7 +42,7 @@ class Splat:
     @property
     def parameters(self) -> dict[str, Tensor]:
         """By the names that splatfacto gives them."""
-        return dict(vars(self))
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @property
     def degree(self) -> int:
@@ -81,8 +80,8 @@ def check_splat(splat: Splat, file: Path) -> None:
     if bool((splat.scales >= 0).all()) and extent > 0 and width > _WIDE * extent:
         raise ValueError(
             f"{file} seems to hold linear scales, between {float(splat.scales.min()):.3g} and "
-            f"{float(splat.scales.max()):.3g}: taken for logarithms, the median Gaussian would be {width:.3g} wide in a "
-            f"scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
+            f"{float(splat.scales.max()):.3g}: taken for logarithms, the median Gaussian would be {width:.3g} wide in "
+            f"a scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
         )
 
 

@@ -121,8 +121,8 @@ def read_transforms(
         Frame(file, name, _pose(entry, path), _intrinsics(found, entry, file, path), mask)
         for entry, file, name, mask in zip(found.frames, files, names, _masks(found, place, images, masks, path))
     ]
-    trained = None if found.train_filenames is None else set(map(Path, found.train_filenames))
-    held_out = [trained is not None and Path(entry.file_path) not in trained for entry in found.frames]
+    trained = None if found.train_filenames is None else {place / name for name in found.train_filenames}
+    held_out = [trained is not None and place / entry.file_path not in trained for entry in found.frames]
     return TransformsFile(
         sorted(frames, key=lambda frame: frame.file),
         frozenset(name for name, out in zip(names, held_out) if out),

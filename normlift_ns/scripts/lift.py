@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
@@ -17,6 +17,7 @@ from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
 if TYPE_CHECKING:
+    from normlift_ns.core.scene import Scene
     from normlift_ns.lifted_run import LiftedRun
     from normlift_ns.stages import Report
 
@@ -58,15 +59,13 @@ class NormLift:
     def main(self) -> LiftedRun:
         """Lifts, and returns the new run."""
         start = time.perf_counter()
-        splat = self._source()
+        self._check_source()
         from normlift_ns.front_door import lift_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.lifting import Export  # noqa: PLC0415
-        from normlift_ns.scenes.opening import open_splat  # noqa: PLC0415
 
-        scene = self.load_config if splat is None else open_splat(splat, self.splat, say=CONSOLE.print)
         with progress_bars() as report:
             run = lift_run(
-                scene,
+                self._trained(),
                 source=self.source,
                 lift=self.lift,
                 queries=self.queries,
@@ -84,33 +83,31 @@ class NormLift:
         CONSOLE.print(summary(run, time.perf_counter() - start, self.queries))
         return run
 
-    def _source(self) -> Path | None:
-        """The splat; None where a run of nerfstudio is lifted.
-
-        Raises:
-            ValueError: none of the three, or more than one; options that do not fit it.
-        """
+    def _check_source(self) -> None:
+        """Raises a ValueError unless one trained splat is given, and only options that fit it."""
         given = [path for path in (self.load_config, self.load_ply, self.load_gsplat) if path is not None]
         if len(given) != 1:
             raise ValueError(
                 f"Give one trained splat, got {len(given)}: --load-config with the config.yml of a splatfacto run, "
                 "--load-ply with a PLY file, or --load-gsplat with a checkpoint of gsplat's trainer."
             )
+        default = SplatOptions()
         if self.load_config is None:
-            for name in ("data", "load_step"):
-                if getattr(self, name) is not None:
-                    raise ValueError(
-                        f"--{name.replace('_', '-')} is for --load-config; for a splat say where the photographs are "
-                        "with --images."
-                    )
-            return given[0]
-        changed = [name for name, value in vars(self.splat).items() if value != getattr(SplatOptions(), name)]
-        if changed:
-            raise ValueError(
-                f"--{changed[0].replace('_', '-')} is for --load-ply and --load-gsplat; a run of nerfstudio brings its "
-                "own cameras."
-            )
-        return None
+            options, names, hint = self, ("data", "load_step"), "--load-config; for a splat see --images"
+        else:
+            options, names, hint = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
+        for name in names:
+            if getattr(options, name) != getattr(default, name, None):
+                raise ValueError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
+
+    def _trained(self) -> Path | Scene:
+        """The run, or the splat, opened."""
+        splat = self.load_ply or self.load_gsplat
+        if splat is None:
+            return cast(Path, self.load_config)
+        from normlift_ns.scenes.opening import open_splat  # noqa: PLC0415
+
+        return open_splat(splat, self.splat, say=CONSOLE.print)
 
 
 @contextmanager

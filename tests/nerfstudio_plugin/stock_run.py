@@ -34,8 +34,8 @@ from PIL import Image
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster import reference
+from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.projection import assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 

@@ -1,0 +1,83 @@
+"""Files of cameras, whatever wrote them: COLMAP projects and transforms.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from normlift_ns.options import SplatOptions
+from normlift_ns.scenes.colmap import model_folder, read_cameras, read_images
+from normlift_ns.scenes.frames import Frame, World, check_frames, find_masks, find_photographs, sized
+from normlift_ns.scenes.similarity import read_world_transform
+from normlift_ns.scenes.transforms import read_transforms, relative_name
+
+
+class Cameras(NamedTuple):
+    """What a file of cameras says."""
+
+    frames: list[Frame]
+    """All photographs in the order of their files, in the file's world."""
+    held_out: frozenset[str]
+    source: Path
+    folder: Path
+    """Of the dataset."""
+    to_splat: World | None
+    """By --world-transform."""
+
+
+def read_camera_file(options: SplatOptions) -> Cameras:
+    """The cameras that the options name, with photographs that exist.
+
+    Raises:
+        FileNotFoundError: a file, folder, photograph or mask is missing.
+        ValueError: none or two files of cameras, or one that cannot be read.
+    """
+    given = {"--colmap": options.colmap, "--transforms": options.transforms}
+    count = sum(value is not None for value in given.values())
+    if count != 1:
+        raise ValueError(
+            f"A splat needs one file of cameras, got {'two' if count else 'none'}: give the folder of a COLMAP project "
+            "with --colmap, or a transforms.json with --transforms."
+        )
+    for name, folder in (("--images", options.images), ("--masks", options.masks)):
+        if folder is not None and not folder.is_dir():
+            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give the folder of the files.")
+    cameras = _colmap(options, options.colmap) if options.colmap is not None else _transforms(options)
+    check_frames(cameras.frames, cameras.source)
+    return cameras._replace(frames=[sized(frame, cameras.source) for frame in cameras.frames])
+
+
+def _transforms(options: SplatOptions) -> Cameras:
+    path = Path(options.transforms or "").absolute()
+    path = path / "transforms.json" if path.is_dir() else path
+    found = read_transforms(path, options.images, options.masks)
+    world = options.world_transform
+    to_splat = None if world is None else read_world_transform(world, found.applied, found.applied_scale)
+    return Cameras(found.frames, found.held_out, path, path.parent, to_splat)
+
+
+def _colmap(options: SplatOptions, folder: Path) -> Cameras:
+    folder = folder.absolute()
+    model = model_folder(folder)
+    cameras, registered = read_cameras(model), read_images(model)
+    lost = [image for image in registered if image.camera not in cameras]
+    if lost or len(registered) == 0:
+        what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
+        raise ValueError(
+            f"{model} has {len(cameras)} cameras and {len(registered)} registered images: {what}. Expected a camera "
+            "for every image; copy the whole reconstruction again."
+        )
+    place = options.images or folder / "images"
+    if not place.is_dir():
+        raise FileNotFoundError(f"There is no folder {place} of photographs. Say where they are with --images.")
+    listed = [image.name for image in registered]
+    files = find_photographs(listed, place.absolute(), model, "say where the photographs are with --images")
+    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
+    base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
+    frames = [
+        Frame(file, relative_name(file, base), image.pose, cameras[image.camera], mask)
+        for image, file, mask in zip(registered, files, masks)
+    ]
+    to_splat = None if options.world_transform is None else read_world_transform(options.world_transform)
+    return Cameras(frames, frozenset(), model, base, to_splat)

@@ -1,0 +1,148 @@
+"""Files of splats and cameras, written as the tools of others write them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
+
+from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.splat import Splat
+
+NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+
+
+def random_splat(n: int = 200, degree: int = 3, seed: int = 0) -> Splat:
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=g)
+
+    rest = normal(n, (degree + 1) ** 2 - 1, 3)
+    return Splat(normal(n, 3), normal(n, 4), normal(n, 3) - 4, normal(n, 1), normal(n, 3), rest)
+
+
+def ply_columns(splat: Splat) -> dict[str, np.ndarray]:
+    columns = {name: splat.means[:, i] for i, name in enumerate("xyz")}
+    columns |= {name: torch.zeros(len(splat)) for name in ("nx", "ny", "nz")}
+    columns |= {f"f_dc_{i}": splat.features_dc[:, i] for i in range(3)}
+    k = splat.features_rest.shape[1]
+    columns |= {f"f_rest_{c * k + i}": splat.features_rest[:, i, c] for c in range(3) for i in range(k)}
+    columns["opacity"] = splat.opacities[:, 0]
+    columns |= {f"scale_{i}": splat.scales[:, i] for i in range(3)}
+    columns |= {f"rot_{i}": splat.quats[:, i] for i in range(4)}
+    return {name: value.numpy() for name, value in columns.items()}
+
+
+def write_ply(
+    path: Path,
+    columns: dict[str, np.ndarray],
+    *,
+    order: Sequence[str] | None = None,
+    comments: Sequence[str] = (),
+    text: bool = False,
+    byte_order: str = "<",
+    element: str = "vertex",
+) -> Path:
+    names = list(columns) if order is None else list(order)
+    table = np.empty(len(columns[names[0]]), [(name, columns[name].dtype.newbyteorder(byte_order)) for name in names])
+    for name in names:
+        table[name] = columns[name]
+    described = PlyElement.describe(table, element)
+    PlyData([described], text=text, byte_order=byte_order, comments=list(comments)).write(str(path))
+    return path
+
+
+def write_gsplat(path: Path, splat: Splat, *, step: int = 29999, **more: object) -> Path:
+    """As gsplat's simple_trainer saves it."""
+    splats = {
+        "means": splat.means,
+        "quats": splat.quats,
+        "scales": splat.scales,
+        "opacities": splat.opacities[:, 0],
+        "sh0": splat.features_dc[:, None],
+        "shN": splat.features_rest,
+    }
+    torch.save({"step": step, "splats": splats, **more}, path)
+    return path
+
+
+def rows_of(splat: Splat, rows: slice) -> Splat:
+    return Splat(**{name: value[rows] for name, value in splat.parameters.items()})
+
+
+def camera_parameters(model: str, c: Intrinsics) -> list[float]:
+    return {
+        "SIMPLE_PINHOLE": [c.fx, c.cx, c.cy],
+        "PINHOLE": [c.fx, c.fy, c.cx, c.cy],
+        "SIMPLE_RADIAL": [c.fx, c.cx, c.cy, c.k1],
+        "RADIAL": [c.fx, c.cx, c.cy, c.k1, c.k2],
+        "OPENCV": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2],
+        "OPENCV_FISHEYE": [c.fx, c.fy, c.cx, c.cy, 0.01, 0.0, 0.0, 0.0],
+    }[model]
+
+
+def write_colmap(
+    folder: Path,
+    frames: Sequence[Frame],
+    model: str = "OPENCV",
+    *,
+    binary: bool = True,
+    points: np.ndarray | None = None,
+) -> Path:
+    """sparse/0 of a COLMAP project, images in another order than their names'; one camera per image."""
+    place = folder / "sparse" / "0"
+    place.mkdir(parents=True)
+    rows = []
+    for i, frame in list(enumerate(frames, 1))[::-1]:
+        opencv = frame.pose[:, :3] * [1, -1, -1]
+        x, y, z, w = Rotation.from_matrix(opencv.T).as_quat()
+        rows.append((i, [w, x, y, z], (-opencv.T @ frame.pose[:, 3]).tolist(), Path(frame.name).name, frame.intrinsics))
+    points = np.zeros((0, 3)) if points is None else points
+    if binary:
+        _write_binary(place, rows, model, points)
+        return folder
+    cameras = [
+        f"{i} {model} {c.width} {c.height} " + " ".join(map(repr, map(float, camera_parameters(model, c))))
+        for i, _, _, _, c in rows
+    ]
+    images = [
+        line
+        for i, q, t, name, _ in rows
+        for line in (f"{i} " + " ".join(map(repr, map(float, [*q, *t]))) + f" {i} {name}", "1.0 2.0 -1 3.0 4.0 7")
+    ]
+    clouds = [f"{i} {x!r} {y!r} {z!r} 10 20 30 0.5 1 2 3 4" for i, (x, y, z) in enumerate(points.tolist(), 1)]
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", clouds)):
+        (place / f"{name}.txt").write_text("\n".join(["# a comment", "# another", *lines]) + "\n")
+    return folder
+
+
+def _write_binary(place: Path, rows: list, model: str, points: np.ndarray) -> None:
+    cameras = images = struct.pack("<Q", len(rows))
+    for i, q, t, name, c in rows:
+        parameters = camera_parameters(model, c)
+        cameras += struct.pack(f"<iiQQ{len(parameters)}d", i, NUMBERS[model], c.width, c.height, *parameters)
+        images += struct.pack("<I7dI", i, *q, *t, i) + name.encode() + b"\0"
+        images += struct.pack("<Q", 2) + struct.pack("<ddqddq", 1, 2, -1, 3, 4, 7)
+    clouds = struct.pack("<Q", len(points))
+    for i, place_of in enumerate(points.tolist(), 1):
+        clouds += struct.pack("<Q3d3BdQ", i, *place_of, 1, 2, 3, 0.5, 2) + struct.pack("<4i", 1, 2, 3, 4)
+    for name, data in (("cameras", cameras), ("images", images), ("points3D", clouds)):
+        (place / f"{name}.bin").write_bytes(data)
+
+
+def in_file_world(frames: Sequence[Frame], matrix: np.ndarray) -> list[Frame]:
+    """Frames whose camera file lies in another world: matrix maps that world to theirs."""
+    back = np.linalg.inv(matrix)
+    scale = np.cbrt(np.linalg.det(back[:3, :3]))
+    moved = []
+    for frame in frames:
+        centre = back[:3, :3] @ frame.pose[:, 3] + back[:3, 3]
+        moved.append(replace(frame, pose=np.column_stack([back[:3, :3] / scale @ frame.pose[:, :3], centre])))
+    return moved

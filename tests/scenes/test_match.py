@@ -1,0 +1,118 @@
+"""Photographs, cameras and Gaussians that belong together, and such that do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from normlift_ns import Camera, open_scene
+from normlift_ns.core.scene import View
+from normlift_ns.scenes.match import judge, match_photographs
+from tests.captures import needs_shared
+
+
+class Changed:
+    """A scene whose training views are changed."""
+
+    def __init__(self, scene, change) -> None:
+        self._scene, self.train = scene, _Views(scene.train, change)
+
+    def __getattr__(self, name: str):
+        return getattr(self._scene, name)
+
+
+class _Views:
+    def __init__(self, views, change) -> None:
+        self.views, self.change = views, change
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> View:
+        return self.change(self.views[index])
+
+
+def focal(factor: float):
+    scale = torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    return lambda view: view._replace(camera=replace(view.camera, K=view.camera.K * scale))
+
+
+def shifted(distance: float):
+    def change(view: View) -> View:
+        pose = view.camera.world_to_camera.clone()
+        pose[2, 3] += distance
+        return view._replace(camera=Camera(view.camera.K, pose, view.camera.width, view.camera.height))
+
+    return change
+
+
+def noisy(sigma: float):
+    def change(view: View) -> View:
+        noise = sigma * torch.randn(view.image.shape, generator=torch.Generator().manual_seed(0))
+        return view._replace(image=(view.image + noise).clamp(0, 255).to(torch.uint8))
+
+    return change
+
+
+@pytest.fixture(scope="module")
+def scene(trained: Path):
+    return open_scene(trained)
+
+
+def test_what_belongs_together_passes(scene) -> None:
+    match = match_photographs(scene)
+    assert match.psnr > 40  # the photographs are pictures of these very Gaussians
+    assert match.in_view > 0.5
+    assert match.grey_psnr < 20
+    assert judge(match) is None
+
+
+@pytest.mark.parametrize(("factor", "direction"), [(1.02, "shorter"), (0.98, "longer"), (1.05, "shorter")])
+def test_another_focal_length_is_noticed(scene, factor: float, direction: str) -> None:
+    warning = judge(match_photographs(Changed(scene, focal(factor))))
+    assert warning is not None
+    assert f"2% {direction} fit the photographs better" in warning
+
+
+def test_photographs_that_look_otherwise_are_warned_of(scene) -> None:
+    warning = judge(match_photographs(Changed(scene, noisy(25))))
+    assert warning is not None
+    assert "dB on three photographs of its training, less than the 24 dB" in warning
+
+
+def test_cameras_that_do_not_look_at_the_splat_are_refused(scene) -> None:
+    with pytest.raises(ValueError, match=r"do not look at this splat: at most 0.00% of its Gaussians"):
+        judge(match_photographs(Changed(scene, shifted(-1000))))
+
+
+def test_photographs_of_another_scene_are_refused(scene) -> None:
+    def upside_down(view: View) -> View:
+        return view._replace(image=255 - view.image.flip(0))
+
+    with pytest.raises(ValueError, match="does not show what its photographs show"):
+        judge(match_photographs(Changed(scene, upside_down)))
+
+
+def test_masked_pixels_do_not_count(scene) -> None:
+    def hidden(view: View) -> View:
+        image, mask = view.image.clone(), torch.ones(view.image.shape[:2], dtype=torch.bool)
+        image[: len(image) // 2] = 0
+        mask[: len(image) // 2] = False
+        return view._replace(image=image, mask=mask)
+
+    assert match_photographs(Changed(scene, hidden)).psnr > 40
+
+
+@needs_shared
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fox", "tabletop"])
+def test_real_captures(name: str) -> None:
+    from benchmarks.captures import SHARED  # noqa: PLC0415
+
+    scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
+    assert judge(match_photographs(scene)) is None
+    for factor in (0.95, 0.98, 1.02, 1.05):
+        assert "fit the photographs better" in str(judge(match_photographs(Changed(scene, focal(factor)))))

@@ -1,0 +1,364 @@
+"""One scene by every way in: evidence and answers are those of the nerfstudio run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from normlift_ns import LiftOptions, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
+from normlift_ns.raster.rasterize import rasterize_evidence
+from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.similarity import gsplat_normalization, similarity
+from normlift_ns.scenes.splat import Splat
+from tests.scenes.made import in_file_world, ply_columns, rows_of, write_colmap, write_gsplat, write_ply
+
+OPTIONS = {"source": SourceOptions(encoder="colour", regions="grid"), "lift": LiftOptions(storage="evidence")}
+
+
+@pytest.fixture(scope="module")
+def native(trained: Path):
+    return open_scene(trained)
+
+
+@pytest.fixture(scope="module")
+def splat(native) -> Splat:
+    return Splat(**native.parameters)
+
+
+@pytest.fixture(scope="module")
+def frames(native) -> list[Frame]:
+    """The cameras of the run, as nerfstudio has them, in the world of the splat."""
+    found = []
+    for views in (native.train, native.held_out):
+        for file, name, camera, pose in zip(views.files, views.names, views.cameras, views._poses):
+            (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+            found.append(
+                Frame(file, name, pose.double().numpy(), Intrinsics(fx, fy, cx, cy, camera.width, camera.height))
+            )
+    return found
+
+
+def held_out(native) -> tuple[str, ...]:
+    return tuple(native.held_out.names)
+
+
+def difference(native, scene, rows=slice(None)) -> float:
+    """Relative Frobenius difference of the evidence of some cells."""
+    sums = []
+    for one in (native, scene):
+        cameras = list(one.train.cameras)
+        labels = [(torch.arange(c.height)[:, None] // 16 * 10 + torch.arange(c.width) // 16).int() for c in cameras]
+        evidence = rasterize_evidence(one.gaussians, cameras, labels, rasterize_mode=one.rasterize_mode)
+        sums.append(torch.stack([evidence.rows.row_sums(), *_moments(evidence)], dim=1))
+    return float((sums[0][rows] - sums[1]).norm() / sums[0][rows].norm())
+
+
+def _moments(evidence) -> list[torch.Tensor]:
+    """Two random projections of every row: equal only where the entries are."""
+    g = torch.Generator().manual_seed(0)
+    vectors = torch.randn(evidence.num_regions, 2, generator=g, dtype=torch.float64)
+    return list(evidence.rows.matmul(vectors).unbind(1))
+
+
+def test_a_ply_file_with_the_transforms_of_the_run(native, splat, trained: Path, tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    folder = native.location.folder
+    options = SplatOptions(transforms=folder, world_transform=trained.parent / "dataparser_transforms.json")
+    said: list[str] = []
+    scene = open_splat(path, options, say=said.append)
+    assert scene.train.names == native.train.names
+    assert scene.held_out.names == native.held_out.names  # transforms.json names them
+    assert any("2 of 14 photographs were held out" in text for text in said)
+    assert any("taken for classic" in text for text in said)
+    assert any("Inria's trainer" in text for text in said)
+    for view, other in zip(scene.train, native.train):
+        assert torch.equal(view.image, other.image)
+        assert torch.equal(view.camera.K, other.camera.K)
+        torch.testing.assert_close(view.camera.world_to_camera, other.camera.world_to_camera, atol=1e-7, rtol=0)
+    assert difference(native, scene) < 1e-5
+    camera = native.train.cameras[0]
+    torch.testing.assert_close(scene.colors(camera), native.colors(camera))
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_ply_file_with_a_colmap_project(native, splat, frames, tmp_path: Path, binary: bool, turned: bool) -> None:
+    matrix = np.diag([3.0, 3, 3, 1]) @ [[0, 0, 1, 2.0], [1, 0, 0, -1], [0, 1, 0, 0.5], [0, 0, 0, 1]]
+    project = write_colmap(
+        tmp_path / "p", in_file_world(frames, matrix) if turned else frames, "PINHOLE", binary=binary
+    )
+    (tmp_path / "world.json").write_text(json.dumps(matrix.tolist()))
+    scene = open_splat(
+        write_ply(tmp_path / "s.ply", ply_columns(splat)),
+        SplatOptions(
+            colmap=project,
+            images=native.location.folder / "images",
+            world_transform=tmp_path / "world.json" if turned else None,
+            holdout=held_out(native),
+        ),
+    )
+    assert scene.train.names == native.train.names
+    assert difference(native, scene) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["plain", "ranks", "normalized", "moved"])
+def test_a_checkpoint_of_gsplat(native, splat, frames, tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "ckpt_29999_rank0.pt"
+    options = SplatOptions(images=native.location.folder / "images", holdout=held_out(native), gsplat_normalize=False)
+    points = splat.means.numpy()[::3]
+    matrix = np.diag([5.0, 5, 5, 1]) @ [[0, -1, 0, 2.0], [1, 0, 0, -1], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+    if kind == "ranks":
+        write_gsplat(path, rows_of(splat, slice(0, 4000)))
+        write_gsplat(tmp_path / "ckpt_29999_rank1.pt", rows_of(splat, slice(4000, None)))
+    elif kind == "moved":  # the training turned and shifted the cameras a little; the project has them as they were
+        generator = torch.Generator().manual_seed(0)
+        moves = 0.05 * torch.randn(len(native.train), 9, generator=generator, dtype=torch.float64)
+        frames = _before(frames, moves, held_out(native))
+        write_gsplat(path, splat, pose_adjust={"embeds.weight": moves, "identity": torch.zeros(6)})
+    elif kind == "normalized":  # the project lies in another world, and the training normalized it
+        frames = in_file_world(frames, matrix)
+        back = np.linalg.inv(matrix)
+        points = points @ back[:3, :3].T + back[:3, 3]
+        world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)[0]
+        whole = np.eye(4)
+        whole[:3] = world.scale * world.transform
+        write_gsplat(path, _in_world(splat, whole @ back))
+        options = replace(options, gsplat_normalize=True)
+    else:
+        write_gsplat(path, splat)
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
+    scene = open_splat(path, replace(options, colmap=project))
+    assert scene.step == 29999
+    assert difference(native, scene) < (5e-5 if kind == "normalized" else 1e-5)  # there the Gaussians are rounded anew
+
+
+def _in_world(splat: Splat, matrix: np.ndarray) -> Splat:
+    """The Gaussians in another world, computed in float64."""
+    world = similarity(matrix, "test")
+    turn = torch.from_numpy(world.transform[:, :3])
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
+    return replace(
+        splat,
+        means=(world.scale * (splat.means.double() @ turn.T + torch.from_numpy(world.transform[:, 3]))).float(),
+        quats=torch.from_numpy(quats.as_quat()[:, [3, 0, 1, 2]]).float(),
+        scales=(splat.scales.double() + np.log(world.scale)).float(),
+    )
+
+
+def _before(frames: list[Frame], moves: torch.Tensor, kept: tuple[str, ...]) -> list[Frame]:
+    """Poses to which gsplat's CameraOptModule gives those of the frames: pose = before @ move, by matrices."""
+    trained = sorted((f for f in frames if f.name not in kept), key=lambda frame: frame.name)
+    found = {frame.name: frame for frame in frames}
+    for frame, move in zip(trained, moves):
+        first = torch.nn.functional.normalize(move[3:6] + torch.eye(3)[0], dim=0)
+        second = move[6:9] + torch.eye(3)[1]
+        second = torch.nn.functional.normalize(second - (first @ second) * first, dim=0)
+        change = torch.eye(4, dtype=torch.float64)
+        change[:3, :3] = torch.stack([first, second, torch.linalg.cross(first, second)])
+        change[:3, 3] = move[:3]
+        opencv = np.vstack([frame.pose * [1, -1, -1, 1], [0, 0, 0, 1]])
+        pose = (opencv @ np.linalg.inv(change.numpy()))[:3] * [1, -1, -1, 1]
+        found[frame.name] = replace(frame, pose=pose)
+    return list(found.values())
+
+
+def test_gsplats_axes_are_turned_where_the_photographs_say_so(native, splat, frames, tmp_path: Path) -> None:
+    """gsplat before 1.5 does not turn the world over, and signs of axes depend on the library that computes them."""
+    points = splat.means.numpy()[::3]
+    for number in (1, 2, 3):
+        world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)[number]
+        matrix = np.eye(4)
+        matrix[:3] = world.scale * world.transform
+        path = write_gsplat(tmp_path / f"ckpt_{number}_rank0.pt", _in_world(splat, matrix))
+        project = write_colmap(tmp_path / f"p{number}", frames, "PINHOLE", points=points)
+        said: list[str] = []
+        options = SplatOptions(colmap=project, images=native.location.folder / "images", holdout=held_out(native))
+        scene = open_splat(path, options, say=said.append)
+        assert any("turned by half a turn" in text for text in said)
+        assert difference(native, scene) < 5e-5
+
+
+def test_the_lifted_run_opens_again(native, splat, trained: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    folder = native.location.folder
+    world = trained.parent / "dataparser_transforms.json"
+    scene = open_splat(path, SplatOptions(transforms=folder, world_transform=world))
+    run = lift_run(scene, timestamp="t", **OPTIONS)
+    assert run.folder == tmp_path / "outputs" / folder.name / "normlift" / "t"
+    path.unlink()  # the run holds its own copy
+    expected = lift_run(native, output_dir=tmp_path / "native", timestamp="t", **OPTIONS).ask("red", "yellow")
+    again = open_run(run.config)
+    assert again.scene.train.names == scene.train.names
+    assert again.scene.held_out.names == scene.held_out.names
+    for view, other in zip(again.scene.train.cameras, scene.train.cameras):
+        assert torch.equal(view.world_to_camera, other.world_to_camera)
+        assert torch.equal(view.K, other.K)
+    found = again.ask("red", "yellow")
+    assert torch.equal(found.selected, expected.selected)
+    torch.testing.assert_close(found.relevancy, expected.relevancy, atol=1e-3, rtol=0)
+    assert again.field.manifest["source_splat"] == str(path)
+    picture = again.render("0003")
+    photograph = np.asarray(Image.open(folder / "images" / "0003.png"))
+    assert np.abs(picture.numpy().astype(int) - photograph).mean() < 3
+    rows = again.export(tmp_path / "again.ply", found["red"])
+    assert 0.9 * int(found["red"].mask.sum()) < len(rows) <= int(found["red"].mask.sum())  # all but the faintest
+    second = lift_run(again.config, timestamp="second", **OPTIONS)  # and can be lifted again
+    assert torch.equal(second.ask("red").selected, again.ask("red").selected)
+
+
+def test_photographs_that_moved_are_found_by_data(native, splat, trained: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "capture").mkdir()
+    transforms = json.loads((native.location.folder / "transforms.json").read_text())
+    for name in (*native.train.names, *native.held_out.names):
+        file = tmp_path / "capture" / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes((native.location.folder / name).read_bytes())
+    (tmp_path / "capture" / "transforms.json").write_text(json.dumps(transforms))
+    world = trained.parent / "dataparser_transforms.json"
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    scene = open_splat(path, SplatOptions(transforms=tmp_path / "capture", world_transform=world))
+    run = lift_run(scene, timestamp="t", **OPTIONS)
+    (tmp_path / "capture").rename(tmp_path / "elsewhere")
+    with pytest.raises(FileNotFoundError, match=r"14 of the 14 photographs .* say where their folder is with --data"):
+        open_run(run.config)
+    assert open_run(run.config, data=tmp_path / "elsewhere").scene.train[0].image.shape == (120, 160, 3)
+    moved_run = (tmp_path / "outputs").rename(tmp_path / "results") / run.folder.relative_to(tmp_path / "outputs")
+    opened = open_run(moved_run / "config.yml", data=tmp_path / "elsewhere" / "images")
+    assert opened.scene.train.names == scene.train.names
+    assert opened.ask("red").selected.any()
+    with pytest.raises(FileNotFoundError, match=r"There is no folder .*nowhere, given with --data"):
+        open_run(moved_run / "config.yml", data=tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_degree_is_lifted_and_drawn(native, splat, trained: Path, tmp_path: Path, degree: int) -> None:
+    rest = 0.2 * torch.randn(len(splat), (degree + 1) ** 2 - 1, 3, generator=torch.Generator().manual_seed(0))
+    path = write_ply(tmp_path / "s.ply", ply_columns(replace(splat, features_rest=rest)))
+    world = trained.parent / "dataparser_transforms.json"
+    scene = open_splat(path, SplatOptions(transforms=native.location.folder, world_transform=world))
+    run = lift_run(scene, output_dir=tmp_path / "out", timestamp="t", **OPTIONS)
+    again = open_run(run.config).scene
+    camera = scene.train.cameras[2]
+    assert torch.equal(again.colors(camera), scene.colors(camera))
+    assert again.splat.degree == max(1, degree)  # splatfacto takes colours without harmonics for logits
+
+
+def test_undistortion_and_masks_are_nerfstudios(tmp_path: Path) -> None:
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: PLC0415
+    from nerfstudio.data.datasets.base_dataset import InputDataset  # noqa: PLC0415
+
+    from normlift_ns.nerfstudio_plugin.views import DatasetViews  # noqa: PLC0415
+    from normlift_ns.scenes.photographs import PhotographViews  # noqa: PLC0415
+    from normlift_ns.scenes.transforms import read_transforms  # noqa: PLC0415
+    from tests.nerfstudio_plugin.stock_run import write_dataset  # noqa: PLC0415
+
+    write_dataset(tmp_path / "a", masks=True, channels=4)
+    content = json.loads((tmp_path / "a" / "transforms.json").read_text())
+    content |= {"k2": -0.02, "k3": 0.01, "p1": 0.004, "p2": -0.003, "fl_y": 43.0, "cx": 22.5}
+    (tmp_path / "a" / "transforms.json").write_text(json.dumps(content))
+    kept = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False, "eval_mode": "all"}
+    parser = NerfstudioDataParserConfig(data=tmp_path / "a", downscale_factor=1, **kept).setup()
+    dataset = InputDataset(parser.get_dataparser_outputs("train"))
+    background = torch.tensor([0.2, 0.4, 0.6])
+    stock = DatasetViews(dataset, tmp_path / "a", dataset.cameras.camera_to_worlds, background)
+    ours = PhotographViews(read_transforms(tmp_path / "a").frames, background)
+    assert ours.names == stock.names
+    for view, other in zip(ours, stock):
+        assert torch.equal(view.image, other.image)
+        assert torch.equal(view.mask, other.mask)
+        assert torch.equal(view.camera.K, other.camera.K)
+        assert torch.equal(view.camera.world_to_camera, other.camera.world_to_camera)
+        assert view.image.shape[:2] == (view.camera.height, view.camera.width)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "needs one file of cameras, got none: give the folder of a COLMAP project"),
+        ({"images": "."}, "needs one file of cameras, got none"),
+        ({"transforms": "a", "colmap": "b"}, "one file of cameras, got two"),
+        ({"transforms": "nowhere.json"}, "There is no file .*nowhere.json"),
+        ({"colmap": "p", "images": "none"}, "There is no folder none, given with --images"),
+        ({"colmap": "p"}, "There is no folder .*p/images of photographs"),
+        ({"colmap": "p", "images": "half"}, "13 of the 14 photographs .* are not in .*half"),
+        ({"colmap": "p", "images": "flat"}, "is 160 x 60 pixels, but its camera .* the aspect differs"),
+        ({"colmap": "empty", "images": "half"}, "has 0 cameras and 0 registered images"),
+        ({"colmap": "p", "images": "all", "test_every": 1}, "--test-every must be at least 2"),
+        ({"colmap": "p", "images": "all", "test_every": 8, "holdout": ("0001",)}, "give one of them"),
+        ({"colmap": "p", "images": "all", "holdout": ("cat",)}, "--holdout names cat, but no photograph is called so"),
+        ({"colmap": "p", "images": "all", "masks": "masks"}, r"no mask for .*0000\.png in masks"),
+        ({"transforms": "t.json"}, "gsplat's trainer normalized the world .* Give the project with --colmap"),
+        ({"colmap": "p", "images": "all"}, "has 0 points, so the normalization .* cannot be computed again"),
+    ],
+)
+def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, monkeypatch, options, message) -> None:
+    monkeypatch.chdir(tmp_path)
+    images = native.location.folder / "images"
+    write_colmap(tmp_path / "p", frames, "PINHOLE")
+    write_colmap(tmp_path / "empty", [], "PINHOLE", binary=False)
+    for folder, names, size in (("half", frames[:1], None), ("flat", frames, (160, 60)), ("all", frames, None)):
+        (tmp_path / folder).mkdir()
+        for frame in names:
+            image = Image.open(frame.file)
+            (image if size is None else image.resize(size)).save(tmp_path / folder / frame.file.name)
+    (tmp_path / "masks").mkdir()
+    transforms = json.loads((images.parent / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["file_path"] = str(images.parent / frame["file_path"])
+    transforms = {name: value for name, value in transforms.items() if not name.endswith("_filenames")}
+    (tmp_path / "t.json").write_text(json.dumps(transforms))
+    path = write_gsplat(tmp_path / "ckpt_1_rank0.pt", rows_of(splat, slice(0, 50)))
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        open_splat(path, SplatOptions(**options))
+
+
+def test_moves_of_another_number_of_views_are_refused(native, splat, frames, tmp_path: Path) -> None:
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE")
+    options = SplatOptions(colmap=project, images=native.location.folder / "images", gsplat_normalize=False)
+    for count, hint in ((12, "give --test-every 8"), (5, "--test-every or --holdout")):
+        moves = {"embeds.weight": torch.zeros(count, 9)}
+        path = write_gsplat(tmp_path / f"ckpt_{count}_rank0.pt", splat, pose_adjust=moves)
+        with pytest.raises(ValueError, match=f"moved the cameras of {count} training views.*{hint}"):
+            open_splat(path, options)
+    assert len(open_splat(tmp_path / "ckpt_12_rank0.pt", replace(options, test_every=8)).train) == 12
+
+
+def test_smaller_copies_of_the_photographs(native, splat, frames, tmp_path: Path) -> None:
+    (tmp_path / "images_2").mkdir()
+    for frame in frames:  # of other format, as gsplat's trainer makes them
+        Image.open(frame.file).resize((81, 60)).save(tmp_path / "images_2" / f"{frame.file.stem}.webp")
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE")
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    scene = open_splat(path, SplatOptions(colmap=project, images=tmp_path / "images_2", test_every=8, views="all"))
+    assert len(scene.train) == 14
+    assert len(scene.held_out) == 0
+    assert scene.train.names[0] == "images_2/0000.webp"
+    camera, full = scene.train.cameras[0], native.train.cameras[0]
+    assert (camera.width, camera.height) == (81, 60)
+    expected = full.K * torch.tensor([[81 / 160], [0.5], [1.0]])
+    torch.testing.assert_close(camera.K, expected)
+
+
+def test_every_eighth_photograph_is_held_out_as_gsplat_does(native, splat, frames, tmp_path: Path) -> None:
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE")
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    base = SplatOptions(colmap=project, images=native.location.folder / "images")
+    names = [f"images/{i:04d}.png" for i in range(14)]
+    eighth = open_splat(path, replace(base, test_every=8))
+    assert eighth.held_out.names == [names[0], names[8]]
+    assert eighth.train.names == [name for name in names if name not in eighth.held_out.names]
+    (tmp_path / "list.txt").write_text("0003\nimages/0005.png\n\n")
+    listed = open_splat(path, replace(base, holdout=(str(tmp_path / "list.txt"),)))
+    assert listed.held_out.names == [names[3], names[5]]
+    share = open_splat(path, replace(base, holdout=("0.1",)))  # ns-train: 13 evenly spaced of 14 are trained
+    assert share.held_out.names == [name for i, name in enumerate(names) if i not in np.linspace(0, 13, 13, dtype=int)]

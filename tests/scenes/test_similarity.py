@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from normlift_ns.scenes.frames import Frame, Intrinsics, moved
+from normlift_ns.scenes.similarity import gsplat_normalization, read_world_transform
+
+ROTATION = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
+MATRIX = np.block([[2.5 * ROTATION, np.array([[1.0], [2.0], [3.0]])], [np.array([[0.0, 0, 0, 1]])]])
+
+
+@pytest.mark.parametrize("kind", ["json", "npy", "txt"])
+def test_a_matrix_is_read_in_its_parts(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"world.{kind}"
+    if kind == "json":
+        path.write_text(json.dumps(MATRIX.tolist()))
+    elif kind == "npy":
+        np.save(path, MATRIX)
+    else:
+        np.savetxt(path, MATRIX)
+    world = read_world_transform(path)
+    assert world.scale == pytest.approx(2.5)
+    assert np.allclose(world.scale * world.transform, MATRIX[:3])
+    assert not world.single
+
+
+def test_dataparser_transforms_start_from_the_capture(tmp_path: Path) -> None:
+    """p = scale (T A^-1) p_file, with A the turn that ns-process-data applied."""
+    applied = np.eye(4)
+    applied[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    transform = np.column_stack([ROTATION, [1.0, 2.0, 3.0]])
+    (tmp_path / "a.json").write_text(json.dumps({"transform": transform.tolist(), "scale": 0.5}))
+    world = read_world_transform(tmp_path / "a.json", applied, 2.0)
+    assert world.single
+    assert world.scale == 0.25
+    point = np.array([3.0, -1.0, 2.0])
+    assert np.allclose(world.transform @ np.append(applied[:3, :3] @ point, 1), transform @ np.append(point, 1))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (np.diag([1.0, 1, -1, 1]).tolist(), "no similarity"),
+        (np.diag([1.0, 1, 2, 1]).tolist(), "no similarity"),
+        (np.zeros((4, 4)).tolist(), "no similarity"),
+        ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
+        ([[1, 2], [3]], "holds no transform"),
+        ("eye", "holds no transform"),
+        ({"transform": [[1, 0, 0, 0]] * 3}, "holds no transform .KeyError: 'scale'"),
+        ({"transform": [[1, 0, 0, 0]] * 3, "scale": 1}, "no similarity"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "no similarity"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": "big"}, "holds no transform"),
+    ],
+)
+def test_what_is_no_similarity_is_refused(tmp_path: Path, content: object, message: str) -> None:
+    path = tmp_path / "world.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message) as caught:
+        read_world_transform(path)
+    assert str(path) in str(caught.value)
+
+
+def test_moved_cameras_see_moved_points_at_the_same_place() -> None:
+    frame = Frame(Path("a"), "a", np.column_stack([Rotation.random(random_state=1).as_matrix(), [1, 2, 3]]), _CAMERA)
+    from normlift_ns.scenes.similarity import similarity  # noqa: PLC0415
+
+    there = moved([frame], similarity(MATRIX, "test"))[0]
+    point = np.array([0.3, -2.0, 5.0])
+    before = frame.pose[:, :3].T @ (point - frame.pose[:, 3])
+    after = there.pose[:, :3].T @ (MATRIX[:3, :3] @ point + MATRIX[:3, 3] - there.pose[:, 3])
+    assert np.allclose(after, 2.5 * before)
+    assert np.allclose(there.pose[:, :3] @ there.pose[:, :3].T, np.eye(3))
+
+
+_CAMERA = Intrinsics(1, 1, 1, 1, 2, 2)
+
+
+def _ring(tilt: Rotation, size: float) -> tuple[list[Frame], np.ndarray]:
+    """Cameras on a level ring that look at its middle, over a flat floor with more points below; then all turned."""
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    centres = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(12)])
+    back = centres
+    right = np.column_stack([-np.sin(angles), np.cos(angles), np.zeros(12)])
+    up = np.tile([0.0, 0.0, 1.0], (12, 1))
+    rotations = np.stack([right, up, back], axis=2)
+    poses = [np.column_stack([tilt.apply(r.T).T, size * tilt.apply(c)]) for r, c in zip(rotations, centres)]
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4000, 3)) * [2.0, 1.0, 0.1]
+    points[:, 2] += np.where(rng.random(4000) < 0.3, np.abs(rng.normal(size=4000)), 0)
+    return [Frame(Path("a"), "a", pose, _CAMERA) for pose in poses], size * tilt.apply(points)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_gsplats_normalization_undoes_any_similarity(seed: int) -> None:
+    """However the world of the project is turned and scaled: cameras at distance 1 over a level floor."""
+    tilt = Rotation.random(random_state=seed)
+    frames, points = _ring(tilt, 0.1 + seed)
+    worlds = gsplat_normalization(frames, points)
+    world = worlds[0]
+    there = world.scale * (points @ world.transform[:, :3].T + world.transform[:, 3])
+    assert np.allclose(np.median(there, axis=0), 0, atol=0.05)  # medians do not turn with the axes
+    spread = there.std(axis=0)
+    assert spread[0] > spread[1] > spread[2]
+    assert np.mean(there[:, 2]) >= np.median(there[:, 2])  # the tail points up
+    poses = np.array([frame.pose for frame in moved(frames, world)])
+    assert np.allclose(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=1), 1, atol=0.01)
+    turns = {tuple(np.round(np.diag(w.transform[:, :3] @ world.transform[:, :3].T)).astype(int)) for w in worlds}
+    assert turns == {(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)}
+
+
+def test_a_world_that_gsplat_mirrors_is_refused() -> None:
+    turn = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    frames = [Frame(Path("a"), "a", np.column_stack([turn, [x, 0.0, 0.0]]), _CAMERA) for x in (-1.0, 3.0)]
+    with pytest.raises(ValueError, match=r"exactly \+y, and gsplat's trainer mirrors such a world"):
+        gsplat_normalization(frames, np.eye(3))
+
+
+def test_gsplats_normalization_of_known_cameras() -> None:
+    """Worked by hand: two cameras above each other that look along x; up is already -y."""
+    turn = np.array([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]])  # OpenGL: right -z, up -y, back -x
+    frames = [Frame(Path("a"), "a", np.column_stack([turn, [0.0, y, 0.0]]), _CAMERA) for y in (-1.0, 3.0)]
+    grid = np.array([[x, y, z] for x in (-3.0, 3.0) for y in (-2.0, 2.0) for z in (-1.0, 1.0)])
+    world = gsplat_normalization(frames, grid)[0]
+    assert world.scale == pytest.approx(0.5)  # the median distance 2 of the cameras from what they look at
+    assert np.allclose(np.abs(world.transform[:, :3]), np.eye(3))
+    assert np.allclose(world.transform[:, 3], 0, atol=1e-9)

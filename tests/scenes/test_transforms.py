@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from normlift_ns.scenes.frames import check_frames
+from normlift_ns.scenes.transforms import read_transforms, write_transforms
+
+INTRINSICS = {"fl_x": 50.0, "fl_y": 51.0, "cx": 20.5, "cy": 14.5, "w": 40, "h": 30}
+
+
+def capture(folder: Path, content: dict | None = None, *, names=("images/b.png", "images/a.png"), **frame) -> Path:
+    """transforms.json and its images."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (40, 30)).save(folder / name)
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist(), **frame} for name in names]
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**INTRINSICS, "frames": frames} if content is None else {**content, "frames": frames}))
+    return path
+
+
+def test_frames_stand_in_the_order_of_their_files(tmp_path: Path) -> None:
+    found = read_transforms(capture(tmp_path))
+    assert [frame.name for frame in found.frames] == ["images/a.png", "images/b.png"]
+    assert found.frames[0].intrinsics[:6] == (50, 51, 20.5, 14.5, 40, 30)
+    assert found.held_out == frozenset()
+
+
+def test_what_stands_in_the_file_counts_before_what_stands_in_a_frame(tmp_path: Path) -> None:
+    path = capture(tmp_path, {"fl_x": 50.0, "k1": 0.1}, fl_x=70.0, fl_y=71.0, k1=0.5, k2=0.6, w=40, h=30)
+    camera = read_transforms(path).frames[0].intrinsics
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 71, 20, 15)
+    assert camera.distortion == (0.1, 0, 0, 0, 0)  # any distortion in the file replaces that of the frames
+    path = capture(tmp_path, {}, distortion_params=[0.1, 0.2, 0.3, 0.0, 0.5, 0.6], fl_x=1.0)
+    assert read_transforms(path).frames[0].intrinsics.distortion == (0.1, 0.2, 0.3, 0.5, 0.6)
+
+
+def test_blenders_scenes_have_an_angle_and_names_without_suffix(tmp_path: Path) -> None:
+    path = capture(tmp_path, {"camera_angle_x": 0.69}, names=("train/r_0.png",))
+    path.write_text(path.read_text().replace("train/r_0.png", "./train/r_0"))
+    frame = read_transforms(path).frames[0]
+    assert frame.file == tmp_path / "train" / "r_0.png"
+    assert frame.name == "train/r_0.png"
+    assert frame.intrinsics.fx == pytest.approx(20 / math.tan(0.345))
+    assert frame.intrinsics[1:6] == (frame.intrinsics.fx, 20, 15, 40, 30)
+
+
+def test_held_out_photographs_are_those_that_the_file_names(tmp_path: Path) -> None:
+    split = {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
+    assert read_transforms(capture(tmp_path, {**INTRINSICS, **split})).held_out == {"images/b.png"}
+
+
+def test_images_and_masks_from_other_folders(tmp_path: Path) -> None:
+    path = capture(tmp_path / "a")
+    for folder, size in (("images_2", (20, 15)), ("masks", (20, 15))):
+        (tmp_path / "b" / folder).mkdir(parents=True)
+        for name in ("a", "b"):
+            suffix = ".png.png" if folder == "masks" and name == "a" else ".png"
+            Image.new("L", size).save(tmp_path / "b" / folder / f"{name}{suffix}")
+    found = read_transforms(path, tmp_path / "b" / "images_2", tmp_path / "b" / "masks").frames
+    assert [frame.name for frame in found] == ["images_2/a.png", "images_2/b.png"]
+    assert [frame.mask for frame in found] == [tmp_path / "b/masks/a.png.png", tmp_path / "b/masks/b.png"]
+    (tmp_path / "b/masks/b.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no mask for .*b\.png in .*masks"):
+        read_transforms(path, None, tmp_path / "b" / "masks")
+
+
+@pytest.mark.parametrize(
+    ("content", "frame", "message"),
+    [
+        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "camera_model is OPENCV_FISHEYE; read are OPENCV"),
+        ({"w": 40, "h": 30}, {}, "neither fl_x nor camera_angle_x"),
+        ({**INTRINSICS, "k4": 0.1}, {}, "distortion k4 = 0.1"),
+        ({**INTRINSICS, "w": 40.5}, {}, "expected whole numbers"),
+        ({**INTRINSICS, "fl_x": "wide"}, {}, r"Expected `float \| null`, got `str` - at `\$.fl_x`"),
+        (INTRINSICS, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix of images/b.png is not 4 x 4"),
+        (INTRINSICS, {"transform_matrix": "eye"}, "another form than expected"),
+        ({**INTRINSICS, "applied_transform": [[1]]}, {}, "applied_transform is not 3 x 4"),
+    ],
+)
+def test_other_content_is_refused(tmp_path: Path, content: dict, frame: dict, message: str) -> None:
+    path = capture(tmp_path, content, **frame)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_transforms(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transform_matrix": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "pose of images/a.png is no rotation"),
+        ({"transform_matrix": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "is no rotation"),
+        ({"fl_x": -5.0}, "focal lengths -5"),
+        ({"w": 0}, "size 0 x 30"),
+    ],
+)
+def test_cameras_that_no_photograph_can_have_are_refused(tmp_path: Path, change: dict, message: str) -> None:
+    content = {name: value for name, value in INTRINSICS.items() if name not in change}
+    path = capture(tmp_path, content, **change)
+    with pytest.raises(ValueError, match=message):
+        check_frames(read_transforms(path).frames, path)
+
+
+def test_nan_and_missing_images_are_named(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    path.write_text(path.read_text().replace("50.0", "NaN"))
+    with pytest.raises(ValueError, match=r"no valid JSON .it contains NaN"):
+        read_transforms(path)
+    path = capture(tmp_path)
+    (tmp_path / "images" / "b.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"1 of the 2 photographs .* the first is images/b.png"):
+        read_transforms(path)
+    with pytest.raises(ValueError, match="has no cameras with photographs"):
+        check_frames([], path)
+
+
+def test_masks_for_some_images_only_are_refused(tmp_path: Path) -> None:
+    path = capture(tmp_path)
+    content = json.loads(path.read_text())
+    content["frames"][0]["mask_path"] = "images/a.png"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"masks for some images, but none for images/a.png"):
+        read_transforms(path)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    found = read_transforms(capture(tmp_path, {**INTRINSICS, "k1": 0.1, "p2": 0.2}))
+    write_transforms(tmp_path / "again.json", found.frames[:1], found.frames[1:])
+    again = read_transforms(tmp_path / "again.json", base=tmp_path)
+    assert again.held_out == {"images/b.png"}
+    for frame, before in zip(again.frames, found.frames):
+        assert (frame.file, frame.name, frame.intrinsics) == (before.file, before.name, before.intrinsics)
+        assert np.array_equal(frame.pose, before.pose.astype(np.float32))
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    key=st.sampled_from([*INTRINSICS, "frames", "applied_transform", "applied_scale", "train_filenames", "k1"]),
+    value=st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+        lambda part: st.lists(part, max_size=4) | st.dictionaries(st.text(max_size=3), part, max_size=3),
+        max_leaves=12,
+    ),
+)
+def test_no_content_gets_through_as_another_error(tmp_path: Path, key: str, value: object) -> None:
+    path = capture(tmp_path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    try:
+        check_frames(read_transforms(path).frames, path)
+    except (ValueError, FileNotFoundError) as error:
+        assert "transforms.json" in str(error)
