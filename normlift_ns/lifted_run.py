@@ -159,6 +159,7 @@ class LiftedRun:
             answer,
             keep=keep,
             spherical_harmonics=self.scene.has_harmonics,
+            rasterize_mode=self.scene.rasterize_mode,
         )
 
     def camera(self, view: str | Path | int) -> Camera:

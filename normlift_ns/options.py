@@ -120,8 +120,8 @@ class SplatOptions:
     views: Literal["train", "all"] = "train"
     """train: lift the photographs that were not held out. all: lift all of them."""
     test_every: int | None = None
-    """Every so manieth photograph was held out of the training: 8 for gsplat's trainer, and for Inria's with --eval. By
-    default none, or those that transforms.json names."""
+    """Every n-th photograph, from the first on, was held out of the training: 8 for gsplat's trainer, and for Inria's
+    with --eval. By default none, or those that transforms.json names."""
     holdout: tuple[str, ...] = ()
     """Photographs held out of the training, instead of --test-every: their names, a text file of names, or a share such
     as 0.1, which ns-train holds out by default."""

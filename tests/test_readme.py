@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from normlift_ns.core.refine import RefineConfig
-from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.lifting import LiftOptions
 from normlift_ns.scripts import lift
 from normlift_ns.scripts.query import NormLiftQuery
@@ -50,8 +49,11 @@ COMMANDS = "".join(re.findall(r"^    ns-normlift(?:-query)? (?:.*\\\n)*.*\n", RE
 TABLE = README.split("## Options of ns-normlift")[1].split("## Limits")[0]
 
 
-@pytest.mark.parametrize("text", [TABLE, COMMANDS, FRONT_ENDS])
+SPLATS = "".join(re.findall(r"`ns-normlift [^`]*`", (ROOT / "docs" / "splats.md").read_text()))
+
+
+@pytest.mark.parametrize("text", [TABLE, COMMANDS, FRONT_ENDS, SPLATS])
 def test_options_that_are_shown_exist(text):
     named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", text)} - {"help"}
-    commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, NormLiftQuery)
+    commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, SplatOptions, NormLiftQuery)
     assert named <= {f.name for cls in commands for f in fields(cls)}

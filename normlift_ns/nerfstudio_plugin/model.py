@@ -22,6 +22,7 @@ from normlift_ns.core.picking import ray_weights
 from normlift_ns.nerfstudio_plugin.appearance import shading_degree
 from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
 from normlift_ns.nerfstudio_plugin.panel import Panel
+from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.files import with_paths
@@ -139,9 +140,9 @@ class NormLiftModel(SplatfactoModel):
         weights = ray_weights(self._scene(rows), origin, direction)
         return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
 
-    def splats(self) -> tuple[Mapping[str, Tensor], bool]:
-        """The parameters for `write_splats`, and whether colours are spherical harmonics."""
-        return dict(self.gauss_params), self.config.sh_degree > 0
+    def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
+        """For `write_splats`: parameters, whether colours are spherical harmonics, and how they were rasterized."""
+        return dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:
         parts = (self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))

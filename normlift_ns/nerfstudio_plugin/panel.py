@@ -32,7 +32,7 @@ from normlift_ns.asking import Answer, Question, default_negatives, encoder_of, 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.nerfstudio_plugin.widgets import FreeButton, Markdown, TextBox, set_value
-from normlift_ns.options import THRESHOLDS
+from normlift_ns.options import THRESHOLDS, RasterizeMode
 from normlift_ns.runs.files import texts_cache
 from normlift_ns.viewer.display import COLORMAPS, PARTS, Display
 from normlift_ns.viewer.session import ALL_PROMPTS, Session, check_prompts, split_prompts
@@ -55,8 +55,8 @@ class Host(Protocol):
         """Weights of the Gaussians on a ray."""
         ...
 
-    def splats(self) -> tuple[Mapping[str, Tensor], bool]:
-        """The parameters for `write_splats`, and whether colours are spherical harmonics."""
+    def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
+        """For `write_splats`: parameters, whether colours are spherical harmonics, and how they were rasterized."""
         ...
 
 
@@ -277,8 +277,9 @@ class Panel(torch.nn.Module):
         """Writes the selection to a PLY file in the run."""
         if self._session is None or self._folder is None:
             raise ValueError(_WAITING)
-        parameters, harmonics = self._host[0].splats()
-        self.note(self._session.export(self._folder.parent / "exports", parameters, spherical_harmonics=harmonics))
+        parameters, harmonics, mode = self._host[0].splats()
+        how: dict[str, Any] = {"spherical_harmonics": harmonics, "rasterize_mode": mode}
+        self.note(self._session.export(self._folder.parent / "exports", parameters, **how))
 
     @_reported
     def _save(self) -> None:

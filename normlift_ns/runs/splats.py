@@ -14,6 +14,7 @@ from normlift_ns.asking import Answer
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import atomic_path
 from normlift_ns.core.query import strongest
+from normlift_ns.options import RasterizeMode
 
 _LEAST_OPACITY = -5.5373
 """logit(1 / 255): what is fainter is never drawn, and ns-export leaves it out."""
@@ -71,11 +72,14 @@ def write_splats(
     *,
     keep: Bool[Tensor, " n"],
     spherical_harmonics: bool,
+    rasterize_mode: RasterizeMode,
 ) -> Int64[np.ndarray, " m"]:
     """Writes path (PLY) and, beside it, the row of every vertex in the scene as <stem>_rows.npy; returns those rows.
 
     Args:
         parameters, spherical_harmonics: as in `splat_columns`.
+        rasterize_mode: how the scene was rasterized in its training; other tools take it for classic unless the file
+            says otherwise.
         keep: the Gaussians wanted; of them those of `exported_rows` are written.
     Raises:
         ValueError: none of them can be written.
@@ -92,6 +96,8 @@ def write_splats(
         table[name] = column[rows]
     texts = () if answer is None else answer.texts
     comments = ["Written by normlift_ns", "Vertical Axis: z"]
+    if rasterize_mode == "antialiased":
+        comments.append("SplatRenderMode: mip")
     comments += [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, temporary.open("wb") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.scenes.splat import DEGREES, Splat, check_splat
 
 _ROWS = 2**18
-"""Gaussians read at a time: what is read lies in memory once, and this much twice."""
+"""Gaussians read at a time."""
 _NEEDED = (
     *"xyz",
     *(f"f_dc_{i}" for i in range(3)),
@@ -35,7 +36,7 @@ class PlySplat(NamedTuple):
 def read_ply(path: Path) -> PlySplat:
     """Reads a splat; properties may stand in any order, others than a splat's are ignored.
 
-    Memory: the Gaussians once, and the pages of the file that the system keeps.
+    Memory: a little more than the Gaussians once.
 
     Raises:
         FileNotFoundError: no such file.
@@ -99,14 +100,24 @@ def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> Splat:
     }
     columns = {name: torch.empty(n, len(group)) for name, group in groups.items()}
     harmonics = torch.empty(n, k, 3)
-    for start in range(0, n, _ROWS):
-        rows = table[start : start + _ROWS]
+    for start, rows in _blocks(path, table):
         for name, group in groups.items():
             for i, column in enumerate(group):
                 columns[name].numpy()[start : start + len(rows), i] = rows[column]
         for i, column in enumerate(rest):  # all of red, then green, then blue
             harmonics.numpy()[start : start + len(rows), i % k, i // k] = rows[column]
     return Splat(**columns, features_rest=harmonics)
+
+
+def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Rows from a first one on; read, not mapped, as mapped pages count as memory of the process."""
+    with path.open("rb") as file:
+        if isinstance(table, np.memmap):
+            file.seek(table.offset)
+        for start in range(0, len(table), _ROWS):
+            count = min(_ROWS, len(table) - start)
+            mapped = isinstance(table, np.memmap)
+            yield start, np.fromfile(file, table.dtype, count) if mapped else table[start : start + count]
 
 
 def _mode(path: Path, comments: list[str]) -> RasterizeMode | None:

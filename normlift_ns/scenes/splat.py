@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,7 +18,7 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 _WIDE = 0.02
 """A median Gaussian wider than this share of the scene, in a file without negative logarithms: they are none."""
 
-_SAMPLE = 2**20
+_SAMPLE, _BLOCK = 2**20, 2**18
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,12 @@ def check_splat(splat: Splat, file: Path) -> None:
     if len(splat) == 0:
         raise ValueError(f"{file} holds no Gaussians at all. Export the scene again.")
     for name, values in _drawn(splat):
-        wrong = ~values.reshape(len(splat), -1).isfinite().all(dim=1)
-        if bool(wrong.any()):
+        blocks = values.reshape(len(splat), -1).split(_BLOCK)
+        wrong = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
+        if len(wrong) > 0:
             raise ValueError(
-                f"{file} has {int(wrong.sum()):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the "
-                f"first in row {int(wrong.nonzero()[0])}. Expected finite numbers; remove those Gaussians, for a PLY "
+                f"{file} has {len(wrong):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first in "
+                f"row {int(wrong[0])}. Expected finite numbers; remove those Gaussians, for a PLY "
                 f"file for example with: splat-transform {file.name} --filter-nan clean.ply"
             )
     lengths = splat.quats.abs().amax(dim=1)

@@ -13,7 +13,7 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, holdout: Seq
 
     Args:
         names: of all photographs, sorted.
-        test_every: every so manieth counts from the first on, as in gsplat's trainer and in Inria's with --eval.
+        test_every: every n-th is held out, from the first on, as in gsplat's trainer and in Inria's with --eval.
         holdout: names, with or without folder and suffix; or one text file with a name per line; or one share below
             1, as ns-train's dataparser holds out the photographs that its evenly spaced training set leaves over.
     Raises:

@@ -17,6 +17,7 @@ from torch import Tensor
 from normlift_ns.asking import Answer, Question, answer, reselect
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import file_name, free_path
+from normlift_ns.options import RasterizeMode
 from normlift_ns.runs.question import save_question
 from normlift_ns.runs.splats import write_splats
 from normlift_ns.viewer.display import COLORMAPS, PARTS, Colormap, Display, Part, make_display, selection
@@ -119,11 +120,18 @@ class Session:
         reliability = float(self.field.scalars.reliability[met])
         return self.ask(question), f"Clicked Gaussian {met}, reliability {reliability:.2f}."
 
-    def export(self, folder: Path, parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> str:
+    def export(
+        self,
+        folder: Path,
+        parameters: Mapping[str, Tensor],
+        *,
+        spherical_harmonics: bool,
+        rasterize_mode: RasterizeMode,
+    ) -> str:
         """Writes the selection that is shown to a new PLY file in the folder; returns a message.
 
         Args:
-            parameters, spherical_harmonics: as in `write_splats`.
+            parameters, spherical_harmonics, rasterize_mode: as in `write_splats`.
         Raises:
             ValueError: nothing is selected.
         """
@@ -134,9 +142,8 @@ class Session:
         name = file_name("_".join(texts) if self.shown is None else texts[self.shown])
         folder.mkdir(exist_ok=True)
         path = free_path(folder / f"{name}.ply")
-        rows = write_splats(
-            path, parameters, self.field, self.answer, keep=chosen, spherical_harmonics=spherical_harmonics
-        )
+        how = {"spherical_harmonics": spherical_harmonics, "rasterize_mode": rasterize_mode}
+        rows = write_splats(path, parameters, self.field, self.answer, keep=chosen, **how)
         return f"{len(rows):,} Gaussians written to {path}"
 
     def save(self, folder: Path | None) -> str:

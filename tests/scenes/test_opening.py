@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from normlift_ns import LiftOptions, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
 from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from normlift_ns.scenes.similarity import gsplat_normalization, similarity
 from normlift_ns.scenes.splat import Splat
+from normlift_ns.scenes.transforms import read_transforms, write_transforms
+from tests.captures import SHARED, needs_shared
 from tests.scenes.made import in_file_world, ply_columns, rows_of, write_colmap, write_gsplat, write_ply
 
 OPTIONS = {"source": SourceOptions(encoder="colour", regions="grid"), "lift": LiftOptions(storage="evidence")}
@@ -142,8 +146,6 @@ def _in_world(splat: Splat, matrix: np.ndarray) -> Splat:
     """The Gaussians in another world, computed in float64."""
     world = similarity(matrix, "test")
     turn = torch.from_numpy(world.transform[:, :3])
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
     quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
     return replace(
         splat,
@@ -259,7 +261,6 @@ def test_undistortion_and_masks_are_nerfstudios(tmp_path: Path) -> None:
 
     from normlift_ns.nerfstudio_plugin.views import DatasetViews  # noqa: PLC0415
     from normlift_ns.scenes.photographs import PhotographViews  # noqa: PLC0415
-    from normlift_ns.scenes.transforms import read_transforms  # noqa: PLC0415
     from tests.nerfstudio_plugin.stock_run import write_dataset  # noqa: PLC0415
 
     write_dataset(tmp_path / "a", masks=True, channels=4)
@@ -362,3 +363,42 @@ def test_every_eighth_photograph_is_held_out_as_gsplat_does(native, splat, frame
     assert listed.held_out.names == [names[3], names[5]]
     share = open_splat(path, replace(base, holdout=("0.1",)))  # ns-train: 13 evenly spaced of 14 are trained
     assert share.held_out.names == [name for i, name in enumerate(names) if i not in np.linspace(0, 13, 13, dtype=int)]
+
+
+@needs_shared
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fox", "tabletop"])
+def test_real_captures_by_other_ways(name: str, tmp_path: Path) -> None:
+    """Two views of each, one at either end of the capture; fox has lens distortion.
+
+    Quaternions hold rotations only, but the matrices of fox's transforms.json are none by 1e-6, which turns single
+    pixels on and off; so COLMAP's project is held against the same poses made orthonormal.
+    """
+    config = SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml"
+    scene = open_scene(config)
+    path = write_ply(tmp_path / "s.ply", ply_columns(Splat(**scene.parameters)))
+    folder, world = SHARED / "captures" / name, config.parent / "dataparser_transforms.json"
+    ends = _Ends(scene)
+    of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, holdout=("0.1",)))
+    assert of_json.train.names == scene.train.names
+    assert difference(ends, _Ends(of_json)) < 1e-5
+    rigid = [_rigid(frame) for frame in read_transforms(folder).frames]
+    write_transforms(tmp_path / "rigid.json", rigid, [])
+    expected = open_splat(path, SplatOptions(transforms=tmp_path / "rigid.json", world_transform=world))
+    for binary in (True, False):
+        project = write_colmap(tmp_path / f"p{binary}", rigid, binary=binary)
+        options = SplatOptions(colmap=project, images=folder / "images", world_transform=world)
+        assert difference(_Ends(expected), _Ends(open_splat(path, options))) < 1e-5
+
+
+def _rigid(frame: Frame) -> Frame:
+    rotation = Rotation.from_matrix(frame.pose[:, :3]).as_matrix()
+    return replace(frame, pose=np.column_stack([rotation, frame.pose[:, 3]]))
+
+
+class _Ends:
+    """The first and the last training view of a scene."""
+
+    def __init__(self, scene) -> None:
+        self.gaussians, self.rasterize_mode = scene.gaussians, scene.rasterize_mode
+        self.train = SimpleNamespace(cameras=[scene.train.cameras[0], scene.train.cameras[-1]])

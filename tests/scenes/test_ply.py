@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,3 +145,37 @@ def test_no_damage_gets_through_as_another_error(tmp_path: Path, place: int, val
         assert len(read_ply(tmp_path / "b.ply").splat) > 0
     except ValueError as error:
         assert "b.ply" in str(error)
+
+
+_MEASURE = """
+import resource, sys
+from pathlib import Path
+from normlift_ns.scenes.ply import read_ply
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+splat = read_ply(Path(sys.argv[1])).splat
+splat.activated
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(len(splat), float(splat.means[-1, 0]), (after - before) * 1024 / Path(sys.argv[1]).stat().st_size)
+"""
+
+
+@pytest.mark.slow
+def test_two_gigabytes_are_read_in_less_than_three_times_their_size(tmp_path: Path) -> None:
+    """8 M Gaussians of degree 3, written block by block; the peak is that of a process of its own."""
+    small = ply_columns(random_splat(100_000))
+    path = write_ply(tmp_path / "small.ply", small)
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    blocks = 80
+    with (tmp_path / "large.ply").open("wb") as file:
+        file.write(head.replace(b"vertex 100000", b"vertex %d" % (100_000 * blocks)) + b"end_header\n")
+        for _ in range(blocks):
+            file.write(body)
+    assert (tmp_path / "large.ply").stat().st_size > 1.9e9
+    words = [sys.executable, "-c", _MEASURE, str(tmp_path / "large.ply")]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    (tmp_path / "large.ply").unlink()
+    count, last, factor = done.stdout.split()
+    assert int(count) == 8_000_000
+    assert float(last) == small["x"][-1]
+    assert float(factor) < 3, factor
+    print(f"peak {factor} times the size of the file")

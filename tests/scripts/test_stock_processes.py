@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -18,9 +19,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from normlift_ns import open_scene
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
-from normlift_ns.options import SourceOptions
+from normlift_ns.options import SourceOptions, SplatOptions
+from normlift_ns.scenes.splat import Splat
 from normlift_ns.scripts.lift import NormLift
+from tests.scenes.made import ply_columns, write_ply
 
 pytestmark = pytest.mark.slow
 
@@ -30,15 +34,27 @@ SECONDS = 300
 """Until a command must have done its work; importing nerfstudio takes 20 of them."""
 
 
-@pytest.fixture(scope="module")
-def lifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of a lifted run."""
+@pytest.fixture(scope="module", params=["run", "ply"])
+def lifted(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """config.yml of a lifted run: of a splatfacto run, and of a PLY file, where no such run ever existed."""
     folder = tmp_path_factory.mktemp("stock")
     room = demo_room(4000)
     write_capture(room, folder / "room", views=4, held_out=2, width=80, height=60)
     trained = write_splatfacto_run(room, folder / "room", folder / "outputs")
     source = SourceOptions(encoder="colour", region_count=64)
-    return NormLift(trained, timestamp="t", queries=("red",), source=source).main().config
+    if request.param == "run":
+        return NormLift(trained, timestamp="t", queries=("red",), source=source).main().config
+    ply = write_ply(folder / "splat.ply", ply_columns(Splat(**open_scene(trained).parameters)))
+    cameras = SplatOptions(
+        transforms=folder / "room",
+        world_transform=trained.parent / "dataparser_transforms.json",
+        rasterize_mode="classic",
+    )
+    options = {"timestamp": "t", "queries": ("red",), "source": source, "output_dir": folder / "outputs"}
+    config = NormLift(load_ply=ply, splat=cameras, **options).main().config
+    ply.unlink()
+    shutil.rmtree(trained.parent)  # neither of them is needed any more
+    return config
 
 
 def run(command: str, *flags: object, cwd: Path) -> subprocess.CompletedProcess[str]:

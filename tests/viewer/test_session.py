@@ -99,12 +99,12 @@ def test_what_is_shown_is_exported_and_saved(session: Session, tmp_path: Path) -
     }
     asked = session.ask(BOTH).show(1, PARTS[0], "turbo")
     for name in ("b", "b_2"):  # nothing is replaced
-        message = asked.export(tmp_path, parameters, spherical_harmonics=True)
+        message = asked.export(tmp_path, parameters, spherical_harmonics=True, rasterize_mode="antialiased")
         assert message == f"{int(asked.chosen.sum())} Gaussians written to {tmp_path / f'{name}.ply'}"
         assert PlyData.read(tmp_path / f"{name}.ply")["vertex"].count == int(asked.chosen.sum())
     for empty in (session, session.ask(Question(("z",), torch.eye(D)[:1], threshold=2.0))):
         with pytest.raises(ValueError, match="Nothing is selected; there is nothing to export"):
-            empty.export(tmp_path, parameters, spherical_harmonics=True)
+            empty.export(tmp_path, parameters, spherical_harmonics=True, rasterize_mode="antialiased")
 
     assert asked.save(tmp_path).startswith("Saved 2 queries in ")
     stored = load_question(tmp_path)
