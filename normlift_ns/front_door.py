@@ -128,8 +128,8 @@ def lift_run(
         output_dir: in place of the run's own outputs folder.
         timestamp: name of the new run directory; None: the present time.
         overwrite: replace a run directory of that name, and exported files of other content.
-        check: compare three training views with renders of the scene first, and refuse scenes that do not show what
-            their photographs show.
+        check: compare three training views with renders of the scene first; warn where they differ, and refuse splats
+            that do not show what their photographs show.
         device: auto, cpu or cuda.
         export: where to write the 2D features too, in LangSplat's format.
         report: called with (stage, steps done, steps in all).
@@ -170,8 +170,10 @@ def lift_run(
     run_dir = run_directory(scene.runs_dir if output_dir is None else Path(output_dir), scene.name, timestamp)
     refuse_existing(run_dir, overwrite)
     say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
-    if check and (warning := judge(match_photographs(scene))) is not None:
-        say(f"Warning: {warning}")
+    if check:
+        warning = judge(match_photographs(scene), own_cameras=not isinstance(scene, SplatScene))
+        if warning is not None:
+            say(f"Warning: {warning}")
     settings = encoder_settings(options)
     if made is None:
         made = given_features(features, texts, scene.train.names)

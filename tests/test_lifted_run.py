@@ -154,7 +154,9 @@ def test_features_that_do_not_fit_are_named(trained: Path, tmp_path: Path, chang
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
     with pytest.raises(FileExistsError, match="exists; give another --timestamp"):
         nl.lift_run(trained, source=nl.SourceOptions(encoder="colour"), timestamp="one")
-    with pytest.raises(TypeError, match=r"lift_run takes the config\.yml of a run or a scene of open_scene, got int"):
+    with pytest.raises(
+        TypeError, match=r"lift_run takes the config\.yml of a run or a scene of open_scene or open_splat, got int"
+    ):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match="is a run without semantics"):
         nl.open_run(trained)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from normlift_ns.core.refine import RefineConfig
-from normlift_ns.lifting import LiftOptions
+from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.scripts import lift
 from normlift_ns.scripts.query import NormLiftQuery
 

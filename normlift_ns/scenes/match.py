@@ -56,27 +56,34 @@ def mean_psnr(scene: Scene) -> float:
     return _mean_psnr(scene, _some_views(scene), 1.0)
 
 
-def judge(match: Match) -> str | None:
+def judge(match: Match, *, own_cameras: bool) -> str | None:
     """None where all is well, or a warning in whole sentences.
 
+    Args:
+        own_cameras: whether the cameras are those that the splat was trained with, as far as files tell.
     Raises:
         ValueError: Gaussians and cameras have nothing to do with each other.
     """
     causes = (
         "Likely causes: cameras of another capture; cameras in another world than the splat's (give "
         "--world-transform; for gsplat's trainer see --gsplat-normalize); other photographs, or distorted ones under "
-        "cameras of undistorted ones; another --rasterize-mode"
+        "cameras of undistorted ones; another --rasterize-mode or --background"
     )
+    if own_cameras:
+        causes = (
+            "Likely causes: the photographs or transforms.json have changed since the training, or the training was "
+            "stopped early"
+        )
     if match.in_view < _LEAST_IN_VIEW:
         raise ValueError(
             f"The cameras do not look at this splat: at most {match.in_view:.2%} of its Gaussians are in any of three "
             f"training views. {causes}. --check False lifts nevertheless."
         )
-    if match.psnr < match.grey_psnr:
+    if match.psnr < match.grey_psnr and not own_cameras:
         raise ValueError(
             f"The splat does not show what its photographs show: rendered from three of their cameras, it is further "
-            f"from them ({match.psnr:.1f} dB) than their mean colour is ({match.grey_psnr:.1f} dB). {causes}; another "
-            "--background. --check False lifts nevertheless."
+            f"from them ({match.psnr:.1f} dB) than their mean colour is ({match.grey_psnr:.1f} dB). {causes}. --check "
+            "False lifts nevertheless."
         )
     if match.focal != 1.0:
         return (
@@ -86,9 +93,8 @@ def judge(match: Match) -> str | None:
         )
     if match.psnr < LEAST_PSNR:
         return (
-            f"The splat reaches {match.psnr:.1f} dB on three photographs of its training, less than the "
-            f"{LEAST_PSNR:.0f} dB that one expects. Semantics will be as inexact. {causes}; another --background, or a "
-            "training that was stopped early."
+            f"The splat reaches {match.psnr:.1f} dB on three photographs of its training; {LEAST_PSNR:.0f} dB or more "
+            f"is usual. Semantics will be as inexact. {causes}."
         )
     return None
 

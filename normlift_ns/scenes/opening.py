@@ -94,7 +94,7 @@ def open_splat(
     >>> transforms, world = run.scene.location.folder / "transforms.json", config.parent / "dataparser_transforms.json"
     >>> scene = open_splat(folder / "splat.ply", SplatOptions(transforms=transforms, world_transform=world))
     >>> len(scene.gaussians) == len(rows), len(scene.train)
-    (True, 14)
+    (True, 12)
     """
     path = Path(path).absolute()
     cameras = read_camera_file(options)
