@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
-from normlift_ns.core.tensor_files import load_tensors, save_tensors
 
 _FORMAT = "normlift_ns.evidence/1"
 _COUNTS = ("num_views", "weight_power", "num_excluded")
@@ -309,10 +309,8 @@ class Evidence:
                 f"{path} is not an evidence file of this version: format {facts.get('format')!r}, expected {_FORMAT!r}"
             )
         try:
-            rows, unlabeled = (
-                SparseRows(*(tensors[name] for name in names))
-                for names in (("offsets", "region", "weight"), [f"unlabeled_{x}" for x in ("offsets", "column", "weight")])
-            )
+            rows = SparseRows(*(tensors[name] for name in ("offsets", "region", "weight")))
+            unlabeled = SparseRows(*(tensors[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
             region_view, counts = tensors["region_view"], [int(facts[name]) for name in _COUNTS]
             if region_view.ndim != 1 or region_view.dtype != torch.int32:
                 raise ValueError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")

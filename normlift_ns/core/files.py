@@ -18,7 +18,7 @@ from pathlib import Path
 
 from safetensors import SafetensorError
 
-from normlift_ns.core.atomic import exchange, held, hold, release, rename_new
+from normlift_ns.core.disk.atomic import exchange, held, hold, release, rename_new
 
 _TEMPORARY, _JOURNAL = ".normlift-", ".journal"
 _AGE = 86400
@@ -143,7 +143,9 @@ def clean(folder: Path) -> None:
     What a running process writes is left alone.
     """
     for temporary in folder.glob(f"{_TEMPORARY}*"):
-        with suppress(OSError, ValueError, LookupError, TypeError):  # a process holds it, it is another user's or no journal
+        with suppress(
+            OSError, ValueError, LookupError, TypeError
+        ):  # a process holds it, it is another user's or no journal
             descriptor = hold(temporary)
             try:
                 _complete(temporary)

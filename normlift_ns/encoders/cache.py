@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
-from normlift_ns.core.tensor_files import load_tensors, save_tensors
+from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, ViewFeatures, check_prompts

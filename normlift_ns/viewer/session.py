@@ -134,9 +134,14 @@ class Session:
         name = file_name("_".join(texts) if self.shown is None else texts[self.shown])
         folder.mkdir(exist_ok=True)
         path = free_path(folder / f"{name}.ply")
-        rows = write_splats(
-            path, parameters, self.field, self.answer, keep=chosen, spherical_harmonics=spherical_harmonics
-        )
+        try:
+            rows = write_splats(
+                path, parameters, self.field, self.answer, keep=chosen, spherical_harmonics=spherical_harmonics,
+                overwrite=True,
+            )  # fmt: skip
+        except BaseException:
+            path.unlink(missing_ok=True)  # the empty file that claims the name
+            raise
         return f"{len(rows):,} Gaussians written to {path}"
 
     def save(self, folder: Path | None) -> str:

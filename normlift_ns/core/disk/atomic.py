@@ -1,4 +1,4 @@
-"""What the operating system does in one step: locks that end with their process, renames that replace nothing, exchanges.
+"""What the system does in one step: locks that end with their process, renames that replace nothing, exchanges.
 
 Where a system has none of it (Windows, some network drives), the functions say so and the caller makes do.
 """
@@ -21,7 +21,7 @@ _UNKNOWN = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
 
 
 def hold(folder: Path, *, wait: bool = False) -> int | None:
-    """Locks a folder until the descriptor is closed or the process ends, however it ends; None where there are no locks.
+    """Locks a folder until `release`, or until the process ends, however it does; None where there are no locks.
 
     Raises:
         BlockingIOError: another process holds it, and `wait` is False.
