@@ -123,7 +123,7 @@ def block_evidence(
         dtype=dtype,
         progress=lambda *_: done(),
     )
-    evidence.save(path, key=path.stem, overwrite=True)
+    evidence.save(path, key=path.stem)
     return _of_regions(evidence, block)
 
 

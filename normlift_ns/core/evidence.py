@@ -266,14 +266,12 @@ class Evidence:
             unlabeled=self.unlabeled.to(device),
         )
 
-    def save(self, path: str | Path, *, key: str = "", overwrite: bool = False) -> str:
-        """Writes a safetensors file, complete or not at all; returns its digest.
+    def save(self, path: str | Path, *, key: str = "") -> str:
+        """Writes a safetensors file, complete or not at all, in place of an earlier one; returns its digest.
 
         Args:
             key: what finds the file again in a cache.
-            overwrite: replace a file of that name.
         Raises:
-            FileExistsError: there is one, and `overwrite` is False.
             OSError: it cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled
@@ -281,7 +279,7 @@ class Evidence:
         tensors |= {f"unlabeled_{name}": getattr(blank, name) for name in ("offsets", "column", "weight")}
         tensors["region_view"] = self.region_view
         facts = {"format": _FORMAT, **{name: str(getattr(self, name)) for name in _COUNTS}}
-        return save_tensors(Path(path), tensors, facts, key=key, overwrite=overwrite)
+        return save_tensors(Path(path), tensors, facts, key=key, overwrite=True)
 
     @staticmethod
     def load(path: str | Path, *, key: str = "") -> Evidence:

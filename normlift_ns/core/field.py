@@ -195,7 +195,7 @@ class SemanticField:
         (folder / MANIFEST).unlink(missing_ok=True)  # without it the folder is incomplete, and may be written to
         digests = {_FIELD: save_tensors(folder / _FIELD, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
-            digests[_EVIDENCE] = self.store.evidence.save(folder / _EVIDENCE, overwrite=True)
+            digests[_EVIDENCE] = self.store.evidence.save(folder / _EVIDENCE)
         else:
             (folder / _EVIDENCE).unlink(missing_ok=True)
         write_manifest(folder, self.manifest, digests)

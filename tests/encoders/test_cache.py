@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
 from normlift_ns.encoders.batches import Batches
@@ -150,13 +151,12 @@ def test_many_regions_survive(tmp_path):
 
 
 def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
-    def full(self, content):
-        with self.open("wb") as file:
-            file.write(content[:10])
-        raise OSError(28, "No space left on device")
+    def full(tensors, path, metadata):
+        path.write_bytes(b"half")
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=r"cannot keep 2D labels in .*No space left on device.*free disk space"):
+    monkeypatch.setattr("normlift_ns.core.disk.tensors.save_file", full)
+    with pytest.raises(OSError, match=r"cannot keep 2D labels: .*/regions/\w+\.safetensors cannot .*free disk space"):
         cached(counted, tmp_path).view(IMAGE, "a.jpg")
     assert list((tmp_path / "regions").iterdir()) == []
 

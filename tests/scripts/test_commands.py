@@ -121,7 +121,9 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
     fresh = []
     monkeypatch.setattr(lifting, "block_evidence", rasterize)
     original = lifting.Evidence.save
-    monkeypatch.setattr(lifting.Evidence, "save", lambda self, path: (fresh.append(path), original(self, path))[1])
+    monkeypatch.setattr(
+        lifting.Evidence, "save", lambda self, path, **rest: (fresh.append(path), original(self, path, **rest))[1]
+    )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
 

@@ -23,6 +23,7 @@ _DIGEST = "digest"
 
 
 LARGEST = torch.finfo(torch.float32).max
+"""Of the numbers in a file."""
 
 
 class TensorFile(NamedTuple):
@@ -116,7 +117,7 @@ def load_tensors(
 
 
 def check_tensor(
-    name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int], low: float, high: float = LARGEST
+    name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int], low: float | int, high: float | int = LARGEST
 ) -> None:
     """Makes sure that a tensor of a file is what the program is about to take it for.
 
