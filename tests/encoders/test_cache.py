@@ -1,7 +1,6 @@
 """The cache of regions and features: what finds an entry again, and what does not."""
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import pytest

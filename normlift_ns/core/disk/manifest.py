@@ -22,7 +22,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str,
     Args:
         facts: JSON types only.
     """
-    text = json.dumps({"digest": "", **facts, "digests": dict(digests)}, indent=2) + "\n"
+    content = {"digest": None, **facts} | {"digest": "", "digests": dict(digests)}  # its own first
+    text = json.dumps(content, indent=2) + "\n"
     write_text(folder / MANIFEST, text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1))
 
 
