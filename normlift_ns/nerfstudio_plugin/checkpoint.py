@@ -66,6 +66,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             f"{path} is truncated or no checkpoint: its {path.stat().st_size:,} bytes are not the zip archive that "
             "torch.save writes. Copy it again, or give another checkpoint with --load-step."
         )
+    _check_sums(path)
     try:
         with torch.serialization.safe_globals(numpy_numbers()):
             loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -92,6 +93,20 @@ def read_checkpoint(path: Path) -> Checkpoint:
             "Train the capture with: ns-train splatfacto --data ..."
         )
     return Checkpoint(path, loaded["step"], model)
+
+
+def _check_sums(path: Path) -> None:
+    """The archive has a CRC-32 of every tensor, which torch.load does not look at."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except Exception as error:  # whatever a damaged file makes zipfile raise
+        damaged = str(error)
+    if damaged is not None:
+        raise ValueError(
+            f"{path} is damaged ({damaged}): a checksum in it is not that of its content. "
+            "Copy it again, or give another checkpoint with --load-step."
+        )
 
 
 def _model_state(pipeline: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:
