@@ -257,7 +257,7 @@ def test_what_a_running_process_writes_is_left_alone(tmp_path: Path):
 def test_without_locks_only_old_leftovers_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """As on Windows and on some network drives."""
     for module in (files, atomic):
-        monkeypatch.setattr(module, "hold", lambda folder, wait=False: None)
+        monkeypatch.setattr(module, "hold", lambda folder: None)
     new, old, other = (tmp_path / name for name in (".normlift-1", ".normlift-2", ".other"))
     for folder in (new, old, other):
         folder.mkdir()
@@ -265,6 +265,14 @@ def test_without_locks_only_old_leftovers_are_removed(tmp_path: Path, monkeypatc
     os.utime(other, (0, 0))
     write_text(tmp_path / "a.txt", "text")
     assert sorted(p.name for p in tmp_path.iterdir()) == [".normlift-1", ".other", "a.txt"]
+
+
+def test_a_folder_that_another_program_has_locked_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(atomic, "_PATIENCE", 0.1)
+    descriptor = atomic.hold(tmp_path)
+    write_text(tmp_path / "a.txt", "text")
+    atomic.release(descriptor)
+    assert (tmp_path / "a.txt").read_text() == "text"
 
 
 def test_a_journal_leads_nowhere_else(tmp_path: Path):

@@ -9,6 +9,7 @@ import ctypes
 import errno
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,15 +17,17 @@ from pathlib import Path
 _NO_REPLACE, _EXCHANGE = 1, 2
 _HERE = -100
 """AT_FDCWD: relative paths start at the working directory."""
+_PATIENCE = 10.0
+"""Seconds; no process of ours needs more than a moment."""
 _UNKNOWN = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
 """What kernels, file systems and containers answer that know no such rename."""
 
 
-def hold(folder: Path, *, wait: bool = False) -> int | None:
+def hold(folder: Path) -> int | None:
     """Locks a folder until `release`, or until the process ends, however it does; None where there are no locks.
 
     Raises:
-        BlockingIOError: another process holds it, and `wait` is False.
+        BlockingIOError: another process holds it.
         OSError: no such folder.
     """
     if sys.platform == "win32":
@@ -33,7 +36,7 @@ def hold(folder: Path, *, wait: bool = False) -> int | None:
 
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
         raise
@@ -51,8 +54,14 @@ def release(descriptor: int | None) -> None:
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Waits for the lock of a folder, and keeps it for a moment."""
-    descriptor = hold(folder, wait=True)
+    """Waits for the lock of a folder, but not for ever: another program may have locked it for the whole of its work."""
+    descriptor, end = None, time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+        try:
+            descriptor = hold(folder)
+            break
+        except BlockingIOError:
+            time.sleep(0.005)
     try:
         yield
     finally:
