@@ -298,6 +298,19 @@ def test_tensors_of_any_kind_come_back(tensor: torch.Tensor, tmp_path: Path) -> 
         check_tensor("a", tensor, tensor.dtype, (*tensor.shape, 1), 0, 3)
 
 
+def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
+    contents = set()
+    for i in range(20):  # safetensors alone makes many files of it
+        tensors, facts = (
+            {"größe": torch.ones(3), "b\n\x01": torch.zeros(2).half()},
+            {"a": "1\t/", "b": "ü\x7f\\", "c": '"'},
+        )
+        save_tensors(tmp_path / str(i), tensors, facts)
+        contents.add((tmp_path / str(i)).read_bytes())
+        assert load_tensors(tmp_path / str(i)).facts == facts
+    assert len(contents) == 1
+
+
 def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
     facts = {"schema_version": 1, "digest": "mine", "text": '"digest": ""', "deep": {"digest": "", "ü": [1e-05, None]}}
     write_manifest(tmp_path, facts, {"a": "b"})

@@ -54,7 +54,7 @@ def release(descriptor: int | None) -> None:
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Waits for the lock of a folder, but not for ever: another program may have locked it for the whole of its work."""
+    """Waits for the lock of a folder, but not for ever: another program may have locked it for all of its work."""
     descriptor, end = None, time.monotonic() + _PATIENCE
     while time.monotonic() < end:
         try:

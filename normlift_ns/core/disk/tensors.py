@@ -80,7 +80,20 @@ def save_tensors(
     digest = tensor_digest(content, given, key)
     with new_file(path, overwrite=overwrite) as draft:
         save_file(content, draft, metadata={**given, _DIGEST: digest})
+        _sort_facts(draft)
     return digest
+
+
+def _sort_facts(path: Path) -> None:
+    """safetensors writes facts in any order; what is the same shall be the same file, bit for bit."""
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        ordered = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode().ljust(size)
+        if len(ordered) == size:  # else another release of safetensors writes its header in another way
+            file.seek(8)
+            file.write(ordered)
 
 
 def load_tensors(
