@@ -25,11 +25,11 @@ def plots(found: Documents, folder: Path) -> Iterator[Path]:
     yield plot_drift(signals, folder / "drift.svg")
     curves = ((key.split(".", 2)[1:], value) for key, value in fit.values.items() if key.startswith("curve."))
     rows = [{"parameter": name, "value": float(at), "miou": value} for (name, at), value in curves]
-    plot_sweeps(rows, "miou", "mIoU on held-out damage, points", folder / "sensitivity.svg")
+    plot_sweeps(rows, "miou", "mIoU on held-out damage, points", folder / "sensitivity.svg", overwrite=True)
     yield folder / "sensitivity.svg"
     start = f"tabletop.{STEP}."
     one = {k.removeprefix(start): value for k, value in signals.values.items() if k.startswith(start)}
-    plot_signals(one, folder / "reliability.svg")
+    plot_signals(one, folder / "reliability.svg", overwrite=True)
     yield folder / "reliability.svg"
 
 

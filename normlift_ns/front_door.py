@@ -12,6 +12,7 @@ from torch import Tensor
 
 from normlift_ns.asking import Question, encoder_settings, given_settings, make_question, with_texts
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.files import clean
 from normlift_ns.core.gpu import choose_device
 from normlift_ns.core.query import CANONICAL_NEGATIVES
 from normlift_ns.core.scene import Scene
@@ -26,8 +27,9 @@ from normlift_ns.runs.files import (
     TEXTS_FILE,
     cache_folder,
     load_field,
-    refuse_existing,
+    refuse_existing_run,
     run_directory,
+    tidy,
     with_paths,
 )
 from normlift_ns.scenes.match import judge, match_photographs
@@ -53,6 +55,8 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     """
     config, place = Path(load_config), None if data is None else Path(data)
     run_dir = Path(os.path.abspath(config)).parent
+    if not run_dir.exists():
+        clean(run_dir.parent)  # a lift that was killed while it replaced the run
     if config.is_file() and is_saved_splat(run_dir):
         return open_saved_splat(run_dir, data=place, load_step=load_step)
     from normlift_ns.nerfstudio_plugin.load import load_scene  # noqa: PLC0415 (nerfstudio takes 20 s)
@@ -126,7 +130,7 @@ def lift_run(
         queries: texts to store in the run; ns-render and ns-viewer show their relevancy.
         data, load_step: as in `open_scene`, for a config.
         output_dir: in place of the run's own outputs folder.
-        timestamp: name of the new run directory; None: the present time.
+        timestamp: name of the new run directory; None: the present time, with a number where a run has that name.
         overwrite: replace a run directory of that name, and exported files of other content.
         check: compare three training views with renders of the scene first; warn where they differ, and refuse splats
             that do not show what their photographs show.
@@ -168,7 +172,9 @@ def lift_run(
             f"lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got {type(scene).__name__}"
         )
     run_dir = run_directory(scene.runs_dir if output_dir is None else Path(output_dir), scene.name, timestamp)
-    refuse_existing(run_dir, overwrite)
+    tidy(run_dir)
+    if timestamp is not None:
+        refuse_existing_run(run_dir, overwrite)
     say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
     if check:
         warning = judge(match_photographs(scene), own_cameras=not isinstance(scene, SplatScene))
@@ -186,7 +192,9 @@ def lift_run(
         report=report,
     )  # fmt: skip
     question = _question(field, made, queries)
-    write_run(scene, field, run_dir, question=question, texts=texts, overwrite=overwrite)
+    run_dir = write_run(
+        scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
+    )
     return LiftedRun(run_dir, scene, with_paths(field.to("cpu"), run_dir / FIELD_FOLDER), device, seconds)
 
 

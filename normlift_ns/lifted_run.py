@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Int64, UInt8
@@ -24,7 +24,7 @@ from normlift_ns.options import Rule
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.runs.files import FIELD_FOLDER, texts_cache
 from normlift_ns.runs.question import load_question, save_question
-from normlift_ns.runs.splats import write_splats
+from normlift_ns.runs.splats import export_files, write_splats
 from normlift_ns.viewer.display import draw, make_display
 
 
@@ -126,6 +126,7 @@ class LiftedRun:
         part: Answer | Finding | Bool[Tensor, " n"] | None = None,
         *,
         answer: Answer | None = None,
+        objects: Mapping[str, Any] | None = None,
         overwrite: bool = False,
     ) -> Int64[ndarray, " m"]:
         """Writes Gaussians to a PLY file, and beside it their rows in the scene as <stem>_rows.npy; returns those rows.
@@ -133,13 +134,14 @@ class LiftedRun:
         Args:
             part: what an answer, or one of its findings, selects; or a mask of Gaussians; None: the whole scene.
             answer: whose relevancies and labels the file gets; None: that of `part`, if it has one.
-            overwrite: replace files of these names.
+            objects: a table to write beside it as <stem>_objects.json, JSON types only.
+            overwrite: replace files of these names; without `objects`, an earlier table of them goes.
         Raises:
             FileExistsError: a file is there and `overwrite` is False.
             ValueError: no Gaussian of the part is ever drawn; a mask of another type or length.
         """
         path = Path(path)
-        for file in (path, path.with_name(f"{path.stem}_rows.npy")):
+        for file in export_files(path)[: 2 if objects is None else 3]:
             if file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
         if isinstance(part, Answer | Finding):
@@ -160,6 +162,8 @@ class LiftedRun:
             keep=keep,
             spherical_harmonics=self.scene.has_harmonics,
             rasterize_mode=self.scene.rasterize_mode,
+            objects=objects,
+            overwrite=overwrite,
         )
 
     def camera(self, view: str | Path | int) -> Camera:

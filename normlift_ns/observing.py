@@ -107,14 +107,11 @@ def block_evidence(
     tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, *block.labels]
     tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
     path = folder / f"{_digest(facts, tensors)}.safetensors"
-    if reuse and path.exists():
-        try:
-            evidence = Evidence.load(path).to(gaussians.means.device)
-            for _ in block.cameras:
-                done()
-            return _of_regions(evidence, block)
-        except ValueError:  # damaged: rasterize again
-            path.unlink()
+    evidence = _kept(path) if reuse else None
+    if evidence is not None:
+        for _ in block.cameras:
+            done()
+        return _of_regions(evidence.to(gaussians.means.device), block)
     evidence = rasterize_evidence(
         gaussians,
         block.cameras,
@@ -126,9 +123,16 @@ def block_evidence(
         dtype=dtype,
         progress=lambda *_: done(),
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    evidence.save(path)
+    evidence.save(path, key=path.stem)
     return _of_regions(evidence, block)
+
+
+def _kept(path: Path) -> Evidence | None:
+    """Evidence that was rasterized before; None also where the file is damaged, or is that of another block."""
+    try:
+        return Evidence.load(path, key=path.stem)
+    except (FileNotFoundError, ValueError):
+        return None
 
 
 def _of_regions(evidence: Evidence, block: Block) -> Evidence:

@@ -32,7 +32,7 @@ BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 FOREIGN = {
     "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
-    "core": BASE,
+    "core": BASE | {"xxhash"},
     "raster": {"torch", "numpy", "jaxtyping", "numba", "gsplat"},
     "encoders": BASE | {"open_clip", "matplotlib", "skimage", "PIL", "huggingface_hub", "torchvision"},
     "observing": {"torch", "jaxtyping"},

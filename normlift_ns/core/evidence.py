@@ -12,14 +12,13 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 
 _FORMAT = "normlift_ns.evidence/1"
+_COUNTS = ("num_views", "weight_power", "num_excluded")
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels without a region, and of pixels that are no observation at all."""
@@ -267,43 +266,57 @@ class Evidence:
             unlabeled=self.unlabeled.to(device),
         )
 
-    def save(self, path: str | Path) -> None:
-        """Writes a safetensors file, complete or not at all."""
+    def save(self, path: str | Path, *, key: str = "") -> str:
+        """Writes a safetensors file, complete or not at all, in place of an earlier one; returns its digest.
+
+        Args:
+            key: what finds the file again in a cache.
+        Raises:
+            OSError: it cannot be written, for instance because the disk is full.
+        """
         rows, blank = self.rows, self.unlabeled
         tensors = {"offsets": rows.offsets, "region": rows.column, "weight": rows.weight}
         tensors |= {f"unlabeled_{name}": getattr(blank, name) for name in ("offsets", "column", "weight")}
         tensors["region_view"] = self.region_view
-        metadata = {name: str(getattr(self, name)) for name in ("num_views", "weight_power", "num_excluded")}
-        with atomic_path(Path(path)) as temporary:
-            save_file(
-                {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
-                temporary,
-                metadata={"format": _FORMAT, **metadata},
-            )
+        facts = {"format": _FORMAT, **{name: str(getattr(self, name)) for name in _COUNTS}}
+        return save_tensors(Path(path), tensors, facts, key=key, overwrite=True)
 
     @staticmethod
-    def load(path: str | Path) -> Evidence:
+    def load(path: str | Path, *, key: str = "") -> Evidence:
         """Reads what `save` wrote.
 
+        Args:
+            key: as it was given then; a file with a key that has no digest, as version 0.1 wrote it, is refused.
         Raises:
             FileNotFoundError: no such file.
             ValueError: not an evidence file, or a damaged one.
         """
+        return Evidence.read(Path(path), key=key)[0]
+
+    @staticmethod
+    def read(path: Path, *, key: str = "", remedy: str = "rasterize again") -> tuple[Evidence, str | None]:
+        """`load`, with the digest of the file; None for one of version 0.1.
+
+        Args:
+            remedy: what to do about a damaged file, for the message.
+        """
+        old = None if key else ("format", *_COUNTS)
+        tensors, facts, digest = load_tensors(path, key=key, undigested=old, remedy=remedy)
+        if facts.get("format") != _FORMAT:
+            raise ValueError(
+                f"{path} is not an evidence file of this version: format {facts.get('format')!r}, expected {_FORMAT!r}"
+            )
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                if metadata.get("format") != _FORMAT:
-                    raise ValueError(
-                        f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "
-                        f"{_FORMAT!r}"
-                    )
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (safe_open is no mapping)
-        except SafetensorError as error:
-            raise ValueError(f"{path} is damaged or no safetensors file ({error}); rasterize again") from error
-        rows = SparseRows(tensors["offsets"], tensors["region"], tensors["weight"])
-        unlabeled = SparseRows(*(tensors[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
-        counts = (int(metadata[name]) for name in ("num_views", "weight_power", "num_excluded"))
-        return Evidence(rows, tensors["region_view"], unlabeled, *counts)
+            rows = SparseRows(*(tensors[name] for name in ("offsets", "region", "weight")))
+            unlabeled = SparseRows(*(tensors[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
+            region_view, counts = tensors["region_view"], [int(facts[name]) for name in _COUNTS]
+            if region_view.ndim != 1 or region_view.dtype != torch.int32:
+                raise ValueError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")
+            rows.check("weights of regions", len(region_view))
+            unlabeled.check("weights of unlabelled pixels", counts[0])
+            return Evidence(rows, region_view, unlabeled, *counts), digest
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{path} is damaged ({error}); {remedy}") from error
 
 
 def _column_table(

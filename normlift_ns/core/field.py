@@ -5,7 +5,6 @@ answers text.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -13,19 +12,25 @@ from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int, Int32
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from normlift_ns.core.disk.manifest import (
+    MANIFEST,
+    REMEDY,
+    SCHEMA_VERSION,
+    check_digests,
+    read_manifest,
+    write_manifest,
+)
+from normlift_ns.core.disk.tensors import LARGEST, check_tensor, load_tensors, save_tensors
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.files import atomic_path
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import smallest_basis
 from normlift_ns.core.query import relevancy
 from normlift_ns.core.storage import StoredDirections, StoredEvidence, sizes_and_bounds, store_directions
 from normlift_ns.options import Rule, Storage
 
-SCHEMA_VERSION = 1
+_FIELD, _EVIDENCE = "field.safetensors", "evidence.safetensors"
 
 
 @dataclass(frozen=True)
@@ -176,27 +181,24 @@ class SemanticField:
     def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Writes field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
 
-        A folder with a manifest is complete.
+        A folder with a manifest is complete. The manifest holds the digests of the files.
 
         Raises:
             FileExistsError: the folder holds a field and `overwrite` is False.
+            OSError: it cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
-        if (folder / "manifest.json").exists() and not overwrite:
+        if (folder / MANIFEST).exists() and not overwrite:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "manifest.json").unlink(missing_ok=True)
-        tensors = dict(_tensors(self))
+        (folder / MANIFEST).unlink(missing_ok=True)  # without it the folder is incomplete, and may be written to
+        digests = {_FIELD: save_tensors(folder / _FIELD, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
-            self.store.evidence.save(folder / "evidence.safetensors")
+            digests[_EVIDENCE] = self.store.evidence.save(folder / _EVIDENCE)
         else:
-            (folder / "evidence.safetensors").unlink(missing_ok=True)
-        with atomic_path(folder / "field.safetensors") as temporary:
-            save_file({name: tensor.contiguous().cpu() for name, tensor in tensors.items()}, temporary)
-        with atomic_path(folder / "manifest.json") as temporary:
-            temporary.write_text(json.dumps(dict(self.manifest), indent=2) + "\n")
+            (folder / _EVIDENCE).unlink(missing_ok=True)
+        write_manifest(folder, self.manifest, digests)
 
     @staticmethod
     def load(
@@ -208,35 +210,27 @@ class SemanticField:
             checkpoint: where the means come from, for the message.
         Raises:
             FileNotFoundError: no complete field in the folder.
-            ValueError: another schema, a damaged file, or a field of other Gaussians.
+            ValueError: another schema, a damaged file, or a field of other Gaussians; the message names it.
         """
         folder = Path(folder)
-        if not (folder / "manifest.json").exists():
-            raise FileNotFoundError(
-                f"{folder} holds no complete semantic field (manifest.json is missing); lift again with: "
-                "ns-normlift --load-config ..."
-            )
+        manifest, digests = read_manifest(folder)
         try:
-            manifest = json.loads((folder / "manifest.json").read_text())
-            if manifest.get("schema_version") != SCHEMA_VERSION:
-                raise ValueError(
-                    f"{folder}: schema version {manifest.get('schema_version')!r}, this program reads "
-                    f"{SCHEMA_VERSION}; lift again"
-                )
             if means is not None:
                 _check_belongs(manifest, means, folder, checkpoint)
-            tensors = load_file(folder / "field.safetensors")
-            scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
+            tensors, _, digest = load_tensors(folder / _FIELD, undigested=(), remedy=REMEDY)
+            found, evidence = {_FIELD: digest}, None
             if manifest["form"] == "evidence":
-                store = StoredEvidence(Evidence.load(folder / "evidence.safetensors"), tensors["features"])
-            else:
-                store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
-            return SemanticField(scalars, tensors["source"], store, manifest)
-        except (SafetensorError, json.JSONDecodeError, KeyError) as error:
-            raise ValueError(
-                f"the semantic field in {folder} is damaged ({type(error).__name__}: {error}); lift again with: "
-                "ns-normlift --load-config ..."
-            ) from error
+                evidence, found[_EVIDENCE] = Evidence.read(folder / _EVIDENCE, remedy=REMEDY)
+            check_digests(folder, found, digests)
+            _check_tensors(folder / _FIELD, tensors, manifest, evidence)
+        except KeyError as error:
+            raise ValueError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
+        scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
+        if evidence is not None:
+            store = StoredEvidence(evidence, tensors["features"])
+        else:
+            store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
+        return SemanticField(scalars, tensors["source"], store, manifest)
 
 
 def fingerprint(means: Float[Tensor, "n 3"]) -> str:
@@ -261,14 +255,39 @@ def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
             yield "basis", store.basis
 
 
+def _check_tensors(
+    path: Path, tensors: Mapping[str, Tensor], manifest: Mapping[str, Any], evidence: Evidence | None
+) -> None:
+    """Makes sure that nothing in the arrays leads outside of them, and that all numbers are numbers."""
+    n, dimension = int(manifest["num_gaussians"]), int(manifest["dimension"])
+    try:
+        check_tensor("source", tensors["source"], torch.int32, (n,), 0, n - 1)
+        for f in fields(Scalars):
+            dtype = torch.int32 if f.name == "view_count" else torch.float32
+            check_tensor(f.name, tensors[f.name], dtype, (n,), 0)
+        if evidence is not None:
+            check_tensor("features", tensors["features"], torch.float32, (evidence.num_regions, dimension), -LARGEST)
+            if evidence.num_gaussians != n:
+                raise ValueError(f"{_EVIDENCE} has {evidence.num_gaussians} Gaussians, expected {n}")
+            return
+        rank = dimension
+        if manifest["form"] == "low_rank":
+            rank = len(tensors["basis"])
+            check_tensor("basis", tensors["basis"], torch.float32, (rank, dimension), -LARGEST)
+        rows = int((tensors["norm"] > 0).sum())
+        check_tensor("coordinates", tensors["coordinates"], torch.float16, (rows, rank), -LARGEST)
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}; {REMEDY}") from error
+
+
 def _check_belongs(manifest: Mapping[str, Any], means: Tensor, folder: Path, checkpoint: str | Path) -> None:
     if manifest["num_gaussians"] != len(means):
         raise ValueError(
             f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "
-            f"{len(means)}; lift again with: ns-normlift --load-config ..."
+            f"{len(means)}; {REMEDY}"
         )
     if manifest["means_fingerprint"] != fingerprint(means):
         raise ValueError(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
-            "number, other means); lift again with: ns-normlift --load-config ..."
+            f"number, other means); {REMEDY}"
         )

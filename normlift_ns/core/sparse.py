@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Float64, Int, Int32, Int64
@@ -89,6 +91,44 @@ class SparseRows:
     def __len__(self) -> int:
         return self.offsets.numel() - 1
 
+    @cached_property
+    def num_columns(self) -> int:
+        """Least number of columns that holds all entries.
+
+        Raises:
+            ValueError: arrays that are no matrix, and would lead into foreign memory.
+        """
+        size, lengths = self.column.numel(), self.offsets.diff()
+        ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []
+        if ends != [0, size] or self.weight.numel() != size or bool((lengths < 0).any()):
+            raise ValueError(
+                f"offsets of rows must rise from 0 to the number of entries, found {ends} for {size} columns and "
+                f"{self.weight.numel()} weights"
+            )
+        low, high = (int(x) for x in self.column.aminmax()) if size > 0 else (0, -1)
+        if low < 0:
+            raise ValueError(f"columns must be 0 or more, found {low}")
+        return high + 1
+
+    def check(self, name: str, num_columns: int) -> None:
+        """Makes sure that the arrays, which may come from a file, describe weights in a matrix of so many columns.
+
+        Args:
+            name: of the matrix, for the message.
+        Raises:
+            ValueError: another type or shape, entries outside the matrix, weights that are negative or not finite.
+        """
+        weights = torch.float64 if self.weight.dtype == torch.float64 else torch.float32
+        arrays = (("offsets", self.offsets, torch.int64), ("columns", self.column, torch.int32))
+        for what, array, dtype in (*arrays, ("weights", self.weight, weights)):
+            if array.ndim != 1 or array.dtype != dtype:
+                raise ValueError(f"{name}: {what} are {array.dtype} {tuple(array.shape)}, expected one row of {dtype}")
+        if self.num_columns > num_columns:
+            raise ValueError(f"{name}: columns reach to {self.num_columns - 1}, expected 0..{num_columns - 1}")
+        least, most = (float(x) for x in self.weight.aminmax()) if len(self.weight) > 0 else (0, 0)
+        if not 0 <= least <= most < math.inf:
+            raise ValueError(f"{name}: weights are in {least}..{most}, expected finite ones that are not negative")
+
     def to(self, device: torch.device | str) -> SparseRows:
         """A copy on another device."""
         return SparseRows(self.offsets.to(device), self.column.to(device), self.weight.to(device))
@@ -134,6 +174,8 @@ class SparseRows:
             columns = [sums.product(self.offsets, self.column, self.weight, x.contiguous()) for x in table.T]
             return torch.stack(columns, dim=1)
         if table.device.type == "cpu" and table.shape[1] <= _FEW_COLUMNS:  # ten times as fast as a bag of one column
+            if self.num_columns > len(table):
+                raise ValueError(f"a matrix with {self.num_columns} columns needs as many rows, got {len(table)}")
             offsets = self.offsets.int() if self.weight.numel() < 2**31 else self.offsets
             arrays = (x.numpy() for x in (self.weight, self.column, offsets))
             product = csr_array(tuple(arrays), shape=(len(self), len(table))) @ table.numpy()

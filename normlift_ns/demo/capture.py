@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from normlift_ns.core.files import new_file, write_text
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.demo.room import DemoRoom
 from normlift_ns.raster.rasterize import render
@@ -57,12 +58,14 @@ def write_capture(
     instance/0000.png … as `view_labels` gives them, and labels.json: {"labels": {"1": name, …}, "background": 0}.
     """
     cameras = [*demo_cameras(views, width, height), *held_out_cameras(held_out, width, height)]
-    for name in ("images", "instance"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
     paths = [f"images/{i:04d}.png" for i in range(len(cameras))]
     for path, camera in zip(paths, cameras):
-        Image.fromarray(view_image(room, camera).numpy()).save(folder / path)
-        Image.fromarray(view_labels(room, camera).numpy()).save(folder / "instance" / Path(path).name)
+        for file, pixels in (
+            (path, view_image(room, camera)),
+            (f"instance/{Path(path).name}", view_labels(room, camera)),
+        ):
+            with new_file(folder / file, overwrite=True) as draft:
+                Image.fromarray(pixels.numpy()).save(draft)
     (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
     transforms = {
         "camera_model": "OPENCV",
@@ -75,7 +78,7 @@ def write_capture(
     }
     labels = {"labels": {str(i): name for i, name in enumerate(room.names, 1)}, "background": 0}
     for name, content in (("transforms.json", transforms), ("labels.json", labels)):
-        (folder / name).write_text(json.dumps(content, indent=1))
+        write_text(folder / name, json.dumps(content, indent=1), overwrite=True)
 
 
 def _look(place: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int) -> Camera:

@@ -1,7 +1,7 @@
 """Regions and features kept on disk per image, so that an interrupted run resumes and a second one computes neither.
 
-An entry is found again by the content of all that it was made from. Files appear complete or not at all; a damaged one
-is computed again. The folders may be deleted at any time.
+An entry is found again by the content of all that it was made from. Files appear complete or not at all; one that is
+damaged, or stands under the name of another, is computed again. The folders may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float32, Int32, UInt8
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, ViewFeatures, check_prompts
@@ -202,22 +200,15 @@ def _path(folder: Path, identity: dict[str, Any], *content: bytes) -> Path:
 
 
 def _read(path: Path, name: str) -> Tensor | None:
+    """What was kept; None also where the file is damaged, or is that of another image."""
     try:
-        with safe_open(path, framework="pt") as file:
-            tensor, digest = file.get_tensor(name), (file.metadata() or {}).get("digest")
-    except (FileNotFoundError, SafetensorError):
+        return load_tensors(path, key=path.stem).tensors[name]
+    except (FileNotFoundError, ValueError, KeyError):
         return None
-    return tensor if digest == _digest(*_parts(tensor)) else None
 
 
 def _write(path: Path, name: str, tensor: Tensor) -> None:
-    content = save({name: tensor.contiguous()}, metadata={"digest": _digest(*_parts(tensor))})
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(content)
+        save_tensors(path, {name: tensor}, key=path.stem, overwrite=True)
     except OSError as error:
-        raise OSError(
-            f"cannot keep 2D {name} in {path.parent} ({error}); free disk space or choose another folder, then run "
-            "again: the views that are done are found there"
-        ) from error
+        raise OSError(f"cannot keep 2D {name}: {error}; the views that are done are found there") from error

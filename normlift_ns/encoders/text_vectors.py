@@ -17,8 +17,12 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.disk.tensors import tensor_digest
+from normlift_ns.core.files import new_file
 from normlift_ns.encoders.source import check_prompts
+
+_SEAL = b"normlift_ns "
+"""How the comment begins of an archive that we wrote; the digest follows. Those of NumPy have none."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,10 @@ class TextVectors:
     def _vectors(self) -> dict[str, Tensor]:
         try:
             with np.load(self.file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
+                arrays, comment = {name: archive[name] for name in archive.files}, archive.zip.comment
+            expected = _seal({name: torch.from_numpy(array) for name, array in arrays.items()})
+            if comment.startswith(_SEAL) and comment != expected:
+                raise ValueError(f"its content has {expected.decode()!r}, expected {comment.decode()!r}")
         except Exception as error:  # whatever a foreign file makes NumPy and zipfile raise
             raise ValueError(
                 f"file of text vectors {self.file} is damaged or no NPZ file ({error}); write it again with "
@@ -102,9 +109,19 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -
 
 
 def write_text_vectors(file: Path, vectors: Mapping[str, Tensor]) -> None:
-    """Writes what `TextVectors` reads, as unit vectors in float32, complete or not at all."""
-    with atomic_path(file) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for text, vector in vectors.items():  # numpy.savez takes no text that is called "file"
-            unit = normalize(vector.double().cpu(), dim=0).float()  # float32 would lose tiny and huge ones
+    """Writes what `TextVectors` reads, as unit vectors in float32, complete or not at all, with a digest.
+
+    Raises:
+        FileExistsError, OSError: as `new_file`.
+    """
+    units = {text: normalize(vector.double().cpu(), dim=0).float() for text, vector in vectors.items()}
+    with new_file(file) as draft, zipfile.ZipFile(draft, "w") as archive:
+        for text, unit in units.items():  # numpy.savez takes no text that is called "file"
             with archive.open(f"{text}.npy", "w") as entry:
                 np.lib.format.write_array(entry, unit.numpy(), allow_pickle=False)
+        archive.comment = _seal(units)
+
+
+def _seal(vectors: Mapping[str, Tensor]) -> bytes:
+    """The comment of an archive of ours, with its digest."""
+    return _SEAL + tensor_digest(vectors, {}).encode()

@@ -9,13 +9,18 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from normlift_ns.core.files import new_file
 
-def plot_sweeps(rows: Sequence[Mapping[str, Any]], metric: str, label: str, path: Path) -> None:
+
+def plot_sweeps(
+    rows: Sequence[Mapping[str, Any]], metric: str, label: str, path: Path, *, overwrite: bool = False
+) -> None:
     """One panel per parameter of `votes.SWEEPS`, the metric over its values.
 
     Args:
         rows: with parameter, value and the metric.
         label: of the metric's axis.
+        overwrite: replace a file of that name.
     """
     parameters = list(dict.fromkeys(row["parameter"] for row in rows))
     figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
@@ -25,10 +30,10 @@ def plot_sweeps(rows: Sequence[Mapping[str, Any]], metric: str, label: str, path
         one.set_xlabel(parameter)
         one.grid(alpha=0.3)
     axes[0].set_ylabel(label)
-    _save(figure, path)
+    _save(figure, path, overwrite)
 
 
-def plot_signals(found: Mapping[str, Any], path: Path) -> None:
+def plot_signals(found: Mapping[str, Any], path: Path, *, overwrite: bool = False) -> None:
     """Accuracy in tenths by R and by ||f||, where there is a truth, and the histogram of R with R = 0 apart."""
     bins = {name: [found[k] for k in found if k.startswith(f"{name}.bin")] for name in ("reliability", "norm")}
     figure, axes = _figure((9, 3.5), 1, 2)
@@ -46,7 +51,7 @@ def plot_signals(found: Mapping[str, Any], path: Path) -> None:
     axes[1].legend()
     for one in axes:
         one.grid(axis="y", alpha=0.3)
-    _save(figure, path)
+    _save(figure, path, overwrite)
 
 
 def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
@@ -55,5 +60,6 @@ def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) 
     return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
 
 
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+def _save(figure: Figure, path: Path, overwrite: bool) -> None:
+    with new_file(path, overwrite=overwrite) as draft:
+        figure.savefig(draft, metadata={"Date": None} if path.suffix == ".svg" else None)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.files import write_text
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,13 @@ def write_evaluation(
     method_name: str,
     checkpoint: str,
     studies: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Writes experiment_name, method_name, checkpoint and results as ns-eval does, then settings, rows and studies;
     NaN as null.
+
+    Raises:
+        FileExistsError: the file is there and `overwrite` is False.
     """
     document = {
         "experiment_name": experiment_name,
@@ -55,9 +59,7 @@ def write_evaluation(
         "rows": evaluation.rows,
         **({"studies": studies} if studies else {}),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(_plain(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
 
 
 def _plain(value: Any) -> Any:

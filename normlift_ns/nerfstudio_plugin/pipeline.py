@@ -15,7 +15,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.asking import encoder_settings, make_question
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
@@ -141,8 +141,7 @@ def lift_trained(trainer: Trainer) -> Path:
         question = make_question(result.field, source, options.queries)
         save_question(folder, question)
     trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
-    with atomic_path(path) as temporary:
-        temporary.write_text(yaml.dump(trainer.config), "utf8")
+    write_text(path, yaml.dump(trainer.config), overwrite=True)
     with trainer.train_lock:
         pipeline.model.attach(result.field, question)
     viewer: Any = trainer.viewer_state

@@ -11,17 +11,17 @@ from typing import Any
 import torch
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
-from safetensors import SafetensorError
 from torch import Tensor
 
 from normlift_ns.asking import Question
 from normlift_ns.core.field import SemanticField, fingerprint
+from normlift_ns.core.files import draft_directory, new_file, numbered, publish, write_text
 from normlift_ns.encoders.text_vectors import write_text_vectors
 from normlift_ns.nerfstudio_plugin.config import set_data, skip_seed_points
 from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
 from normlift_ns.nerfstudio_plugin.splat_config import splat_config
-from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, complete_directory, refuse_existing
+from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, refuse_existing_run, tidy
 from normlift_ns.runs.question import save_question
 from normlift_ns.scenes.checkpoint import Checkpoint
 from normlift_ns.scenes.opening import SplatScene
@@ -36,8 +36,9 @@ def write_run(
     question: Question | None = None,
     texts: Mapping[str, Tensor] | None = None,
     overwrite: bool = False,
-) -> None:
-    """Writes a lifted run, complete or not at all.
+    exact: bool = True,
+) -> Path:
+    """Writes a lifted run, complete or not at all; returns its directory.
 
     It holds config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model, without
     optimizers), dataparser_transforms.json and the field in normlift/. Relative paths of the source's config stay
@@ -49,31 +50,36 @@ def write_run(
         question: what to draw as relevancy_0, relevancy_1, …
         texts: vectors of the user's own, by text.
         overwrite: replace a directory of that name.
+        exact: False: where something has that name, the run is called <name>_2, <name>_3, …
     Raises:
-        FileExistsError: the directory exists and `overwrite` is False.
+        FileExistsError: the directory exists, `exact` is True and `overwrite` False.
         ValueError: a field of other Gaussians.
         OSError: it cannot be written, for instance because the disk is full; nothing is left then.
     """
-    refuse_existing(run_dir, overwrite)
+    tidy(run_dir)
+    if exact:
+        refuse_existing_run(run_dir, overwrite)
     if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
         raise ValueError(
             f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
             f"{source.checkpoint_path}; lift that again."
         )
-    splat = isinstance(source, SplatScene)
-    config = splat_config(source, run_dir) if splat else _lifted_config(source, run_dir)
-    with complete_directory(run_dir) as folder:
-        try:
-            _write_tensors(folder, source, field, question, texts)
-        except (RuntimeError, SafetensorError) as error:  # what torch and safetensors make of a full disk
-            raise OSError(f"{run_dir} cannot be written: {error}") from error
-        if splat:
+    with draft_directory(run_dir) as folder:
+        _write_tensors(folder, source, field, question, texts)
+        if isinstance(source, SplatScene):
             save_splat(folder, source)
             transform = {"transform": torch.eye(4)[:3].tolist(), "scale": 1.0}
         else:
             transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
-        (folder / "dataparser_transforms.json").write_text(json.dumps(transform, indent=4), "utf8")
-        (folder / "config.yml").write_text(yaml.dump(config), "utf8")
+        write_text(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
+        for place in (run_dir,) if exact else numbered(run_dir):
+            of_splat = isinstance(source, SplatScene)
+            config = splat_config(source, place) if of_splat else _lifted_config(source, place)
+            write_text(folder / "config.yml", yaml.dump(config), overwrite=True)
+            if publish(folder, place, overwrite=overwrite and exact):
+                return place
+    refuse_existing_run(run_dir, overwrite=False)  # another process was faster
+    raise FileExistsError(f"{run_dir} was there a moment ago; lift again")
 
 
 def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
@@ -107,8 +113,8 @@ def _write_tensors(
     if texts:
         write_text_vectors(folder / FIELD_FOLDER / TEXTS_FILE, texts)
     checkpoint = checkpoint_of(source) if isinstance(source, SplatScene) else _slim(source.checkpoint)
-    (folder / CHECKPOINT_FOLDER).mkdir()
-    torch.save(checkpoint, folder / CHECKPOINT_FOLDER / f"step-{checkpoint['step']:09d}.ckpt")
+    with new_file(folder / CHECKPOINT_FOLDER / f"step-{checkpoint['step']:09d}.ckpt") as draft:
+        torch.save(checkpoint, draft)
 
 
 def _slim(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -1,11 +1,8 @@
-"""Where the files of a lifted run are, and how its directory appears complete or not at all."""
+"""Where the files of a lifted run are."""
 
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -14,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.files import clean, refuse_existing
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
@@ -77,25 +75,12 @@ def with_paths(field: SemanticField, folder: Path) -> SemanticField:
     return replace(field, manifest={**field.manifest, "encoder": {**encoder, "text_vectors": path}})
 
 
-def refuse_existing(run_dir: Path, overwrite: bool) -> None:
+def tidy(run_dir: Path) -> None:
+    """Completes and removes what lifts that were killed have left beside a run directory and in its cache."""
+    for folder in (run_dir.parent, *cache_folder(run_dir).glob("*")):
+        clean(folder)
+
+
+def refuse_existing_run(run_dir: Path, overwrite: bool) -> None:
     """Raises FileExistsError if the directory is there and may not be replaced."""
-    if run_dir.exists() and not overwrite:
-        raise FileExistsError(f"{run_dir} exists; give another --timestamp or --output-dir, or --overwrite True.")
-
-
-@contextmanager
-def complete_directory(path: Path) -> Iterator[Path]:
-    """A temporary directory that takes the place of `path` if all goes well, and vanishes if not, Ctrl-C included."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{kind}") for kind in ("tmp", "old"))
-    temporary.mkdir()
-    try:
-        yield temporary
-        if path.exists():
-            path.rename(old)
-        temporary.rename(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if old.exists() and not path.exists():
-            old.rename(path)
-        shutil.rmtree(old, ignore_errors=True)
+    refuse_existing(run_dir, overwrite=overwrite, instead="--timestamp or --output-dir")

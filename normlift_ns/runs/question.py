@@ -9,16 +9,14 @@ import json
 from pathlib import Path
 from typing import get_args
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-
 from normlift_ns.asking import Question
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.options import Rule
 
 QUERIES_FILE = "queries.safetensors"
 """In the folder of the field: vectors, and everything else as JSON in the file's metadata."""
 _KEY = "question"
+_REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save True"
 
 
 def save_question(folder: Path, question: Question) -> Path:
@@ -26,12 +24,8 @@ def save_question(folder: Path, question: Question) -> Path:
     rule = {"form": question.rule, "threshold": question.threshold, "min_reliability": question.min_reliability}
     facts = {"texts": question.texts, "negatives": question.negatives, "refined": question.refined, **rule}
     tensors = {"vectors": question.vectors, "negative_vectors": question.negative_vectors}
-    with atomic_path(folder / QUERIES_FILE) as temporary:
-        save_file(
-            {name: value.contiguous().cpu() for name, value in tensors.items() if value is not None},
-            temporary,
-            metadata={_KEY: json.dumps(facts)},
-        )
+    given = {name: value for name, value in tensors.items() if value is not None}
+    save_tensors(folder / QUERIES_FILE, given, {_KEY: json.dumps(facts)}, overwrite=True)
     return folder / QUERIES_FILE
 
 
@@ -45,9 +39,8 @@ def load_question(folder: Path) -> Question | None:
     if not path.exists():
         return None
     try:
-        with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {})[_KEY])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+        tensors, stored, _ = load_tensors(path, undigested=(_KEY,), remedy=_REMEDY)
+        facts = json.loads(stored[_KEY])
         question = Question(
             texts=tuple(map(str, facts["texts"])),
             vectors=tensors["vectors"],
@@ -60,9 +53,6 @@ def load_question(folder: Path) -> Question | None:
         )
         if len(question.vectors) != len(question.texts) or question.rule not in get_args(Rule):
             raise ValueError(f"{len(question.vectors)} vectors of {len(question.texts)} texts, rule {question.rule!r}")
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path} is damaged ({type(error).__name__}: {error}). Delete it, or store the queries again with: "
-            "ns-normlift-query --load-config ... --text ... --save True"
-        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
     return question

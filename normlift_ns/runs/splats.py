@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 
 from normlift_ns.asking import Answer
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.files import new_files
 from normlift_ns.core.query import strongest
 from normlift_ns.options import RasterizeMode
 
@@ -73,6 +75,8 @@ def write_splats(
     keep: Bool[Tensor, " n"],
     spherical_harmonics: bool,
     rasterize_mode: RasterizeMode,
+    objects: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
 ) -> Int64[np.ndarray, " m"]:
     """Writes path (PLY) and, beside it, the row of every vertex in the scene as <stem>_rows.npy; returns those rows.
 
@@ -81,8 +85,12 @@ def write_splats(
         rasterize_mode: how the scene was rasterized in its training; other tools take it for classic unless the file
             says otherwise.
         keep: the Gaussians wanted; of them those of `exported_rows` are written.
+        objects: a table for <stem>_objects.json; None: no table, and `overwrite` removes that of an earlier export.
+        overwrite: replace files of these names.
     Raises:
+        FileExistsError: there are such, and `overwrite` is False.
         ValueError: none of them can be written.
+        OSError: the disk is full, or the like.
     """
     from plyfile import PlyData, PlyElement  # noqa: PLC0415 (import-light: every ns-* command loads this module)
 
@@ -99,12 +107,24 @@ def write_splats(
     if rasterize_mode == "antialiased":
         comments.append("SplatRenderMode: mip")
     comments += [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
-    with atomic_path(path.with_name(f"{path.stem}_rows.npy")) as temporary, temporary.open("wb") as file:
-        np.save(file, rows)
+    files = export_files(path)
+    written, gone = (files, ()) if objects is not None else (files[:2], files[2:])
+    with new_files(*written, overwrite=overwrite, remove=gone if overwrite else ()) as drafts:
+        with drafts[0].open("wb") as file:
+            PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
+        np.save(drafts[1], rows)
+        if objects is not None:
+            drafts[2].write_text(json.dumps(objects, indent=2) + "\n", "utf8")
     return rows
+
+
+def export_files(path: Path) -> tuple[Path, Path, Path]:
+    """The PLY file of an export, and what belongs to it: rows, and the table of objects.
+
+    >>> [file.name for file in export_files(Path("fox.ply"))]
+    ['fox.ply', 'fox_rows.npy', 'fox_objects.json']
+    """
+    return path, path.with_name(f"{path.stem}_rows.npy"), path.with_name(f"{path.stem}_objects.json")
 
 
 def _comment(text: str) -> str:

@@ -90,6 +90,7 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
             f"{path} is truncated or no checkpoint: its {path.stat().st_size:,} bytes are not the zip archive that "
             f"torch.save writes. Copy it again, or {advice}."
         )
+    _check_sums(path, advice)
     try:
         with torch.serialization.safe_globals(numpy_numbers()):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -103,6 +104,19 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
         raise ValueError(
             f"{path} is damaged ({str(error).strip().split('. ')[0]}). Copy it again, or {advice}."
         ) from error
+
+
+def _check_sums(path: Path, advice: str) -> None:
+    """The archive has a CRC-32 of every tensor, which torch.load does not look at."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except Exception as error:  # whatever a damaged file makes zipfile raise
+        damaged = str(error)
+    if damaged is not None:
+        raise ValueError(
+            f"{path} is damaged ({damaged}): a checksum in it is not that of its content. Copy it again, or {advice}."
+        )
 
 
 def _model_state(pipeline: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:

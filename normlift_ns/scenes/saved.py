@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import torch
 
+from normlift_ns.core.files import write_text
 from normlift_ns.options import Background, RasterizeMode
 from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
 from normlift_ns.scenes.frames import check_frames
@@ -35,7 +36,7 @@ def save_splat(folder: Path, scene: SplatScene) -> None:
     saved = _Saved(
         scene.name, scene.rasterize_mode, scene.background_name, str(scene.photographs), dict(scene.identity)
     )
-    (folder / SCENE_FILE).write_text(json.dumps(msgspec.to_builtins(saved), indent=2) + "\n", "utf8")
+    write_text(folder / SCENE_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")
 
 
 def checkpoint_of(scene: SplatScene) -> dict[str, Any]:

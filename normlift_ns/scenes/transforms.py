@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from normlift_ns.core.files import write_text
 from normlift_ns.scenes.frames import Frame, Intrinsics, find_masks, find_photographs, photograph_size
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -234,7 +235,7 @@ def write_transforms(path: Path, frames: Sequence[Frame], held_out: Sequence[Fra
     if len(held_out) > 0:
         content |= {name: [str(frame.file) for frame in part] for name, part in splits.items()}
     content["frames"] = [_entry(frame) for frame in sorted((*frames, *held_out), key=lambda frame: frame.file)]
-    path.write_text(json.dumps(content, indent=1) + "\n", "utf8")
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def _entry(frame: Frame) -> dict[str, Any]:

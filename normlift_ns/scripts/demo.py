@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from normlift_ns.core.files import new_file, write_text
 from normlift_ns.options import SourceOptions
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
@@ -52,7 +53,7 @@ class Demo:
         pictures, answers = self.folder / "pictures", self.folder / "answers.json"
         flags = ("--render-dir", pictures, "--json", answers)
         _show("ns-normlift-query", "--load-config", run.config, "--text", *TEXTS, *flags)
-        NormLiftQuery(run.config, TEXTS, render_dir=pictures, json=answers).main()
+        NormLiftQuery(run.config, TEXTS, render_dir=pictures, json=answers, overwrite=True).main()
         middle = f"{spread(self.views, 3)[1]:04d}"
         side_by_side(
             [pictures / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures
@@ -71,7 +72,7 @@ class Demo:
         means = {name: float(values.mean()) for name, values in scores.items()}
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
-        (self.folder / "miou.json").write_text(json.dumps(means, indent=2) + "\n")
+        write_text(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
         viewer = f"ns-viewer --load-config {run.config} --viewer.websocket-host 127.0.0.1"
         CONSOLE.print(f"Pictures are in {pictures}. See it in the viewer: {viewer}", soft_wrap=True)
         return means
@@ -87,7 +88,8 @@ def side_by_side(paths: list[Path], folder: Path) -> None:
     for image in images:
         joined.paste(image, (left, 0))
         left += image.width
-    joined.save(folder / "overview.png")
+    with new_file(folder / "overview.png", overwrite=True) as draft:
+        joined.save(draft)
 
 
 def iou_per_class(found: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:

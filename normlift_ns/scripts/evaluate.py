@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from rich.table import Table
 
+from normlift_ns.core.files import refuse_existing
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from normlift_ns.evaluation.protocols import EvaluatedRun
     from normlift_ns.evaluation.results import Evaluation
     from normlift_ns.evaluation.studies import Evaluate, Row
+
+_WITH_FIGURE = ("sweeps", "signals")
+"""Studies that are drawn."""
 
 
 @dataclass
@@ -33,6 +37,8 @@ class NormLiftEval:
     folder of masks."""
     output_path: Path = Path("output.json")
     """Name of the output file."""
+    overwrite: bool = False
+    """Replace the output file and the figures beside it."""
     refined: bool = True
     """Evaluate the refined directions."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing"], ...] = ()
@@ -58,6 +64,8 @@ class NormLiftEval:
             )
         if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
             raise ValueError("protocol masks and --data take one run at a time; name a single --load-config")
+        figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
+        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
@@ -90,7 +98,7 @@ class NormLiftEval:
         experiments, checkpoints = (", ".join(values) for values in zip(*names))
         write_evaluation(
             self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
-            studies=studies,
+            studies=studies, overwrite=self.overwrite,
         )  # fmt: skip
         written = [self.output_path, *self._plots(studies, next(iter(evaluation.results)))]
         CONSOLE.print(rows_table(evaluation.rows))
@@ -120,13 +128,18 @@ class NormLiftEval:
         """Figures beside the output file."""
         from normlift_ns.evaluation.plots import plot_signals, plot_sweeps  # noqa: PLC0415
 
-        for name in {"sweeps", "signals"} & set(studies):
-            path = self.output_path.with_name(f"{self.output_path.stem}_{name}.svg")
+        for name in _WITH_FIGURE:
+            if name not in studies:
+                continue
+            path = self._figure(name)
             if name == "sweeps":
-                plot_sweeps(studies[name], metric, metric, path)
+                plot_sweeps(studies[name], metric, metric, path, overwrite=self.overwrite)
             else:
-                plot_signals(studies[name][0], path)
+                plot_signals(studies[name][0], path, overwrite=self.overwrite)
             yield path
+
+    def _figure(self, study: str) -> Path:
+        return self.output_path.with_name(f"{self.output_path.stem}_{study}.svg")
 
 
 def results_table(evaluation: Evaluation) -> Table:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.table import Table
 
+from normlift_ns.core.files import refuse_existing
 from normlift_ns.options import MIN_SIZE, REACH, AskOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
@@ -46,14 +46,9 @@ class NormLiftExport:
         if name == "":
             raise ValueError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
         target = self.output_dir / name
-        objects = target.with_name(f"{target.stem}_objects.json")
-        for path in (target, target.with_name(f"{target.stem}_rows.npy"), objects):
-            if path.exists() and not self.overwrite:
-                raise FileExistsError(
-                    f"{path} exists; give another --output-dir or --output-filename, or --overwrite True."
-                )
-        from normlift_ns.core.files import atomic_path  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.front_door import open_run  # noqa: PLC0415
+        files = (target, *(target.with_name(f"{target.stem}_{name}") for name in ("rows.npy", "objects.json")))
+        refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
+        from normlift_ns.front_door import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.objects import find_objects  # noqa: PLC0415
 
         run = open_run(
@@ -67,26 +62,24 @@ class NormLiftExport:
         if answer is None and self.part != "scene":
             raise ValueError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
         part = None if answer is None or self.part == "scene" else answer.mask
-        rows = run.export(
-            target, ~part if part is not None and self.part == "rest" else part, answer=answer, overwrite=True
-        )
-        CONSOLE.print(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}", highlight=False)
-        objects.unlink(missing_ok=True)
+        part = ~part if part is not None and self.part == "rest" else part
+        objects: dict[str, Any] | None = None
         if answer is not None:
-            limits = {"reach": self.reach, "min_size": self.min_size}
-            tables: list[dict[str, Any]] = [
+            limits, question = {"reach": self.reach, "min_size": self.min_size}, answer.question
+            tables = [
                 {"text": found.text, **find_objects(run.field, answer.means, found.mask, **limits).to_json()}
                 for found in answer
             ]
-            question = answer.question
-            facts = {
+            objects = {
+                "queries": tables,
                 "relevancy": question.rule,
                 "threshold": question.threshold,
                 "min_reliability": question.min_reliability,
             }
-            with atomic_path(objects) as temporary:
-                temporary.write_text(json.dumps({"queries": tables, **facts}, indent=2) + "\n")
-            CONSOLE.print(_table(tables))
+        rows = run.export(target, part, answer=answer, objects=objects, overwrite=self.overwrite)
+        CONSOLE.print(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}", highlight=False)
+        if objects is not None:
+            CONSOLE.print(_table(objects["queries"]))
         return target
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
+from normlift_ns.core.files import file_name, new_file, refuse_existing, write_text
 from normlift_ns.options import AskOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
@@ -35,6 +37,8 @@ class NormLiftQuery:
     """Write pictures of the relevancy into this folder."""
     render_views: tuple[str, ...] = ()
     """Training images from whose cameras to render, such as 0001 0042. By default three of them, evenly spread."""
+    overwrite: bool = False
+    """Replace files of these names."""
     data: Path | None = None
     """Where the dataset is now, if it was moved."""
     device: str = "auto"
@@ -42,6 +46,10 @@ class NormLiftQuery:
 
     def main(self) -> list[dict[str, Any]]:
         """Asks, prints and writes; returns the rows of the table."""
+        for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
+            if path is not None:
+                refuse_existing(path, overwrite=self.overwrite, instead=flag)
+        refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
         from normlift_ns.asking import summarize  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.front_door import open_run  # noqa: PLC0415
         from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
@@ -58,32 +66,32 @@ class NormLiftQuery:
         rows, question = summarize(answer), answer.question
         CONSOLE.print(_table(rows, f"{question.rule} > {question.threshold:g}"))
         if self.json is not None:
-            _write_json(self.json, rows, answer)
+            _write_json(self.json, rows, answer, self.overwrite)
         if self.output_path is not None:
-            _write_arrays(self.output_path, answer)
+            _write_arrays(self.output_path, answer, self.overwrite)
         if self.render_dir is not None:
-            save_overlays(run.scene, answer, cameras, self.render_dir)
+            save_overlays(run.scene, answer, cameras, self.render_dir, overwrite=self.overwrite)
         stored = run.save(question) if self.save else None
         written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
         if len(written) > 0:
             CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)
         return rows
 
+    def _pictures(self) -> list[Path]:
+        """Pictures that new ones would replace: of the same texts, and of the same views where some are named."""
+        views = [glob.escape(Path(name).stem) for name in self.render_views] or ["*"]
+        names = [f"{view}_{i}_{file_name(text)}.png" for view in views for i, text in enumerate(self.text)]
+        return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
 
-def _write_json(path: Path, rows: list[dict[str, Any]], answer: Answer) -> None:
-    from normlift_ns.core.files import atomic_path  # noqa: PLC0415
 
+def _write_json(path: Path, rows: list[dict[str, Any]], answer: Answer, overwrite: bool) -> None:
     question = answer.question
     facts = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps({"queries": rows, **facts}, indent=2) + "\n")
+    write_text(path, json.dumps({"queries": rows, **facts}, indent=2) + "\n", overwrite=overwrite)
 
 
-def _write_arrays(path: Path, answer: Answer) -> None:
+def _write_arrays(path: Path, answer: Answer, overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
-
-    from normlift_ns.core.files import atomic_path  # noqa: PLC0415
 
     tensors = {
         "relevancy": answer.relevancy,
@@ -91,8 +99,7 @@ def _write_arrays(path: Path, answer: Answer) -> None:
         "valid": answer.valid,
     }
     arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with new_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
         np.savez(file, names=np.array(answer.texts), **arrays)
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from normlift_ns.asking import Answer, pixel_relevancy
-from normlift_ns.core.files import file_name
+from normlift_ns.core.files import file_name, new_file
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.observing import spread
@@ -20,13 +20,18 @@ from normlift_ns.raster.rasterize import render, render_picture
 _INCHES, _DPI = 6.0, 120
 
 
-def save_overlays(scene: Scene, answer: Answer, cameras: dict[str, Camera], folder: Path) -> list[Path]:
+def save_overlays(
+    scene: Scene, answer: Answer, cameras: dict[str, Camera], folder: Path, *, overwrite: bool = False
+) -> list[Path]:
     """Writes one PNG per camera and text: the rendered scene, and where the text is found on it.
 
     Args:
         cameras: by the name that the files get.
+        overwrite: replace files of these names.
+    Raises:
+        FileExistsError: there is one, and `overwrite` is False.
+        OSError: it cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, camera in cameras.items():
         values, alpha = render(scene.gaussians, camera, answer.relevancy, rasterize_mode=scene.rasterize_mode)
@@ -34,7 +39,8 @@ def save_overlays(scene: Scene, answer: Answer, cameras: dict[str, Camera], fold
         image = render_picture(scene, camera)
         for q, text in enumerate(answer.texts):
             paths.append(folder / f"{name}_{q}_{file_name(text)}.png")
-            save_overlay(paths[-1], image, relevancy[:, :, q], text, answer)
+            with new_file(paths[-1], overwrite=overwrite) as draft:
+                save_overlay(draft, image, relevancy[:, :, q], text, answer)
     return paths
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -142,8 +143,12 @@ class Session:
         name = file_name("_".join(texts) if self.shown is None else texts[self.shown])
         folder.mkdir(exist_ok=True)
         path = free_path(folder / f"{name}.ply")
-        how = {"spherical_harmonics": spherical_harmonics, "rasterize_mode": rasterize_mode}
-        rows = write_splats(path, parameters, self.field, self.answer, keep=chosen, **how)
+        how: dict[str, Any] = {"spherical_harmonics": spherical_harmonics, "rasterize_mode": rasterize_mode}
+        try:
+            rows = write_splats(path, parameters, self.field, self.answer, keep=chosen, overwrite=True, **how)
+        except BaseException:
+            path.unlink(missing_ok=True)  # the empty file that claims the name
+            raise
         return f"{len(rows):,} Gaussians written to {path}"
 
     def save(self, folder: Path | None) -> str:

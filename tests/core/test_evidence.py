@@ -203,8 +203,8 @@ def test_a_failed_save_leaves_nothing(tmp_path, monkeypatch):
     def full_disk(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("normlift_ns.core.evidence.save_file", full_disk)
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr("normlift_ns.core.disk.tensors.save_file", full_disk)
+    with pytest.raises(OSError, match=r"e\.safetensors cannot be written .*No space left"):
         random_evidence(5, [2], 0).save(tmp_path / "e.safetensors")
     assert list(tmp_path.iterdir()) == []
 

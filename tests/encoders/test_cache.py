@@ -1,11 +1,12 @@
 """The cache of regions and features: what finds an entry again, and what does not."""
 
+import random
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
 from normlift_ns.encoders.batches import Batches
@@ -150,13 +151,12 @@ def test_many_regions_survive(tmp_path):
 
 
 def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
-    def full(self, content):
-        with self.open("wb") as file:
-            file.write(content[:10])
-        raise OSError(28, "No space left on device")
+    def full(tensors, path, metadata):
+        path.write_bytes(b"half")
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=r"cannot keep 2D labels in .*No space left on device.*free disk space"):
+    monkeypatch.setattr("normlift_ns.core.disk.tensors.save_file", full)
+    with pytest.raises(OSError, match=r"cannot keep 2D labels: .*/regions/\w+\.safetensors cannot .*free disk space"):
         cached(counted, tmp_path).view(IMAGE, "a.jpg")
     assert list((tmp_path / "regions").iterdir()) == []
 
@@ -264,3 +264,50 @@ def test_patches_seen_before_need_no_network(clip, tmp_path):
     assert torch.equal(cached(source, tmp_path).text(["red"]), clip.text(["red"]))
     with pytest.raises(AttributeError):
         cached(PatchFeatures(unusable(clip), 30), tmp_path).view(IMAGE, "a.jpg")
+
+
+def test_swapped_entries_are_computed_again(counted, tmp_path):
+    """Content that is whole, under the name of another image."""
+    source = cached(counted, tmp_path)
+    images = (IMAGE, "a.jpg"), (255 - IMAGE, "b.jpg")
+    expected = [source.view(*image) for image in images]
+    for kind in ("regions", "features"):
+        first, second = (tmp_path / kind).iterdir()
+        content = first.read_bytes(), second.read_bytes()
+        first.write_bytes(content[1])
+        second.write_bytes(content[0])
+    before = asked(counted)
+    for image, view in zip(images, expected, strict=True):
+        assert_same(source.view(*image), view)
+    assert before == (2, 2)
+    assert asked(counted) == (4, 4)
+    for image, view in zip(images, expected, strict=True):
+        assert_same(source.view(*image), view)
+    assert asked(counted) == (4, 4)
+
+
+def test_every_flipped_bit_of_an_entry_is_noticed(counted, tmp_path):
+    source = cached(counted, tmp_path)
+    expected = source.view(IMAGE, "a.jpg")
+    for kind in ("regions", "features"):
+        (path,) = (tmp_path / kind).iterdir()
+        whole = path.read_bytes()
+        for bit in random.Random(0).sample(range(8 * len(whole)), 40):
+            changed = bytearray(whole)
+            changed[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(changed)
+            assert_same(source.view(IMAGE, "a.jpg"), expected)
+            assert path.read_bytes() == whole
+    assert asked(counted) == (41, 41)
+
+
+def test_a_text_under_the_name_of_another_is_encoded_again(clip, tmp_path):
+    texts = CachedTexts(clip, tmp_path)
+    mug, table = texts.text(["mug"]), texts.text(["table"])
+    first, second = tmp_path.iterdir()
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    torch.testing.assert_close(texts.text(["mug"]), mug, rtol=0, atol=1e-6)
+    torch.testing.assert_close(texts.text(["table"]), table, rtol=0, atol=1e-6)
+    assert not torch.allclose(mug, table)

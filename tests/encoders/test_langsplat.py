@@ -5,9 +5,11 @@ The files are put together byte by byte, so that reading is tested without our w
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from normlift_ns.encoders import LangSplat, RegionFeatures, SourceOptions, make_
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles
-from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.encoders.text_vectors import TextVectors, write_text_vectors
 
 NAME = "images/frame_00001.jpg"
 HEIGHT, WIDTH, D = 3, 4, 512
@@ -451,3 +453,27 @@ def test_broken_text_vectors_name_file_and_array(tmp_path, write, message):
 def test_absent_text_vectors():
     with pytest.raises(FileNotFoundError, match=r"nowhere\.npz does not exist; .*--text-vectors"):
         TextVectors(Path("nowhere.npz"))
+
+
+def test_damage_of_text_vectors_is_noticed(tmp_path):
+    file = tmp_path / "texts.npz"
+    write_text_vectors(file, {"fox": torch.tensor([3.0, 4.0]), "file": torch.tensor([0.0, 2.0])})
+    expected = TextVectors(file).text(["fox", "file"]).tolist()
+    assert np.allclose(expected, [[0.6, 0.8], [0, 1]])
+    with pytest.raises(FileExistsError):
+        write_text_vectors(file, {})
+    whole = file.read_bytes()
+    for bit in range(0, 8 * len(whole), 5):  # what does not matter to the vectors may change: the date of an entry
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(changed)
+        try:
+            assert TextVectors(file).text(["fox", "file"]).tolist() == expected
+        except ValueError as error:
+            assert "texts.npz is damaged or no NPZ file" in str(error)
+    with zipfile.ZipFile(file, "w") as archive, zipfile.ZipFile(io.BytesIO(whole)) as original:
+        for name, other in (("fox.npy", "file.npy"), ("file.npy", "fox.npy")):
+            archive.writestr(name, original.read(other))
+        archive.comment = original.comment
+    with pytest.raises(ValueError, match=r"texts\.npz is damaged .*content has 'normlift_ns xxh3_128:\w+', expected"):
+        TextVectors(file).text(["fox"])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+import random
 import zipfile
 from pathlib import Path
 
@@ -97,6 +98,24 @@ def test_a_truncated_checkpoint_is_named(full: Path, tmp_path: Path, share: floa
     (tmp_path / "step-000000002.ckpt").write_bytes(content[:size])
     with pytest.raises(ValueError, match=rf"step-000000002\.ckpt is truncated .* {size:,} bytes .*Copy it again"):
         read_checkpoint(tmp_path / "step-000000002.ckpt")
+
+
+def test_flipped_bits_are_noticed_or_change_nothing(full: Path, tmp_path: Path) -> None:
+    path, expected, whole = tmp_path / "step-000000002.ckpt", read_checkpoint(full).model, full.read_bytes()
+    noticed = 0
+    for bit in random.Random(0).sample(range(8 * len(whole)), 120):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        try:
+            found = read_checkpoint(path).model
+        except ValueError as error:
+            assert str(path) in str(error)
+            noticed += 1
+        else:  # dates and names of entries, and the gaps between them
+            assert found.keys() == expected.keys()
+            assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert noticed > 60
 
 
 class _Touch:

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import resource
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,18 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
+from normlift_ns import open_run
 from normlift_ns.asking import Question
+from normlift_ns.core.disk import atomic
 from normlift_ns.nerfstudio_plugin.config import read_config
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
+from normlift_ns.nerfstudio_plugin.write import write_run
+from normlift_ns.runs.files import cache_folder, run_directory
 from normlift_ns.runs.question import load_question
 from tests.nerfstudio_plugin.conftest import field_of, lifted_field, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
+from tests.processes import killed_at
 
 
 def test_a_lifted_run_has_the_files_that_nerfstudio_expects(copied: Path, tmp_path: Path) -> None:
@@ -193,3 +199,97 @@ def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun) -> Non
 def test_a_run_without_semantics_is_named(stock: StockRun) -> None:
     with pytest.raises(FileNotFoundError, match=r"is a run without semantics \(no normlift/ in it\)\. Lift it"):
         field_of(load_scene(stock.config))
+
+
+def test_default_names_of_the_same_second_are_numbered(copied: Path) -> None:
+    """Two lifts at once, and two one after the other, under a name that nobody chose."""
+    source = load_scene(copied)
+    field = lifted_field(source)
+    place = run_directory(source.runs_dir, source.name, "2024-05-01_120000")
+
+    def lift(_: int) -> str:
+        return write_run(source, field, place, exact=False).name
+
+    expected = ["2024-05-01_120000", "2024-05-01_120000_2", "2024-05-01_120000_3"]
+    with ThreadPoolExecutor(2) as pool:
+        names = [*pool.map(lift, range(2)), lift(2)]
+    assert sorted(names) == sorted(os.listdir(place.parent)) == expected
+    for name in names:
+        config: Any = read_config(place.with_name(name) / "config.yml")
+        assert config.timestamp == name
+        assert config.pipeline.model.semantics == Path("outputs/scene/normlift") / name / "normlift"
+        assert len(field_of(load_scene(place.with_name(name) / "config.yml"))) == len(field)
+
+
+def test_of_two_lifts_with_the_same_timestamp_one_is_refused(copied: Path) -> None:
+    source = load_scene(copied)
+    field = lifted_field(source)
+    place = run_directory(source.runs_dir, source.name, "now")
+
+    def lift(seed: int) -> Exception | Path:
+        question = Question((str(seed),), torch.eye(8)[:1])
+        try:
+            return write_run(source, field, place, question=question)
+        except FileExistsError as error:
+            return error
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lift, range(2)))
+    (refused,) = (error for error in found if isinstance(error, FileExistsError))
+    assert str(refused).startswith(f"{place} exists; give another --timestamp or --output-dir")
+    kept = load_question(place / "normlift")
+    assert kept is not None
+    assert kept.texts == (str(found.index(place)),)
+    assert os.listdir(place.parent) == ["now"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exchanged", [True, False])
+def test_a_lift_that_is_killed_while_it_replaces_a_run_loses_nothing(
+    copied: Path, exchanged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every seventh access to the disk; the command that opens the run completes what was under way."""
+    source = load_scene(copied)
+    field = lifted_field(source)
+    run_dir = write(source, field, question=Question(("old",), torch.eye(8)[:1]), timestamp="now")
+    (run_dir.parent / ".cache" / "features").mkdir(parents=True)
+    if not exchanged:
+        monkeypatch.setattr(atomic, "_rename", lambda *_: False)
+
+    def lift() -> None:
+        write(source, field, question=Question(("new",), torch.eye(8)[:1]), timestamp="now", overwrite=True)
+
+    step, seen, gone = 1, [], 0
+    while killed_at(step, lift, run_dir.parent):
+        gone += not run_dir.exists()
+        run = open_run(run_dir / "config.yml")
+        stored = run.ask_stored()
+        assert stored is not None
+        assert len(run.field) == len(field)
+        seen.append(stored.texts[0])
+        step += 7 if seen[-1] == "old" and step < 250 else 1
+    assert set(seen) == {"old", "new"}
+    assert gone == 0 or not exchanged
+    lift()
+    assert sorted(os.listdir(run_dir.parent)) == [".cache", "now"]
+    print(f"{step} accesses, {len(seen)} kills, the run was out of its place {gone} times")
+
+
+def test_what_a_killed_lift_left_is_cleaned_and_a_running_one_is_not(copied: Path) -> None:
+    source = load_scene(copied)
+    field = lifted_field(source)
+    place = run_directory(source.runs_dir, source.name, "now")
+    cache = cache_folder(place) / "features"
+    for folder in (place.parent, cache):
+        (folder / ".normlift-dead" / "now").mkdir(parents=True)
+        (folder / ".normlift-live" / "now").mkdir(parents=True)
+    held = [atomic.hold(folder / ".normlift-live") for folder in (place.parent, cache)]
+    try:
+        write_run(source, field, place)
+        left = [sorted(path.name for path in folder.glob(".normlift-*")) for folder in (place.parent, cache)]
+        assert left == [[".normlift-live"]] * 2
+    finally:
+        for descriptor in held:
+            atomic.release(descriptor)
+    write_run(source, field, place, overwrite=True)
+    assert list(place.parent.rglob(".normlift-*")) == []

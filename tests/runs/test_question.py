@@ -45,3 +45,14 @@ def test_a_damaged_file_says_what_to_do(facts: str | None, tmp_path: Path) -> No
     (tmp_path / "queries.safetensors").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"queries\.safetensors is damaged"):
         load_question(tmp_path)
+
+
+def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    path = save_question(tmp_path, WHOLE)
+    whole = path.read_bytes()
+    for bit in range(0, 8 * len(whole), 7):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        with pytest.raises(ValueError, match=r"queries\.safetensors is damaged .*--save True"):
+            load_question(tmp_path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import shutil
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.runs.question import load_question
-from normlift_ns.scripts import lift, query
+from normlift_ns.scripts import export, lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.encoders.tiny import CLIP, write_clip, write_sam
 from tests.scripts.conftest import SMALL, run_entry
@@ -85,6 +86,77 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
         assert (np.ptp(pixels, axis=2) > 60).mean() > 0.001, path  # something is coloured, over a grey image
 
 
+@pytest.mark.parametrize("output", ["--json", "--output-path", "--render-dir"])
+def test_a_query_replaces_nothing_unasked(output, lifted, tmp_path, monkeypatch, capsys):
+    existing = tmp_path / ("0003_1_sky_blue.png" if output == "--render-dir" else "mine")
+    existing.write_text("mine")
+    place = tmp_path if output == "--render-dir" else existing
+    flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place)
+    with monkeypatch.context() as patch:
+        patch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
+        for views in ((), ("--render-views", "0002", "images/0003.png")):
+            assert run_entry(patch, query.entrypoint, *flags, *views) == 1
+            shown = " ".join(capsys.readouterr().out.split())
+            assert f"{existing.name} exists; give another {output}, or --overwrite True." in shown
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+    asked = (*flags, "--render-views", "0003", "--overwrite", True)
+    assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
+    assert existing.stat().st_size > 100
+    assert len(list(tmp_path.iterdir())) == (2 if output == "--render-dir" else 1)
+
+
+def test_pictures_of_other_texts_and_views_may_join_a_folder(lifted, tmp_path, monkeypatch):
+    flags = ("--load-config", lifted, "--render-dir", tmp_path, "--render-views")
+    for views, text in (("0003", "red"), ("0003", "yellow"), ("0007", "red")):
+        assert run_entry(monkeypatch, query.entrypoint, *flags, views, "--text", text) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0003_0_red.png", "0003_0_yellow.png", "0007_0_red.png"]
+
+
+def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
+    before = {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()}
+    for path in before:
+        for flag in ("--json", "--output-path"):
+            assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red", flag, path) == 1
+    shown = " ".join(capsys.readouterr().out.split())
+    assert shown.count("--overwrite True") == 2 * len(before)
+    assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["field.safetensors", "manifest.json", "queries.safetensors"])
+def test_a_damaged_run_is_refused_with_a_message(name, lifted, tmp_path, monkeypatch, capsys):
+    shutil.copytree(lifted.parent, tmp_path / "outputs" / "room" / "normlift" / "one")
+    config = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
+    path = config.parent / "normlift" / name
+    content = bytearray(path.read_bytes())
+    content[-9] ^= 1
+    path.write_bytes(content)
+    flags = ("--load-config", config, "--data", lifted.parents[4] / "room")
+    assert run_entry(monkeypatch, export.entrypoint, *flags, "--output-dir", tmp_path / "out") == 1
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "is damaged" in shown and name in shown
+    assert "ns-normlift --load-config" in shown or "ns-normlift-query --load-config" in shown
+    assert not (tmp_path / "out").exists()
+
+
+def test_lifts_without_a_name_at_the_same_second_both_remain(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr("normlift_ns.runs.files.datetime", Clock)
+    flags = ("--load-config", trained, *SMALL, "--output-dir", tmp_path, "--max-views", "2", "--refine", "False")
+    for overwrite in ("False", "True"):
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
+    runs = tmp_path / "room" / "normlift"
+    names = ["2024-05-01_120000", "2024-05-01_120000_2"]
+    assert sorted(path.name for path in runs.iterdir()) == [".cache", *names]
+    assert [len(open_run(runs / name / "config.yml").field) > 0 for name in names] == [True, True]
+
+
+class Clock:
+    """Stands still."""
+
+    @staticmethod
+    def now() -> datetime:
+        return datetime(2024, 5, 1, 12)
+
+
 def test_a_second_lift_rasterizes_and_encodes_nothing(trained, monkeypatch, capsys):
     def never(*_args, **_kwargs):
         raise AssertionError("rasterized again")
@@ -121,7 +193,9 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
     fresh = []
     monkeypatch.setattr(lifting, "block_evidence", rasterize)
     original = lifting.Evidence.save
-    monkeypatch.setattr(lifting.Evidence, "save", lambda self, path: (fresh.append(path), original(self, path))[1])
+    monkeypatch.setattr(
+        lifting.Evidence, "save", lambda self, path, **rest: (fresh.append(path), original(self, path, **rest))[1]
+    )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
 

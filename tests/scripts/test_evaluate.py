@@ -41,8 +41,34 @@ def workspace(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def evaluated(monkeypatch, workspace: Path, protocol: str, labels: Path, *flags: object) -> dict:
     config, output = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml", workspace / f"{protocol}.json"
     given = ("--protocol", protocol, "--load-config", config, "--labels", labels, "--output-path", output)
+    given += ("--overwrite", True)
     assert run_entry(monkeypatch, evaluate.entrypoint, *given, *flags) == 0
     return json.loads(output.read_text())
+
+
+@pytest.mark.parametrize("existing", ["scores.json", "scores_sweeps.svg", "scores_signals.svg"])
+def test_nothing_is_replaced_unasked(existing, workspace, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
+    (tmp_path / existing).write_text("mine")
+    config = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml"
+    flags = ("--protocol", "masks", "--load-config", config, "--labels", workspace / "room" / "instance")
+    flags += ("--output-path", tmp_path / "scores.json", "--study", "sweeps", "signals")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 1
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"{existing} exists; give another --output-path, or --overwrite True." in shown
+    assert [path.name for path in tmp_path.iterdir()] == [existing]
+    assert (tmp_path / existing).read_text() == "mine"
+
+
+def test_the_default_output_is_not_replaced_either(workspace, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("output.json").write_text("mine")
+    config = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml"
+    flags = ("--protocol", "masks", "--load-config", config, "--labels", workspace / "room" / "instance")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 1
+    assert "output.json exists" in capsys.readouterr().out
+    assert run_entry(monkeypatch, evaluate.entrypoint, *flags, "--overwrite", True) == 0
+    assert json.loads(Path("output.json").read_text())["experiment_name"] == "room"
 
 
 def stand_ins(path: Path, words: dict[str, str]) -> Path:

@@ -154,3 +154,24 @@ def test_nothing_is_overwritten_unasked(scene_ply: Path, lifted: Path, monkeypat
     assert run_entry(monkeypatch, export.entrypoint, *flags[:-2], *outside) == 0
     assert (scene_ply.parent / "evil.ply").exists()
     assert not (scene_ply.parents[2] / "evil.ply").exists()
+
+
+def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_path: Path, monkeypatch) -> None:
+    flags = ("--load-config", lifted, "--output-dir", tmp_path)
+    for rest in ((), ("--text", "red", "--part", "selection", "--overwrite", True)):
+        assert run_entry(monkeypatch, export.entrypoint, *flags, *rest) == 0
+    count = PlyData.read(tmp_path / "splat.ply")["vertex"].count
+    assert count == len(np.load(tmp_path / "splat_rows.npy")) < len(open_run(lifted).scene.gaussians) / 2
+    (red,) = json.loads((tmp_path / "splat_objects.json").read_text())["queries"]
+    assert red["text"] == "red"
+    open_run(lifted).export(tmp_path / "splat.ply", overwrite=True)  # has no table, and leaves none of another's
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["splat.ply", "splat_rows.npy"]
+
+
+@pytest.mark.parametrize("existing", ["splat.ply", "splat_rows.npy", "splat_objects.json"])
+def test_no_part_of_an_export_is_replaced_unasked(existing, lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
+    (tmp_path / existing).write_text("mine")
+    assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path) == 1
+    assert f"{existing} exists; give another --output-dir" in " ".join(capsys.readouterr().out.split())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]

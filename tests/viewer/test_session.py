@@ -105,6 +105,10 @@ def test_what_is_shown_is_exported_and_saved(session: Session, tmp_path: Path) -
     for empty in (session, session.ask(Question(("z",), torch.eye(D)[:1], threshold=2.0))):
         with pytest.raises(ValueError, match="Nothing is selected; there is nothing to export"):
             empty.export(tmp_path, parameters, spherical_harmonics=True, rasterize_mode="antialiased")
+    faint = {**parameters, "opacities": torch.full((N, 1), -9.0)}
+    with pytest.raises(ValueError, match="none of the"):  # nothing that is ever drawn; the name is free again
+        asked.export(tmp_path, faint, spherical_harmonics=True, rasterize_mode="antialiased")
+    assert len(list(tmp_path.iterdir())) == 4
 
     assert asked.save(tmp_path).startswith("Saved 2 queries in ")
     stored = load_question(tmp_path)

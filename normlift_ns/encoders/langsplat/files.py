@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
-from normlift_ns.core.files import atomic_path
+from normlift_ns.core.files import new_file
 from normlift_ns.encoders.images import read_npy
 from normlift_ns.encoders.source import UNIT_TOLERANCE
 
@@ -121,8 +121,8 @@ def write_npy(path: Path, array: np.ndarray, overwrite: bool) -> None:
             return
         if not overwrite:
             raise FileExistsError(f"{path} exists with other content; export to another folder, or --overwrite True")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    with new_file(path, overwrite=overwrite) as draft:
+        draft.write_bytes(content)
 
 
 def listed(values: Sequence[object]) -> str:

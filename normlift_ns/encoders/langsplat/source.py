@@ -210,7 +210,6 @@ def write_langsplat(
     first = torch.tensor([0, *(len(rows) for _, rows in levels)]).cumsum(0).tolist()
     segments = torch.stack([torch.where(labels >= 0, labels + start, -1) for (labels, _), start in zip(levels, first)])
     stem = PurePosixPath(name).name.split(".")[0]
-    folder.mkdir(parents=True, exist_ok=True)
     for suffix, array in (
         ("s", segments.float().expand(len(LEVELS), -1, -1)),
         ("f", torch.cat([rows for _, rows in levels])),

@@ -1,0 +1,1 @@
+"""Files on a disk: in one step, with digests."""

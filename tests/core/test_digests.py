@@ -1,0 +1,332 @@
+"""Damage and files in the wrong place are noticed before any number is used, and nothing is read outside of arrays."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from normlift_ns import Evidence, SemanticField, lift
+from normlift_ns.core.disk.manifest import MANIFEST, read_manifest, write_manifest
+from normlift_ns.core.disk.tensors import check_tensor, load_tensors, save_tensors, tensor_digest
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.core.storage import StoredDirections, StoredEvidence
+from tests.scenes import generator, random_evidence, unit_rows
+
+VIEWS = [6, 5, 0, 7]
+S, D, N = sum(VIEWS), 12, 40
+FORMS = ["evidence", "float16", "low_rank"]
+FLIPS = 150
+
+
+def example(form: str = "evidence", seed: int = 0) -> SemanticField:
+    table = torch.nn.functional.normalize(unit_rows(S, 4, seed) @ unit_rows(4, D, seed + 1), dim=1).float()
+    lifted = lift(random_evidence(N, VIEWS, seed, fill=0.15, dtype=torch.float32), table)
+    means, source = torch.rand(N, 3, generator=generator(seed)), torch.randint(0, N, (N,), generator=generator(seed))
+    return SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)  # type: ignore[arg-type]
+
+
+def flipped(content: bytes, bit: int) -> bytes:
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_flipped_bit_of_a_field_is_noticed(form: str, tmp_path: Path) -> None:
+    example(form).save(tmp_path)
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == (3 if form == "evidence" else 2)
+    for path in files:
+        whole = path.read_bytes()
+        for bit in random.Random(0).sample(range(8 * len(whole)), FLIPS):
+            path.write_bytes(flipped(whole, bit))
+            with pytest.raises(ValueError, match=rf"{path}|schema version .* this program reads 1"):
+                SemanticField.load(tmp_path)
+        path.write_bytes(whole)
+    assert SemanticField.load(tmp_path).manifest == example(form).manifest
+
+
+def test_a_message_says_what_was_found_expected_and_what_to_type(tmp_path: Path) -> None:
+    example("float16").save(tmp_path)
+    path = tmp_path / "field.safetensors"
+    path.write_bytes(flipped(path.read_bytes(), 8 * path.stat().st_size - 1))
+    with pytest.raises(ValueError, match="is damaged") as caught:
+        SemanticField.load(tmp_path)
+    with safe_open(path, "pt") as file:
+        written = file.metadata()["digest"]
+    found = tensor_digest(load_file(path), {})
+    assert str(caught.value) == (
+        f"{path} is damaged: its content has digest {found}, expected {written}; lift again with: "
+        "ns-normlift --load-config ..."
+    )
+
+
+@pytest.mark.parametrize("name", ["field.safetensors", "evidence.safetensors", "manifest.json"])
+def test_files_of_different_lifts_do_not_pass_together(name: str, tmp_path: Path) -> None:
+    for seed in (0, 1):
+        example(seed=seed).save(tmp_path / str(seed))
+    shutil.copy(tmp_path / "1" / name, tmp_path / "0" / name)
+    with pytest.raises(
+        ValueError, match=r"safetensors and the manifest beside it are of different lifts: .*lift again"
+    ):
+        SemanticField.load(tmp_path / "0")
+
+
+def test_a_field_that_is_loaded_and_saved_again_has_its_own_digests(tmp_path: Path) -> None:
+    example().save(tmp_path / "a")
+    loaded = SemanticField.load(tmp_path / "a")
+    replace(loaded, source=loaded.source.flip(0)).save(tmp_path / "b")
+    assert read_manifest(tmp_path / "a")[1] != read_manifest(tmp_path / "b")[1]
+    assert torch.equal(SemanticField.load(tmp_path / "b").source, loaded.source.flip(0))
+
+
+def as_version_0_1(folder: Path) -> None:
+    """Takes the digests away, as if there had never been any."""
+    for path in folder.glob("*.safetensors"):
+        with safe_open(path, "pt") as file:
+            facts = {name: value for name, value in (file.metadata() or {}).items() if name != "digest"}
+        save_file(load_file(path), path, metadata=facts or None)
+    manifest = json.loads((folder / MANIFEST).read_text())
+    facts = {name: value for name, value in manifest.items() if name not in ("digest", "digests")}
+    (folder / MANIFEST).write_text(json.dumps(facts, indent=2) + "\n")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_field_of_version_0_1_opens_with_a_note(form: str, tmp_path: Path) -> None:
+    field = example(form)
+    field.save(tmp_path)
+    as_version_0_1(tmp_path)
+    with pytest.warns(UserWarning, match=rf"^{tmp_path} was written by version 0\.1, without digests: .*lift again"):
+        loaded = SemanticField.load(tmp_path)
+    assert torch.equal(loaded.query(torch.eye(D)), field.query(torch.eye(D)))
+    assert loaded.manifest == field.manifest
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded.save(tmp_path / "again")
+        SemanticField.load(tmp_path / "again")
+
+
+@pytest.mark.parametrize("part", ["field.safetensors", "evidence.safetensors", "manifest.json"])
+def test_digests_that_are_missing_in_one_place_are_missed(part: str, tmp_path: Path) -> None:
+    example().save(tmp_path / "new")
+    example().save(tmp_path / "old")
+    as_version_0_1(tmp_path / "old")
+    shutil.copy(tmp_path / "old" / part, tmp_path / "new" / part)
+    with pytest.raises(ValueError, match="different lifts"):
+        SemanticField.load(tmp_path / "new")
+
+
+def with_value(tensor: torch.Tensor, value: float) -> torch.Tensor:
+    changed = tensor.clone()
+    changed.view(-1)[3] = value
+    return changed
+
+
+def with_scalar(name: str, value: float) -> Callable[[SemanticField], SemanticField]:
+    return lambda f: replace(f, scalars=replace(f.scalars, **{name: with_value(getattr(f.scalars, name), value)}))
+
+
+def with_rows(**arrays: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[SemanticField], SemanticField]:
+    """Other evidence, put together without the checks of its constructor."""
+
+    def change(field: SemanticField) -> SemanticField:
+        assert isinstance(field.store, StoredEvidence)
+        rows = field.store.evidence.rows
+        new = replace(rows, **{name: make(getattr(rows, name)) for name, make in arrays.items()})
+        evidence = replace(field.store.evidence)
+        object.__setattr__(evidence, "rows", new)
+        return replace(field, store=replace(field.store, evidence=evidence))
+
+    return change
+
+
+def with_table(make: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[SemanticField], SemanticField]:
+    def change(field: SemanticField) -> SemanticField:
+        name = "features" if isinstance(field.store, StoredEvidence) else "coordinates"
+        return replace(field, store=replace(field.store, **{name: make(getattr(field.store, name))}))
+
+    return change
+
+
+WRONG = {
+    "negative source": (lambda f: replace(f, source=with_value(f.source, -1)), "source has numbers in -1"),
+    "source out of range": (lambda f: replace(f, source=with_value(f.source, N)), rf"source has numbers in .*\.\.{N}"),
+    "short source": (lambda f: replace(f, source=f.source[1:]), r"source is torch\.int32 \(39,\), expected"),
+    "long source": (lambda f: replace(f, source=f.source.long()), r"source is torch\.int64 \(40,\), expected"),
+    "NaN norm": (with_scalar("norm", float("nan")), "norm has numbers in nan"),
+    "negative weight": (with_scalar("weight", -1.0), "weight has numbers in -1"),
+    "infinite reliability": (with_scalar("reliability", float("inf")), r"reliability has numbers in .*\.\.inf"),
+    "short table": (with_table(lambda x: x[:-1]), r"(features|coordinates) is .*, expected"),
+    "narrow table": (with_table(lambda x: x[:, 1:]), r"(features|coordinates) is .*, expected"),
+    "wrong type": (with_table(lambda x: x.double()), r"(features|coordinates) is torch\.float64 .*, expected"),
+    "NaN in the table": (
+        with_table(lambda x: with_value(x, float("nan"))),
+        "(features|coordinates) has numbers in nan",
+    ),
+    "infinite table": (with_table(lambda x: with_value(x, float("inf"))), "(features|coordinates) has numbers in"),
+}
+WRONG_ROWS = {
+    "column out of range": (
+        with_rows(column=lambda x: with_value(x, 10**6)),
+        "columns reach to 1000000, expected 0..17",
+    ),
+    "negative column": (with_rows(column=lambda x: with_value(x, -7)), "columns must be 0 or more, found -7"),
+    "falling offsets": (with_rows(offsets=lambda x: with_value(x, 10**9)), "offsets of rows must rise"),
+    "offsets past the end": (with_rows(offsets=lambda x: x + 1), "offsets of rows must rise"),
+    "no offsets": (with_rows(offsets=lambda x: x[:0]), "offsets of rows must rise"),
+    "short offsets": (with_rows(offsets=lambda x: torch.cat([x[:5], x[-1:]])), "evidence.*one per Gaussian"),
+    "short columns": (with_rows(column=lambda x: x[:-1]), "offsets of rows must rise"),
+    "narrow columns": (with_rows(column=lambda x: x.to(torch.int16)), r"columns are torch\.int16"),
+    "NaN weight": (with_rows(weight=lambda x: with_value(x, float("nan"))), r"weights are in nan"),
+    "negative weight": (with_rows(weight=lambda x: with_value(x, -1.0)), r"weights are in -1"),
+    "integer weights": (with_rows(weight=lambda x: x.int()), r"weights are torch\.int32"),
+}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("digests", [True, False])
+@pytest.mark.parametrize(
+    ("form", "change", "message"),
+    [
+        *((form, *case) for form in ("float16", "low_rank", "evidence") for case in WRONG.values()),
+        *(("evidence", *case) for case in WRONG_ROWS.values()),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
+def test_arrays_that_lead_outside_are_refused(form, change, message, digests: bool, tmp_path: Path) -> None:
+    """Also where somebody wrote them with right digests."""
+    change(example(form)).save(tmp_path)
+    if not digests:
+        as_version_0_1(tmp_path)
+    with pytest.raises(ValueError, match=message) as caught:
+        SemanticField.load(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+    assert "lift again with: ns-normlift" in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
+def test_a_field_without_an_array_is_refused(tmp_path: Path) -> None:
+    example("float16").save(tmp_path)
+    as_version_0_1(tmp_path)
+    tensors = load_file(tmp_path / "field.safetensors")
+    save_file({name: x for name, x in tensors.items() if name != "n_eff"}, tmp_path / "field.safetensors")
+    with pytest.raises(ValueError, match="is damaged: 'n_eff' is missing"):
+        SemanticField.load(tmp_path)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_product_never_reads_outside_of_its_table() -> None:
+    rows = SparseRows(torch.tensor([0, 2]), torch.tensor([0, 5]).int(), torch.ones(2))
+    assert rows.num_columns == 6
+    with pytest.raises(ValueError, match="a matrix with 6 columns needs as many rows, got 5"):
+        rows.matmul(torch.ones(5, 1))
+    assert rows.matmul(torch.ones(6, 1)).tolist() == [[2.0]]
+    for broken in (
+        replace(rows, column=torch.tensor([0, -5]).int()),
+        replace(rows, offsets=torch.tensor([0, 3])),
+        replace(rows, offsets=torch.tensor([0, 5, -3, 2])),
+        replace(rows, weight=torch.ones(1)),
+    ):
+        with pytest.raises(ValueError, match=r"must (be 0 or more|rise from 0)"):
+            broken.matmul(torch.ones(6, 1))
+
+
+def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
+    path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
+    digest = evidence.save(path, key="a")
+    assert digest == Evidence.read(path, key="a")[1] != evidence.save(tmp_path / "f.safetensors")
+    for key in ("", "b"):
+        with pytest.raises(ValueError, match="is damaged: its content has digest"):
+            Evidence.load(path, key=key)
+    whole = path.read_bytes()
+    for bit in random.Random(1).sample(range(8 * len(whole)), FLIPS):
+        path.write_bytes(flipped(whole, bit))
+        with pytest.raises(ValueError, match=r"e\.safetensors is damaged"):
+            Evidence.load(path, key="a")
+
+
+def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
+    path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
+    evidence.save(path)
+    (tmp_path / MANIFEST).write_text("{}")
+    as_version_0_1(tmp_path)
+    assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
+    with pytest.raises(ValueError, match="expected one, but it names none"):
+        Evidence.load(path, key="a")
+
+
+def test_a_digest_covers_names_types_shapes_numbers_facts_and_key() -> None:
+    base, facts = {"a": torch.arange(6.0), "b": torch.ones(2)}, {"f": "1"}
+    digests = [
+        tensor_digest(base, facts),
+        tensor_digest(base, facts, "key"),
+        tensor_digest(base, {"f": "2"}),
+        tensor_digest(base, {"g": "1"}),
+        tensor_digest({"a": base["b"], "b": base["a"]}, facts),
+        tensor_digest({**base, "a": base["a"].view(2, 3)}, facts),
+        tensor_digest({**base, "a": base["a"].view(torch.int32)}, facts),
+        tensor_digest({**base, "c": torch.zeros(0)}, facts),
+        tensor_digest({**base, "b": torch.tensor([1.0, 1.0000001])}, facts),
+    ]
+    assert len(set(digests)) == len(digests)
+    assert tensor_digest(dict(reversed(base.items())), facts) == digests[0]
+    strided = torch.stack([base["a"], base["a"]], dim=1)[:, 0]
+    assert tensor_digest({**base, "a": strided}, facts) == digests[0]
+
+
+@pytest.mark.parametrize(
+    "tensor",
+    [torch.zeros(0, 3), torch.tensor(3.0), torch.ones(2).bfloat16(), torch.tensor([True]), torch.ones(2).half()],
+)
+def test_tensors_of_any_kind_come_back(tensor: torch.Tensor, tmp_path: Path) -> None:
+    digest = save_tensors(tmp_path / "a.safetensors", {"größe/\n": tensor}, {"fact": "ü"})
+    tensors, facts, found = load_tensors(tmp_path / "a.safetensors")
+    assert (facts, found) == ({"fact": "ü"}, digest)
+    assert torch.equal(tensors["größe/\n"], tensor)
+    check_tensor("a", tensor, tensor.dtype, tensor.shape, 0, 3)
+    with pytest.raises(ValueError, match="a is "):
+        check_tensor("a", tensor, tensor.dtype, (*tensor.shape, 1), 0, 3)
+
+
+def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
+    contents = set()
+    for i in range(20):  # safetensors alone makes many files of it
+        tensors, facts = (
+            {"größe": torch.ones(3), "b\n\x01": torch.zeros(2).half()},
+            {"a": "1\t/", "b": "ü\x7f\\", "c": '"'},
+        )
+        save_tensors(tmp_path / str(i), tensors, facts)
+        contents.add((tmp_path / str(i)).read_bytes())
+        assert load_tensors(tmp_path / str(i)).facts == facts
+    assert len(contents) == 1
+
+
+def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
+    facts = {"schema_version": 1, "digest": "mine", "text": '"digest": ""', "deep": {"digest": "", "ü": [1e-05, None]}}
+    write_manifest(tmp_path, facts, {"a": "b"})
+    assert read_manifest(tmp_path) == ({k: v for k, v in facts.items() if k != "digest"}, {"a": "b"})
+    path = tmp_path / MANIFEST
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))  # as a copy by way of Windows may have it
+    assert read_manifest(tmp_path)[1] == {"a": "b"}
+    for text in ("[" * 100_000, "[]", "null", "{", '{"schema_version": 1, "digest": 7}', b"\xff\xfe"):
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        with pytest.raises(ValueError, match=r"damaged|schema version None"):
+            read_manifest(tmp_path)
+
+
+def test_low_rank_needs_its_basis(tmp_path: Path) -> None:
+    field = example("low_rank")
+    assert isinstance(field.store, StoredDirections)
+    replace(field, store=replace(field.store, basis=None)).save(tmp_path / "a")
+    with pytest.raises(ValueError, match="'basis' is missing"):
+        SemanticField.load(tmp_path / "a")
