@@ -180,6 +180,8 @@ def lift_run(
         warning = judge(match_photographs(scene), own_cameras=not isinstance(scene, SplatScene))
         if warning is not None:
             say(f"Warning: {warning}")
+    if export is not None:
+        _refuse_equal_stems(scene.train.names)
     settings = encoder_settings(options)
     if made is None:
         made = given_features(features, texts, scene.train.names)
@@ -196,6 +198,17 @@ def lift_run(
         scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
     )
     return LiftedRun(run_dir, scene, with_paths(field.to("cpu"), run_dir / FIELD_FOLDER), device, seconds)
+
+
+def _refuse_equal_stems(names: Sequence[str]) -> None:
+    """LangSplat's format names files by the stems of the images."""
+    stems = [Path(name).stem for name in names]
+    for i, stem in enumerate(stems):
+        if stem in stems[:i]:
+            raise ValueError(
+                f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
+                "Give the images other names, or lift without --export-langsplat."
+            )
 
 
 def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str]) -> Question | None:

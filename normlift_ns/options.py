@@ -135,6 +135,10 @@ class SplatOptions:
         for name in ("colmap", "transforms", "images", "masks", "world_transform"):
             value = getattr(self, name)
             object.__setattr__(self, name, None if value is None else Path(value))
+        if isinstance(self.holdout, str | float):
+            object.__setattr__(self, "holdout", (str(self.holdout),))
+        if self.test_every is not None and not isinstance(self.test_every, int):
+            raise ValueError(f"test_every must be a whole number, got {self.test_every!r}")
         for name, known in (
             ("views", ("train", "all")),
             ("rasterize_mode", (None, *get_args(RasterizeMode))),

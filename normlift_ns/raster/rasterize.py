@@ -151,11 +151,18 @@ def render(
         return chosen.composite(job, camera, values)
 
 
-def render_picture(scene: Scene, camera: Camera) -> UInt8[Tensor, "h w 3"]:
-    """The trained scene as a camera sees it, sRGB on its background: by the scene's own renderer if it has one."""
+def render_picture(
+    scene: Scene, camera: Camera, *, settings: RasterSettings | None = None, mode: RasterizeMode | None = None
+) -> UInt8[Tensor, "h w 3"]:
+    """The trained scene as a camera sees it, sRGB on its background: by the scene's own renderer if it has one.
+
+    Args:
+        settings, mode: other constants and another mode than those of the training, for pictures of another size.
+    """
     if scene.renderer is not None:
         return scene.renderer(camera)
-    color, alpha = render(scene.gaussians, camera, scene.colors(camera), rasterize_mode=scene.rasterize_mode)
+    how = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
+    color, alpha = render(scene.gaussians, camera, scene.colors(camera), **how)
     color = color + (1 - alpha)[:, :, None] * scene.background
     return (color.clamp(0, 1) * 255).round().to(torch.uint8)
 

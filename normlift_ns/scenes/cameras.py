@@ -22,6 +22,8 @@ class Cameras(NamedTuple):
     source: Path
     folder: Path
     """Of the dataset."""
+    base: Path
+    """What the names of the photographs are relative to."""
     to_splat: World | None
     """By --world-transform."""
 
@@ -54,7 +56,8 @@ def _transforms(options: SplatOptions) -> Cameras:
     found = read_transforms(path, options.images, options.masks)
     world = options.world_transform
     to_splat = None if world is None else read_world_transform(world, found.applied, found.applied_scale)
-    return Cameras(found.frames, found.held_out, path, path.parent, to_splat)
+    base = path.parent if options.images is None else options.images.absolute().parent
+    return Cameras(found.frames, found.held_out, path, path.parent, base, to_splat)
 
 
 def _colmap(options: SplatOptions, folder: Path) -> Cameras:
@@ -72,7 +75,9 @@ def _colmap(options: SplatOptions, folder: Path) -> Cameras:
     if not place.is_dir():
         raise FileNotFoundError(f"There is no folder {place} of photographs. Say where they are with --images.")
     listed = [image.name for image in registered]
-    files = find_photographs(listed, place.absolute(), model, "say where the photographs are with --images")
+    files = find_photographs(
+        listed, place.absolute(), model, "say where the photographs are with --images", copies=True
+    )
     masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
     base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
     frames = [
@@ -80,4 +85,4 @@ def _colmap(options: SplatOptions, folder: Path) -> Cameras:
         for image, file, mask in zip(registered, files, masks)
     ]
     to_splat = None if options.world_transform is None else read_world_transform(options.world_transform)
-    return Cameras(frames, frozenset(), model, base, to_splat)
+    return Cameras(frames, frozenset(), model, folder, base, to_splat)

@@ -120,7 +120,7 @@ def _read(
             data.end()
             return found
         path = model / f"{name}.txt"
-        lines = [line.strip() for line in path.read_text("utf8").splitlines()]
+        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
         return list(text([line for line in lines if not line.startswith("#")]))
     except FileNotFoundError:
         raise FileNotFoundError(
@@ -192,13 +192,23 @@ def _images_binary(data: _Bytes) -> Iterator[tuple[str, list[float], list[float]
 
 
 def _images_text(lines: list[str]) -> Iterator[tuple[str, list[float], list[float], int]]:
-    while lines and lines[-1] == "":
-        lines.pop()
-    for line in lines[::2]:  # the points of an image stand in the line after it, which may be empty
+    rest = iter(lines)
+    for line in rest:
         if line == "":
-            raise ValueError("an empty line where an image was expected")
+            continue
+        points = next(rest, "").split()  # of the image, in the line after it, which may be empty
+        if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
+            raise ValueError(f"the line after that of {line.split()[-1]} holds no points, as x, y and their numbers")
         _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
         yield name, list(map(float, (qw, qx, qy, qz))), list(map(float, (tx, ty, tz))), int(camera)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _points_binary(data: _Bytes) -> Iterator[tuple[int, tuple[float, ...]]]:

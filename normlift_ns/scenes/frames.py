@@ -119,31 +119,48 @@ def photograph_size(file: Path) -> tuple[int, int]:
         raise ValueError(f"{file} cannot be read as an image ({error}). Copy it again from the capture.") from error
 
 
-def find_photographs(names: Sequence[str], folder: Path, source: Path, advice: str) -> list[Path]:
+def find_photographs(names: Sequence[str], folder: Path, source: Path, advice: str, *, copies: bool) -> list[Path]:
     """The files of those names in a folder, absolute.
 
+    Args:
+        copies: whether the folder may hold copies of the photographs, so that names need not begin with their folders.
     Raises:
         FileNotFoundError: some are missing; the message counts them and names the first.
+        ValueError: two names stand for one file.
     """
-    found = [find_file(folder, name) for name in names]
+    found = [find_file(folder, name, copies=copies) for name in names]
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
             f"{len(missing)} of the {len(names)} photographs that {source} names are not in {folder}, the first is "
             f"{missing[0]}. Put them back, or {advice}."
         )
-    return [file.absolute() for file in found if file is not None]
+    files = [file.absolute() for file in found if file is not None]
+    if len(set(files)) < len(files):
+        first = next(i for i, file in enumerate(files) if file in files[:i])
+        raise ValueError(
+            f"{source} names {names[files.index(files[first])]} and {names[first]}, but in {folder} there is only "
+            f"{files[first]} for both. Put the photographs into the folders that it names, or {advice}."
+        )
+    return files
 
 
-def find_file(folder: Path, name: str) -> Path | None:
-    """The file of that name in a folder; else one of the same stem, as downscaled copies have other suffixes; else one
-    of the same name without its folders."""
-    for path in dict.fromkeys((folder / name, folder / Path(name).name)):
-        if path.is_file():
-            return path
-        for suffix in _SUFFIXES:
-            if path.with_suffix(suffix).is_file():
-                return path.with_suffix(suffix)
+def find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
+    """The file of that name in a folder, or of another suffix, as downscaled copies have.
+
+    Args:
+        copies: try it without its first folders too, as copies in images_2 lie.
+    """
+    path = Path(name)
+    parts = path.parts[1:] if path.is_absolute() else path.parts
+    places = [folder.joinpath(*parts[start:]) for start in range(len(parts))] if copies else [folder / path]
+    for place in places:
+        for file in (
+            *(place.with_name(place.name + end) for end in ("", *_SUFFIXES)),
+            *map(place.with_suffix, _SUFFIXES),
+        ):
+            if file.is_file():
+                return file
     return None
 
 
@@ -155,12 +172,11 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
     """
     masks = []
     for name in names:
-        tried = (folder / f"{name}.png", folder / f"{Path(name).name}.png")
-        found = next((path for path in tried if path.is_file()), None) or find_file(folder, name)
+        found = find_file(folder, f"{name}.png", copies=True) or find_file(folder, name, copies=True)
         if found is None:
             raise FileNotFoundError(
-                f"There is no mask for {name} in {folder}. Expected {tried[1].name} or {Path(name).stem}.png for every "
-                "photograph."
+                f"There is no mask for {name} in {folder}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
+                "every photograph."
             )
         masks.append(found.absolute())
     return masks

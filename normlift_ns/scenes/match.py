@@ -12,15 +12,29 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.raster.rasterize import render_picture
+from normlift_ns.raster.settings import RasterSettings
 
 _LONGEST = 400
 """Longer side of the renders in pixels."""
+_FINE = 4.0
+"""A photograph made smaller by less than this is met by making the rasterizer's 0.3 square pixels smaller, one made
+smaller by more by renders that keep the mean of Gaussians below the size of a pixel. As trained, a render at that size
+would be too thick."""
+_THIN = 0.1
+"""Square pixels added in such renders."""
 LEAST_PSNR = 24.0
 """Scenes of people reach 25 to 40 dB on the photographs of their training."""
 _FOCAL_STEP, _FOCAL_GAIN = 1.02, 1.0
 """A focal length that is wrong by 2 % costs about 15 dB on a sharp scene: 1 dB is well beyond chance."""
 _LEAST_IN_VIEW = 0.001
 """Share of the Gaussians that one of the views must see."""
+
+
+class _Small(NamedTuple):
+    """A view at no more than 400 pixels, and by how much it was made smaller."""
+
+    view: View
+    divisor: float
 
 
 class Match(NamedTuple):
@@ -43,9 +57,9 @@ def match_photographs(scene: Scene) -> Match:
         FileNotFoundError, ValueError: a photograph that is missing or cannot be read.
     """
     views = _some_views(scene)
-    in_view = max(_share_in_view(scene, view.camera) for view in views)
+    in_view = max(_share_in_view(scene, small.view.camera) for small in views)
     plain = _mean_psnr(scene, views, 1.0)
-    grey = sum(_psnr(view, _mean_color(view)) for view in views) / len(views)
+    grey = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
     others = {factor: _mean_psnr(scene, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
     best = max(others, key=lambda factor: others[factor])
     return Match(plain, in_view, grey, best if others[best] > plain + _FOCAL_GAIN else 1.0)
@@ -67,12 +81,13 @@ def judge(match: Match, *, own_cameras: bool) -> str | None:
     causes = (
         "Likely causes: cameras of another capture; cameras in another world than the splat's (give "
         "--world-transform; for gsplat's trainer see --gsplat-normalize); other photographs, or distorted ones under "
-        "cameras of undistorted ones; another --rasterize-mode or --background"
+        "cameras of undistorted ones; another exposure than in the training; much smaller copies of the photographs "
+        "than those of the training; another --rasterize-mode or --background"
     )
     if own_cameras:
         causes = (
-            "Likely causes: the photographs or transforms.json have changed since the training, or the training was "
-            "stopped early"
+            "Likely causes: the photographs, their exposure or transforms.json have changed since the training, or the "
+            "training was stopped early"
         )
     if match.in_view < _LEAST_IN_VIEW:
         raise ValueError(
@@ -99,12 +114,19 @@ def judge(match: Match, *, own_cameras: bool) -> str | None:
     return None
 
 
-def _some_views(scene: Scene) -> list[View]:
+def _some_views(scene: Scene) -> list[_Small]:
     last = len(scene.train) - 1
-    return [_small(scene.train[index]) for index in sorted({0, last // 2, last})]
+    views = [_small(scene.train[index]) for index in sorted({0, last // 2, last})]
+    seen = [small for small in views if small.view.mask is None or bool(small.view.mask.any())]
+    if len(seen) == 0:
+        raise ValueError(
+            f"The masks of {', '.join(small.view.name for small in views)} leave no pixel. Expected masks that are "
+            "zero where a pixel does not count; are they inverted?"
+        )
+    return seen
 
 
-def _small(view: View) -> View:
+def _small(view: View) -> _Small:
     """Pixels are averaged, so that what is left needs no filter."""
     camera = view.camera
     divisor = max(1.0, max(camera.width, camera.height) / _LONGEST)
@@ -117,11 +139,19 @@ def _small(view: View) -> View:
         share = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
         mask = share > 0.999
     smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
-    return View(smaller, image.round().to(torch.uint8), mask, view.name)
+    return _Small(View(smaller, image.round().to(torch.uint8), mask, view.name), divisor)
 
 
-def _mean_psnr(scene: Scene, views: Sequence[View], factor: float) -> float:
-    return sum(_psnr(view, render_picture(scene, _zoomed(view.camera, factor))) for view in views) / len(views)
+def _mean_psnr(scene: Scene, views: Sequence[_Small], factor: float) -> float:
+    return sum(_psnr(small.view, _picture(scene, small, factor)) for small in views) / len(views)
+
+
+def _picture(scene: Scene, small: _Small, factor: float) -> UInt8[Tensor, "h w 3"]:
+    """The scene, as a render at full size would be if it were made smaller."""
+    camera = _zoomed(small.view.camera, factor)
+    fine = small.divisor < _FINE
+    settings = RasterSettings(eps2d=RasterSettings().eps2d / small.divisor**2 if fine else _THIN)
+    return render_picture(scene, camera, settings=settings, mode=scene.rasterize_mode if fine else "antialiased")
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:

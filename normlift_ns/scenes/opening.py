@@ -27,8 +27,7 @@ from normlift_ns.scenes.splat import Splat
 from normlift_ns.scenes.split import held_out_names
 
 BACKGROUNDS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
-_FEW_POINTS = 4
-_CHECKPOINTS = (".pt", ".pth", ".ckpt")
+_FEW_POINTS, _PARALLEL = 4, 1e-6
 
 
 @dataclass(frozen=True)
@@ -81,12 +80,14 @@ def open_splat(
     """A trained splat and its photographs.
 
     Args:
-        path: a PLY file of Inria's trainer, gsplat or ns-export, or ckpt_<step>_rank<r>.pt of gsplat's simple_trainer.
+        path: a PLY file of Inria's trainer, gsplat or ns-export, or ckpt_<step>_rank<r>.pt of gsplat's simple_trainer;
+            its first bytes tell which.
         options: where its cameras and photographs are.
         say: called with a sentence for everything that had to be assumed, for example `print`.
     Raises:
         FileNotFoundError: a file or photograph is missing.
         ValueError: a file that cannot be read, that does not fit the others or that is no splat.
+        TypeError: arguments of other types.
 
     >>> from normlift_ns import SplatOptions, open_run, open_splat
     >>> run = open_run(config)
@@ -96,10 +97,14 @@ def open_splat(
     >>> len(scene.gaussians) == len(rows), len(scene.train)
     (True, 12)
     """
+    if not isinstance(path, str | Path) or not isinstance(options, SplatOptions):
+        raise TypeError(
+            f"open_splat takes a path and SplatOptions, got {type(path).__name__} and {type(options).__name__}"
+        )
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     frames = cameras.frames
-    checkpoint = read_gsplat(path) if path.suffix in _CHECKPOINTS else None
+    checkpoint = read_gsplat(path) if _is_checkpoint(path) else None
     splat, mode = read_ply(path) if checkpoint is None else (checkpoint.splat, None)
     held_out = cameras.held_out
     if options.test_every is not None or len(options.holdout) > 0:
@@ -127,7 +132,7 @@ def open_splat(
             path,
             step,
             Path("outputs").absolute(),
-            cameras.folder,
+            cameras.base,
             {"source_splat": str(path), "source_cameras": str(cameras.source), "source_step": step},
             options.rasterize_mode or mode or "classic",
             options.background,
@@ -136,29 +141,62 @@ def open_splat(
     return _best(placed, worlds, say)
 
 
+def _is_checkpoint(path: Path) -> bool:
+    """What torch.save writes is a ZIP archive; a missing file goes by its suffix."""
+    if not path.is_file():
+        return path.suffix in (".pt", ".pth", ".ckpt")
+    with path.open("rb") as file:
+        return file.read(2) == b"PK" or (path.suffix in (".pt", ".pth", ".ckpt") and path.stat().st_size != 0)
+
+
 def _best(
-    placed: Callable[[World], SplatScene],
-    worlds: Sequence[World],
-    say: Callable[[str], None],
+    placed: Callable[[World], SplatScene], worlds: Sequence[tuple[str, World]], say: Callable[[str], None]
 ) -> SplatScene:
     """The scene in the first world that its photographs confirm; if none does, in that which fits best."""
-    scene = placed(worlds[0])
-    if len(worlds) == 1 or (best := mean_psnr(scene)) >= LEAST_PSNR:
+    (_, first), *others = worlds
+    scene = placed(first)
+    if len(others) == 0 or (best := mean_psnr(scene)) >= LEAST_PSNR:
         return scene
-    for world in worlds[1:]:
+    found = ""
+    for text, world in others:
         other = placed(world)
         if (psnr := mean_psnr(other)) > best + 1:
-            scene, best = other, psnr
-            say("The trainer's axes point the other way; turned by half a turn, the splat fits its photographs.")
+            scene, best, found = other, psnr, text
+    if found != "":
+        say(found)
     return scene
 
 
-def _worlds(checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: Cameras) -> Sequence[World]:
-    """From the world of the cameras to that of the splat; several where only photographs can tell."""
+_TURNED = (
+    "The axes of gsplat's normalization point the other way; turned by half a turn, the splat fits its photographs."
+)
+_NORMALIZED = (
+    "The splat does not lie in the world of its cameras, but fits its photographs in gsplat's normalized world."
+)
+
+
+def _worlds(checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: Cameras) -> list[tuple[str, World]]:
+    """From the world of the cameras to that of the splat, with what to say of it; several where only photographs tell.
+
+    A PLY file may be of gsplat's trainer too: its normalized world is tried where that of the cameras does not fit.
+    """
     if cameras.to_splat is not None:
-        return [cameras.to_splat]
-    if checkpoint is None or not options.gsplat_normalize:
-        return [World(np.eye(4)[:3], 1.0)]
+        return [("", cameras.to_splat)]
+    same = [("", World(np.eye(4)[:3], 1.0))]
+    if not options.gsplat_normalize or (checkpoint is None and options.colmap is None):
+        return same
+    try:
+        first, *turned = _normalized(options, cameras)
+    except (ValueError, FileNotFoundError):
+        if checkpoint is None:
+            return same
+        raise
+    worlds = [("", first)] if checkpoint is not None else [*same, (_NORMALIZED, first)]
+    return [*worlds, *((_TURNED, world) for world in turned)]
+
+
+def _normalized(options: SplatOptions, cameras: Cameras) -> list[World]:
+    """How gsplat's trainer normalized the world, from its COLMAP project."""
     if options.colmap is None:
         raise ValueError(
             "gsplat's trainer normalized the world of the splat by the points of its COLMAP project, so a "
@@ -193,6 +231,8 @@ def _adjusted(
     by_name = {}
     for frame, move in zip(trained, moves.numpy()):
         first, second = move[3:6] + np.eye(3)[0], move[6:9] + np.eye(3)[1]
+        if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
+            raise ValueError(f"{path}: its `pose_adjust` turns {frame.name} by no rotation. Expected two axes.")
         x = first / np.linalg.norm(first)
         y = second - (x @ second) * x
         y /= np.linalg.norm(y)
@@ -229,10 +269,8 @@ def _assumptions(
     else:
         texts.append(f"All {len(frames)} photographs are lifted; see --test-every and --holdout.")
     if options.colmap is not None:
-        folder = options.images or cameras.folder / "images"
-        unused = sum(file.is_file() for file in folder.iterdir()) - len(
-            {f.file for f in frames if f.file.parent == folder}
-        )
+        folder = (options.images or options.colmap / "images").absolute()
+        unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})
         if unused > 0:
             texts.append(f"{unused} files in {folder} have no camera and are left out.")
     return texts

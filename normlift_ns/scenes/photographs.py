@@ -108,7 +108,10 @@ def _undistorted(
 def _read(frame: Frame) -> UInt8[np.ndarray, "h w c"]:
     try:
         with Image.open(frame.file) as image:
-            pixels = np.array(image if image.mode in ("RGB", "RGBA") else image.convert("RGB"), np.uint8)
+            if image.mode[0] in "IF":
+                raise ValueError(f"its pixels are of mode {image.mode}, expected 8 bits per channel")
+            mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
+            pixels = np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
     except FileNotFoundError:
         raise FileNotFoundError(
             f"{frame.file} is missing, which the cameras name. Put it back, or say where the images are."

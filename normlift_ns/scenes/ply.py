@@ -22,7 +22,9 @@ _NEEDED = (
     *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
 )
-_MODES: dict[str, RasterizeMode] = {"mip": "antialiased", "antialiased": "antialiased", "classic": "classic"}
+_MODES: dict[str, RasterizeMode] = {
+    "mip": "antialiased", "antialiased": "antialiased", "classic": "classic", "default": "classic",
+}  # fmt: skip
 
 
 class PlySplat(NamedTuple):
@@ -30,7 +32,7 @@ class PlySplat(NamedTuple):
 
     splat: Splat
     rasterize_mode: RasterizeMode | None
-    """As the comment SplatRenderMode says; None: there is none."""
+    """As the comment SplatRenderMode says; None: there is none, or an unknown one."""
 
 
 def read_ply(path: Path) -> PlySplat:
@@ -47,7 +49,17 @@ def read_ply(path: Path) -> PlySplat:
         raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
     try:
         found = PlyData.read(str(path), mmap="c")
-    except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"The header of {path} has characters beyond ASCII, perhaps in a comment ({error}). Remove them from it, "
+            f"or write the file again, for example with: splat-transform {path.name} clean.ply"
+        ) from error
+    except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
+        if path.open("rb").read(3) == b"ply":
+            raise ValueError(
+                f"{path} is truncated or damaged ({' '.join(str(error).split())}): its {path.stat().st_size:,} bytes "
+                "do not hold what its header says. Copy it again."
+            ) from error
         raise ValueError(
             f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in the PLY "
             "format; splat-transform turns other formats into it, for example: splat-transform scene.sog scene.ply"
@@ -65,15 +77,23 @@ def read_ply(path: Path) -> PlySplat:
     if missing:
         raise ValueError(
             f"{path} is no splat: its {vertex.count:,} vertices have no {', '.join(missing)}. Expected the properties "
-            f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found {', '.join(sorted(names)[:12])}. Give the "
-            "PLY file that the splat's trainer or ns-export gaussian-splat wrote, not the point cloud it began with."
+            f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
+            f"{', '.join([item for item in sorted(names) if not item.startswith('f_rest_')][:16])}. {_advice(missing)}"
         )
     lists = [item.name for item in vertex.properties if item.name in _NEEDED and hasattr(item, "len_dtype")]
     if lists:
         raise ValueError(f"{path} is no splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
     splat = _read_columns(path, vertex.data, _rest_names(path, names))
     check_splat(splat, path)
-    return PlySplat(splat, _mode(path, [*found.comments, *vertex.comments]))
+    return PlySplat(splat, _mode([*found.comments, *vertex.comments]))
+
+
+def _advice(missing: list[str]) -> str:
+    if missing == ["scale_2"]:
+        return "2D Gaussians have two scales, and are not read; train the scene with 3D Gaussians."
+    if all(name.startswith("f_dc_") for name in missing):
+        return "Its colours are not spherical harmonics; export it again with f_dc_*."
+    return "Give the PLY file that its trainer or ns-export gaussian-splat wrote, not the point cloud it began with."
 
 
 def _rest_names(path: Path, names: set[str]) -> list[str]:
@@ -120,15 +140,9 @@ def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
             yield start, np.fromfile(file, table.dtype, count) if mapped else table[start : start + count]
 
 
-def _mode(path: Path, comments: list[str]) -> RasterizeMode | None:
+def _mode(comments: list[str]) -> RasterizeMode | None:
     for comment in comments:
         key, _, value = comment.partition(":")
         if key.strip().lower() == "splatrendermode":
-            mode = value.strip().lower()
-            if mode not in _MODES:
-                raise ValueError(
-                    f"{path} says SplatRenderMode: {value.strip()}, expected one of {', '.join(_MODES)}. Say how the "
-                    "scene was rasterized in its training with --rasterize-mode classic or antialiased."
-                )
-            return _MODES[mode]
+            return _MODES.get(value.strip().lower())
     return None

@@ -88,7 +88,14 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
         1.5 did not flip, and the signs of the axes depend on the linear algebra library of the training.
     """
     poses = np.array([np.concatenate([frame.pose, [[0, 0, 0, 1]]]) for frame in frames]) * [1, -1, -1, 1]
-    upright = _upright(poses)
+    with np.errstate(all="ignore"):
+        upright = _upright(poses)
+    if not np.isfinite(upright).all():
+        raise ValueError(
+            "gsplat's normalization cannot be computed from these cameras: all of them stand at one point, or look up "
+            "in opposite directions. Give --world-transform; or --gsplat-normalize False, if the training had "
+            "--no-normalize-world-space."
+        )
     if np.linalg.det(upright[:3, :3]) < 0:
         raise ValueError(
             "The mean up axis of the cameras is exactly +y, and gsplat's trainer mirrors such a world. Train the splat "
@@ -128,7 +135,10 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
     """The median of the points goes to the origin, their widest direction to x, their narrowest to z."""
     centre = np.median(points, axis=0)
-    axes = np.linalg.eigh(np.cov(points - centre, rowvar=False))[1][:, ::-1].copy()
+    covariance = np.cov(points - centre, rowvar=False)
+    if not np.isfinite(covariance).all():
+        raise ValueError("gsplat's normalization cannot be computed: the points of the project lie too far away.")
+    axes = np.linalg.eigh(covariance)[1][:, ::-1].copy()
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
     matrix = np.eye(4)

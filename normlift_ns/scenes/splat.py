@@ -19,6 +19,8 @@ _WIDE = 0.02
 """A median Gaussian wider than this share of the scene, in a file without negative logarithms: they are none."""
 
 _SAMPLE, _BLOCK = 2**20, 2**18
+_MANY = 100
+"""Gaussians from which logits that all lie in 0..1 are no chance."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def check_splat(splat: Splat, file: Path) -> None:
     """Refuses Gaussians that nothing could draw.
 
     Raises:
-        ValueError: none at all, values that are not finite, rotations of length zero, scales that are no logarithms.
+        ValueError: none at all, values that are not finite, rotations of length zero, scales that are no logarithms,
+            opacities that are no logits.
     """
     if len(splat) == 0:
         raise ValueError(f"{file} holds no Gaussians at all. Export the scene again.")
@@ -76,9 +79,15 @@ def check_splat(splat: Splat, file: Path) -> None:
     lengths = splat.quats.abs().amax(dim=1)
     if bool((lengths == 0).all()):
         raise ValueError(f"{file} has rotations of zeros only, so nothing of it can be drawn. Export the scene again.")
+    low, high = float(splat.opacities.min()), float(splat.opacities.max())
+    if len(splat) >= _MANY and low >= 0 and high <= 1:
+        raise ValueError(
+            f"{file} seems to hold opacities, between {low:.3g} and {high:.3g}, in place of their logits. Expected "
+            "logits, as all splat trainers write them; store log(opacity / (1 - opacity))."
+        )
     some = splat.means[:: max(1, len(splat) // _SAMPLE)]
-    low, high = some.quantile(0.05, dim=0), some.quantile(0.95, dim=0)
-    extent, width = float((high - low).amax()), float(splat.scales.median().exp())
+    left, right = some.quantile(0.05, dim=0), some.quantile(0.95, dim=0)
+    extent, width = float((right - left).amax()), float(splat.scales.median().exp())
     if bool((splat.scales >= 0).all()) and extent > 0 and width > _WIDE * extent:
         raise ValueError(
             f"{file} seems to hold linear scales, between {float(splat.scales.min()):.3g} and "

@@ -23,15 +23,17 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, holdout: Seq
         raise ValueError("--test-every and --holdout both say which photographs are held out; give one of them")
     if test_every is not None:
         if test_every < 2:
-            raise ValueError(f"--test-every must be at least 2, got {test_every}; --views all holds nothing out")
+            raise ValueError(
+                f"--test-every must be at least 2, got {test_every}; leave it out where nothing was held out"
+            )
         return frozenset(names[::test_every])
     share = _share(holdout)
     if share is not None:
         trained = np.linspace(0, len(names) - 1, int(np.ceil(len(names) * (1 - share))), dtype=int)
         return frozenset(np.delete(np.array(names, dtype=object), trained).tolist())
     wanted = list(holdout)
-    if len(wanted) == 1 and wanted[0].endswith(".txt") and Path(wanted[0]).is_file():
-        wanted = [line.strip() for line in Path(wanted[0]).read_text("utf8").splitlines() if line.strip() != ""]
+    if len(wanted) == 1 and wanted[0].endswith(".txt"):
+        wanted = _listed(Path(wanted[0]))
     return frozenset(name for want in wanted for name in _matching(want, names))
 
 
@@ -42,18 +44,42 @@ def _share(holdout: Sequence[str]) -> float | None:
         share = float(holdout[0])
     except ValueError:
         return None
-    return share if 0 < share < 1 else None
+    if share.is_integer() and not 0 <= share <= 1:
+        return None  # the name of a photograph
+    if not 0 < share < 1:
+        raise ValueError(
+            f"--holdout {holdout[0]} is no share: expected a number between 0 and 1, such as 0.1, or names"
+        )
+    return share
+
+
+def _listed(file: Path) -> list[str]:
+    """Names in a text file, one per line."""
+    if not file.is_file():
+        raise ValueError(
+            f"--holdout names {file}, and there is no such file. Expected one name of a photograph per line."
+        )
+    try:
+        names = [line.strip() for line in file.read_text("utf-8-sig").splitlines()]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file} is no UTF-8 text ({error}). Expected one name of a photograph per line.") from error
+    if not any(names):
+        raise ValueError(f"{file} is empty. Expected the names of the photographs that were held out, one per line.")
+    return [name for name in names if name != ""]
 
 
 def _matching(wanted: str, names: Sequence[str]) -> list[str]:
     path = Path(wanted)
-    found = [
-        name
-        for name in names
-        if wanted in (name, Path(name).name, Path(name).stem, Path(name).with_suffix("").as_posix())
-    ]
-    if not found:
+    for short in (lambda name: name, lambda name: name.name, lambda name: name.with_suffix(""), lambda name: name.stem):
+        found = [name for name in names if str(short(Path(name))) == str(path)]
+        if len(found) > 1:
+            raise ValueError(f"--holdout {wanted} fits {len(found)} photographs: {', '.join(found)}. Give whole names.")
+        if found:
+            return found
+    found = [name for name in names if path.as_posix().endswith(f"/{name}")]
+    if len(found) != 1:
         raise ValueError(
-            f"--holdout names {path}, but no photograph is called so; there are {len(names)}, {names[0]} to {names[-1]}"
+            f"--holdout names {wanted}, but no photograph is called so; there are {len(names)}, "
+            f"{names[0]} to {names[-1]}"
         )
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 from collections.abc import Sequence
@@ -17,6 +18,9 @@ from jaxtyping import Float
 from normlift_ns.core.files import write_text
 from normlift_ns.scenes.frames import Frame, Intrinsics, find_masks, find_photographs, photograph_size
 
+_LARGEST = 2**16
+"""Pixels along one side of a photograph."""
+_SINGULAR = 1e-6
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
@@ -39,6 +43,7 @@ class _Camera(msgspec.Struct):
     camera_angle_x: float | None = None
     camera_angle_y: float | None = None
     camera_model: str | None = None
+    is_fisheye: bool | None = None
 
 
 class _Frame(_Camera, kw_only=True):
@@ -77,7 +82,7 @@ def read_json(path: Path, expected: str) -> Any:
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}. Expected {expected}.")
-    text = path.read_bytes()
+    text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     try:
         return msgspec.json.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -114,7 +119,7 @@ def read_transforms(
         raise ValueError(f"{path} has another form than expected: {error}. Expected {expected}.") from error
     place = path.parent if base is None else base
     listed = [relative_name(Path(frame.file_path), place) for frame in found.frames]
-    files = find_photographs(listed, place if images is None else images, path, advice)
+    files = find_photographs(listed, images or place, path, advice, copies=images is not None)
     names = listed
     if base is None:
         names = [relative_name(file, (place if images is None else images.parent).absolute()) for file in files]
@@ -122,14 +127,31 @@ def read_transforms(
         Frame(file, name, _pose(entry, path), _intrinsics(found, entry, file, path), mask)
         for entry, file, name, mask in zip(found.frames, files, names, _masks(found, place, images, masks, path))
     ]
-    trained = None if found.train_filenames is None else {place / name for name in found.train_filenames}
-    held_out = [trained is not None and place / entry.file_path not in trained for entry in found.frames]
+    held_out = _held_out(found, place, path)
     return TransformsFile(
         sorted(frames, key=lambda frame: frame.file),
         frozenset(name for name, out in zip(names, held_out) if out),
         _applied(found, path),
         found.applied_scale,
     )
+
+
+def _held_out(found: _File, place: Path, path: Path) -> list[bool]:
+    """Which frames the file keeps from the training; like nerfstudio it refuses lists that name other files."""
+    lists = {"train": found.train_filenames, "val": found.val_filenames, "test": found.test_filenames}
+    known = [place / frame.file_path for frame in found.frames]
+    for split, names in lists.items():
+        strange = [name for name in names or () if place / name not in known]
+        if strange:
+            raise ValueError(
+                f"{path}: its {split}_filenames name {strange[0]}, which is no file_path of its frames. Expected the "
+                "same names in both."
+            )
+    if found.train_filenames is not None:
+        trained = {place / name for name in found.train_filenames}
+        return [file not in trained for file in known]
+    kept = {place / name for name in (*(found.val_filenames or ()), *(found.test_filenames or ()))}
+    return [file in kept for file in known]
 
 
 def relative_name(file: Path, folder: Path) -> str:
@@ -149,9 +171,22 @@ def _masks(
     if len(given) < len(named):
         bare = next(frame.file_path for frame in found.frames if frame.mask_path is None)
         raise ValueError(f"{path} names masks for some images, but none for {bare}. Expected one for each, or none.")
-    listed = [relative_name(Path(name), place) for name in given]
-    folder = place if images is None or not (images / listed[0]).is_file() else images
-    return find_photographs(listed, folder, path, "say where the masks are with --masks")
+    found_masks = [_mask(name, place, images) for name in given]
+    missing = [name for name, file in zip(given, found_masks) if file is None]
+    if missing:
+        raise FileNotFoundError(
+            f"{len(missing)} of the {len(given)} masks that {path} names are missing, the first is "
+            f"{place / missing[0]}. Put them back, beside the photographs if those were moved."
+        )
+    return [file.absolute() for file in found_masks if file is not None]
+
+
+def _mask(name: str, place: Path, images: Path | None) -> Path | None:
+    """Where the file says, or in a folder of the same name in or beside the folder of the photographs."""
+    own = place / name
+    tail = Path(own.parent.name, own.name)
+    moved = () if images is None else (images / relative_name(own, place), images / tail, images.parent / tail)
+    return next((file for file in (own, *moved) if file.is_file()), None)
 
 
 def _pose(frame: _Frame, path: Path) -> Float[np.ndarray, "3 4"]:
@@ -171,6 +206,7 @@ def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrins
         return getattr(frame, name) if found is None else found
 
     model = value("camera_model") or "OPENCV"
+    model = "OPENCV_FISHEYE" if value("is_fisheye") else model
     if model not in _PERSPECTIVE:
         raise ValueError(
             f"{path}: the camera_model is {model}; read are {', '.join(_PERSPECTIVE)}. Undistort the images, train the "
@@ -178,9 +214,14 @@ def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrins
         )
     size = (value("w"), value("h"))
     width, height = photograph_size(file) if None in size else size
-    if not (float(width).is_integer() and float(height).is_integer()):
-        raise ValueError(f"{path}: w and h of {frame.file_path} are {width} and {height}, expected whole numbers.")
+    if not all(float(side).is_integer() and 0 < side <= _LARGEST for side in (width, height)):
+        raise ValueError(
+            f"{path}: w and h of {frame.file_path} are {width} and {height}, expected whole numbers of pixels."
+        )
     fx, fy = value("fl_x"), value("fl_y")
+    for angle in (value("camera_angle_x"), value("camera_angle_y")):
+        if angle is not None and not 0 < angle < math.pi:
+            raise ValueError(f"{path}: a camera_angle is {angle}, expected radians between 0 and pi.")
     if fx is None and value("camera_angle_x") is not None:
         fx = 0.5 * width / math.tan(0.5 * value("camera_angle_x"))
     if fy is None and value("camera_angle_y") is not None:
@@ -225,6 +266,11 @@ def _applied(found: _File, path: Path) -> Float[np.ndarray, "4 4"]:
         if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not np.isfinite(rows).all():
             raise ValueError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
         matrix[:3] = rows[:3]
+    if abs(np.linalg.det(matrix)) < _SINGULAR or not 0 < found.applied_scale < math.inf:
+        raise ValueError(
+            f"{path}: applied_transform cannot be inverted, or applied_scale is {found.applied_scale}. Expected a "
+            "rotation and a positive number."
+        )
     return matrix
 
 

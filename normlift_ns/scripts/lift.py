@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
@@ -78,7 +80,7 @@ class NormLift:
                 device=self.device,
                 export=None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite),
                 report=report,
-                say=CONSOLE.print,
+                say=_say,
             )
         CONSOLE.print(summary(run, time.perf_counter() - start, self.queries))
         return run
@@ -107,7 +109,11 @@ class NormLift:
             return cast(Path, self.load_config)
         from normlift_ns.scenes.opening import open_splat  # noqa: PLC0415
 
-        return open_splat(splat, self.splat, say=CONSOLE.print)
+        return open_splat(splat, self.splat, say=_say)
+
+
+def _say(text: str) -> None:
+    CONSOLE.print(text, markup=False, highlight=False)
 
 
 @contextmanager
@@ -156,9 +162,11 @@ def summary(run: LiftedRun, total: float, queries: tuple[str, ...]) -> Panel:
     table.add_row("stored as", f"{facts['form']}, {chosen['bytes'] / 1e6:.1f} MB, cosines within {chosen['bound']:.1e}")
     others = (f"{name} {way['bytes'] / 1e6:.1f} MB" for name, way in facts["forms"].items() if name != facts["form"])
     table.add_row("", "instead of " + ", ".join(others))
-    table.add_row("run", str(run.folder))
+    table.add_row("run", Text(str(run.folder)))
     text = queries[0] if len(queries) > 0 else "…"
-    table.add_row("next", f'ns-normlift-query --load-config {run.config} --text "{text}"')
+    table.add_row(
+        "next", Text(f"ns-normlift-query --load-config {shlex.quote(str(run.config))} --text {shlex.quote(text)}")
+    )
     return Panel(table, title="[bold][green]:tada: Lifted :tada:", expand=False)
 
 

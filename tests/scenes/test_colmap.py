@@ -93,6 +93,18 @@ def test_lines_that_make_no_sense_are_refused(tmp_path: Path, name: str, line: s
         read(folder)
 
 
+def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> None:
+    folder = model_folder(write_colmap(tmp_path, frames(), binary=False))
+    expected = read_images(folder)
+    lines = (folder / "images.txt").read_text().splitlines()
+    pairs = [f"\n{first}\n{second}\n" for first, second in zip(lines[2::2], lines[3::2])]
+    (folder / "images.txt").write_text("\n".join([*lines[:2], *pairs]), "utf-8-sig")
+    assert [image.name for image in read_images(folder)] == [image.name for image in expected]
+    (folder / "images.txt").write_text("\n".join(lines[2::2]))  # without the lines of points
+    with pytest.raises(ValueError, match=r"the line after that of .* holds no points"):
+        read_images(folder)
+
+
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(["cameras", "images", "points3D"]),

@@ -14,8 +14,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns import LiftOptions, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
+from normlift_ns.lifting import Export
 from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.scenes.similarity import gsplat_normalization, similarity
 from normlift_ns.scenes.splat import Splat
 from normlift_ns.scenes.transforms import read_transforms, write_transforms
@@ -260,7 +262,6 @@ def test_undistortion_and_masks_are_nerfstudios(tmp_path: Path) -> None:
     from nerfstudio.data.datasets.base_dataset import InputDataset  # noqa: PLC0415
 
     from normlift_ns.nerfstudio_plugin.views import DatasetViews  # noqa: PLC0415
-    from normlift_ns.scenes.photographs import PhotographViews  # noqa: PLC0415
     from tests.nerfstudio_plugin.stock_run import write_dataset  # noqa: PLC0415
 
     write_dataset(tmp_path / "a", masks=True, channels=4)
@@ -296,6 +297,11 @@ def test_undistortion_and_masks_are_nerfstudios(tmp_path: Path) -> None:
         ({"colmap": "empty", "images": "half"}, "has 0 cameras and 0 registered images"),
         ({"colmap": "p", "images": "all", "test_every": 1}, "--test-every must be at least 2"),
         ({"colmap": "p", "images": "all", "test_every": 8, "holdout": ("0001",)}, "give one of them"),
+        ({"colmap": "p", "images": "all", "holdout": ("1.5",)}, "1.5 is no share: expected a number between 0 and 1"),
+        (
+            {"colmap": "p", "images": "all", "holdout": ("list.txt",)},
+            "--holdout names list.txt, and there is no such file",
+        ),
         ({"colmap": "p", "images": "all", "holdout": ("cat",)}, "--holdout names cat, but no photograph is called so"),
         ({"colmap": "p", "images": "all", "masks": "masks"}, r"no mask for .*0000\.png in masks"),
         ({"transforms": "t.json"}, "gsplat's trainer normalized the world .* Give the project with --colmap"),
@@ -363,6 +369,86 @@ def test_every_eighth_photograph_is_held_out_as_gsplat_does(native, splat, frame
     assert listed.held_out.names == [names[3], names[5]]
     share = open_splat(path, replace(base, holdout=("0.1",)))  # ns-train: 13 evenly spaced of 14 are trained
     assert share.held_out.names == [name for i, name in enumerate(names) if i not in np.linspace(0, 13, 13, dtype=int)]
+
+
+def test_a_ply_file_of_gsplats_trainer_lies_in_its_normalized_world(native, splat, frames, tmp_path: Path) -> None:
+    points = splat.means.numpy()[::3]
+    world = gsplat_normalization(sorted(frames, key=lambda frame: frame.name), points)[0]
+    matrix = np.eye(4)
+    matrix[:3] = world.scale * world.transform
+    path = write_ply(tmp_path / "point_cloud_29999.ply", ply_columns(_in_world(splat, matrix)))
+    project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
+    options = SplatOptions(colmap=project, images=native.location.folder / "images", holdout=held_out(native))
+    said: list[str] = []
+    scene = open_splat(path, options, say=said.append)
+    assert any("gsplat's normalized world" in text for text in said)
+    assert not any("have no camera" in text for text in said)
+    assert difference(native, scene) < 5e-5
+
+
+def test_photographs_in_subfolders(native, splat, frames, tmp_path: Path, monkeypatch) -> None:
+    """Two cameras with photographs of the same names, in copies outside the dataset, which are moved later."""
+    monkeypatch.chdir(tmp_path)
+    entries = []
+    for i, frame in enumerate(frames):
+        name = f"{('left', 'right')[i % 2]}/{i // 2:04d}.png"
+        for folder in ("cap/images", "photos"):
+            (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / folder / name).write_bytes(frame.file.read_bytes())
+        camera = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h"), frame.intrinsics))
+        entries.append(
+            {"file_path": f"images/{name}", "transform_matrix": [*frame.pose.tolist(), [0, 0, 0, 1]], **camera}
+        )
+    (tmp_path / "cap" / "transforms.json").write_text(json.dumps({"frames": entries}))
+    path = write_ply(tmp_path / "s.ply", ply_columns(splat))
+    scene = open_splat(path, SplatOptions(transforms="cap", images="photos"))
+    assert scene.train.names[0] == "photos/left/0000.png"
+    assert scene.train.names[-1] == "photos/right/0006.png"
+    run = lift_run(scene, timestamp="t", **OPTIONS)
+    (tmp_path / "photos").rename(tmp_path / "moved")
+    for data in ("moved", "."):
+        if data == ".":
+            (tmp_path / "moved").rename(tmp_path / "photos")
+        again = open_run(run.config, data=tmp_path / data)
+        assert again.scene.train.names == scene.train.names
+        assert again.scene.train[3].image.shape == (120, 160, 3)
+    with pytest.raises(ValueError, match=r"would share the files 0000_\*\.npy of LangSplat's format"):
+        lift_run(again.scene, export=Export(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
+    (tmp_path / "photos" / "left" / "0001.png").unlink()
+    (tmp_path / "photos" / "0001.png").write_bytes(frames[0].file.read_bytes())
+    (tmp_path / "photos" / "right" / "0001.png").unlink()
+    with pytest.raises(ValueError, match=r"there is only .*photos/0001.png for both"):
+        open_splat(path, SplatOptions(transforms="cap", images="photos"))
+
+
+@pytest.mark.parametrize("mode", ["P", "LA", "RGBA"])
+def test_transparent_pixels_show_the_background(tmp_path: Path, mode: str) -> None:
+    image = Image.new("RGBA", (40, 30), (255, 0, 255, 0))
+    image.paste((10, 20, 30, 255), (0, 0, 20, 30))
+    kwargs = {"transparency": 1} if mode == "P" else {}
+    if mode == "P":
+        image = Image.fromarray((np.arange(40) >= 20).astype(np.uint8)[None].repeat(30, 0), "P")
+        image.putpalette([10, 20, 30, 255, 0, 255])
+    (image.convert("LA") if mode == "LA" else image).save(tmp_path / "a.png", **kwargs)
+    frame = Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], Intrinsics(30, 30, 20, 15, 40, 30))
+    pixels = PhotographViews([frame], torch.ones(3))[0].image
+    assert (pixels[:, 20:] == 255).all()
+    assert (pixels[:, :20] < 40).all()
+
+
+def test_photographs_of_sixteen_bits_are_refused_by_name(tmp_path: Path) -> None:
+    Image.fromarray(np.full((30, 40), 30000, np.uint16)).save(tmp_path / "a.png")
+    frame = Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], Intrinsics(30, 30, 20, 15, 40, 30))
+    with pytest.raises(ValueError, match=r"a\.png cannot be read .its pixels are of mode I"):
+        _ = PhotographViews([frame], torch.ones(3))[0]
+
+
+def test_wrong_types_are_named(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="open_splat takes a path and SplatOptions, got str and str"):
+        open_splat("x.ply", "capture")  # type: ignore[arg-type]
+    assert SplatOptions(holdout=0.1).holdout == ("0.1",)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="test_every must be a whole number, got '8'"):
+        SplatOptions(test_every="8")  # type: ignore[arg-type]
 
 
 @needs_shared

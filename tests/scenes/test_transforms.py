@@ -58,6 +58,19 @@ def test_held_out_photographs_are_those_that_the_file_names(tmp_path: Path) -> N
     assert read_transforms(capture(tmp_path, {**INTRINSICS, **split})).held_out == {"images/b.png"}
 
 
+def test_lists_of_other_names_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"train_filenames name images/c.png, which is no file_path"):
+        read_transforms(capture(tmp_path, {**INTRINSICS, "train_filenames": ["images/a.png", "images/c.png"]}))
+    only = read_transforms(capture(tmp_path, {**INTRINSICS, "test_filenames": ["images/a.png"]}))
+    assert only.held_out == {"images/a.png"}
+
+
+def test_names_may_have_dots_and_no_suffix(tmp_path: Path) -> None:
+    path = capture(tmp_path, names=("images/frame.0000.png", "images/frame.0001.png"))
+    path.write_text(path.read_text().replace(".png", ""))
+    assert [frame.file.name for frame in read_transforms(path).frames] == ["frame.0000.png", "frame.0001.png"]
+
+
 def test_images_and_masks_from_other_folders(tmp_path: Path) -> None:
     path = capture(tmp_path / "a")
     for folder, size in (("images_2", (20, 15)), ("masks", (20, 15))):
@@ -80,6 +93,12 @@ def test_images_and_masks_from_other_folders(tmp_path: Path) -> None:
         ({"w": 40, "h": 30}, {}, "neither fl_x nor camera_angle_x"),
         ({**INTRINSICS, "k4": 0.1}, {}, "distortion k4 = 0.1"),
         ({**INTRINSICS, "w": 40.5}, {}, "expected whole numbers"),
+        ({**INTRINSICS, "w": 0}, {}, "w and h of images/b.png are 0.* and 30"),
+        ({**INTRINSICS, "h": 10**30}, {}, "expected whole numbers of pixels"),
+        ({**INTRINSICS, "is_fisheye": True}, {}, "camera_model is OPENCV_FISHEYE"),
+        ({"camera_angle_x": 0, "w": 40, "h": 30}, {}, "camera_angle is 0.*, expected radians between 0 and pi"),
+        ({**INTRINSICS, "applied_scale": 0}, {}, "applied_scale is 0"),
+        ({**INTRINSICS, "applied_transform": [[0, 0, 0, 0]] * 3}, {}, "applied_transform cannot be inverted"),
         ({**INTRINSICS, "fl_x": "wide"}, {}, r"Expected `float \| null`, got `str` - at `\$.fl_x`"),
         (INTRINSICS, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix of images/b.png is not 4 x 4"),
         (INTRINSICS, {"transform_matrix": "eye"}, "another form than expected"),
@@ -99,7 +118,6 @@ def test_other_content_is_refused(tmp_path: Path, content: dict, frame: dict, me
         ({"transform_matrix": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "pose of images/a.png is no rotation"),
         ({"transform_matrix": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "is no rotation"),
         ({"fl_x": -5.0}, "focal lengths -5"),
-        ({"w": 0}, "size 0 x 30"),
     ],
 )
 def test_cameras_that_no_photograph_can_have_are_refused(tmp_path: Path, change: dict, message: str) -> None:
