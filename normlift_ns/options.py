@@ -116,7 +116,8 @@ class SplatOptions:
     """File of the similarity from the world of the cameras to that of the splat: 4 x 4 numbers, or the
     dataparser_transforms.json of the run that a PLY file was exported from. By default the worlds are the same."""
     gsplat_normalize: bool = True
-    """For --load-gsplat: the trainer normalized the world (its default); computed again from the COLMAP project."""
+    """gsplat's trainer normalized the world (its default); computed again from the COLMAP project. A PLY file is
+    taken for one of that trainer only where its photographs say so."""
     views: Literal["train", "all"] = "train"
     """train: lift the photographs that were not held out. all: lift all of them."""
     test_every: int | None = None

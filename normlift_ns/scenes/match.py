@@ -67,7 +67,13 @@ def match_photographs(scene: Scene) -> Match:
 
 def mean_psnr(scene: Scene) -> float:
     """`Match.psnr` alone, in dB."""
-    return _mean_psnr(scene, _some_views(scene), 1.0)
+    return focal_psnrs(scene, [1.0])[0]
+
+
+def focal_psnrs(scene: Scene, factors: Sequence[float]) -> list[float]:
+    """PSNR in dB on the three views, with the focal lengths times each of the factors."""
+    views = _some_views(scene)
+    return [_mean_psnr(scene, views, factor) for factor in factors]
 
 
 def judge(match: Match, *, own_cameras: bool) -> str | None:

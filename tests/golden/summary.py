@@ -4,9 +4,10 @@ python -m tests.golden.summary FOLDER > tests/golden/golden.json
 
 FOLDER/<scene>/ holds what `run_commands` writes. The committed golden.json was made by version 0.1.
 
-Another number of threads, or another kind of processor, rounds the last bits of a vote otherwise. About one Gaussian in
-ten thousand then copies another neighbour, so that `source` is compared exactly only on the machine that golden.json
-names, and by a sample elsewhere.
+Another number of threads, or another kind of processor, rounds the last bits otherwise: four of 295,534 entries of the
+demo room's evidence come or go, and one Gaussian in a hundred copies another of its equal neighbours. So numbers are
+compared one by one on the kind of machine that golden.json names only, and elsewhere by means, counts and a sample of
+the sources.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from safetensors.numpy import load_file
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
 SAMPLES = 64
+SAME_SOURCES, LOOSE, FEW = 0.97, 0.01, 5
+"""On another machine: the share of equal sources, how far floats may be apart, and whole numbers at least."""
 
 
 def run_commands(scene: str, config: Path, folder: Path) -> None:
@@ -98,30 +101,39 @@ def _array(array: np.ndarray, name: str = "") -> dict[str, Any]:
 
 
 def compare(found: dict[str, Any], golden: dict[str, Any], tolerance: float) -> list[str]:
-    """Places where two summaries of a scene differ."""
-    if found["machine"] != golden["machine"]:
-        ours, theirs = found["field"].pop("source"), golden["field"].pop("source")
-        same = np.mean(np.equal(ours["sample"], theirs["sample"]))
-        share = found["statistics"].pop("refined_share") - golden["statistics"].pop("refined_share")
-        del found["machine"], golden["machine"]
-        if same < 0.99 or abs(share) > 1e-3:
-            return [f"source: {same:.2%} of a sample are equal, the refined share differs by {share:.1e}"]
-    return differences(found, golden, tolerance)
+    """Places where two summaries of a scene differ; with another processor or torch, loosely."""
+    if found["machine"] == golden["machine"]:
+        return differences(found, golden, tolerance)
+    ours, theirs = found["field"]["source"]["sample"], golden["field"]["source"]["sample"]
+    same = np.mean(np.equal(ours, theirs))
+    lines = [] if same >= SAME_SOURCES else [f"source: {same:.2%} of a sample are equal"]
+    return lines + differences(without_bits(found), without_bits(golden), LOOSE, loose=True)
 
 
-def differences(found: Any, golden: Any, tolerance: float, path: str = "") -> list[str]:
+def without_bits(summary: Any) -> Any:
+    """The summary without what one entry more or less changes altogether: digests, samples and the machine."""
+    if not isinstance(summary, dict):
+        return summary
+    return {k: without_bits(v) for k, v in summary.items() if k not in ("digest", "sample", "machine")}
+
+
+def differences(found: Any, golden: Any, tolerance: float, path: str = "", *, loose: bool = False) -> list[str]:
     """Places where two values differ: floats by more than the tolerance (relative to values above 1), all else at
-    all."""
+    all; loosely, whole numbers differ as floats do, by that share of them or a few."""
+    if loose and isinstance(found, int) and isinstance(golden, int) and not isinstance(found, bool):
+        return [] if abs(found - golden) <= max(FEW, tolerance * golden) else [f"{path}: {found} is not {golden}"]
     if isinstance(found, dict) and isinstance(golden, dict):
         names = sorted({*found, *golden})
         return [
             line
             for name in names
-            for line in differences(found.get(name), golden.get(name), tolerance, f"{path}/{name}")
+            for line in differences(found.get(name), golden.get(name), tolerance, f"{path}/{name}", loose=loose)
         ]
     if isinstance(found, list) and isinstance(golden, list) and len(found) == len(golden):
         return [
-            line for i, (a, b) in enumerate(zip(found, golden)) for line in differences(a, b, tolerance, f"{path}/{i}")
+            line
+            for i, (a, b) in enumerate(zip(found, golden))
+            for line in differences(a, b, tolerance, f"{path}/{i}", loose=loose)
         ]
     if isinstance(found, float) and isinstance(golden, float):
         return [] if abs(found - golden) <= tolerance * max(1.0, abs(golden)) else [f"{path}: {found} is not {golden}"]
