@@ -5,9 +5,9 @@ python -m tests.golden.summary FOLDER > tests/golden/golden.json
 FOLDER/<scene>/ holds what `run_commands` writes. The committed golden.json was made by version 0.1.
 
 Another number of threads, or another kind of processor, rounds the last bits otherwise: four of 295,534 entries of the
-demo room's evidence come or go, and one Gaussian in a hundred copies another of its equal neighbours. So numbers are
-compared one by one on the kind of machine that golden.json names only, and elsewhere by means, counts and a sample of
-the sources.
+demo room's evidence come or go, and one Gaussian in a hundred (six on a capture) copies another of its nearly equal
+neighbours. So numbers are compared one by one on the kind of machine that golden.json names only, and elsewhere by
+means, counts and a sample of the sources.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from safetensors.numpy import load_file
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
 SAMPLES = 64
-SAME_SOURCES, LOOSE, FEW = 0.97, 0.01, 5
+SAME_SOURCES, LOOSE, FEW = 0.9, 0.01, 5
 """On another machine: the share of equal sources, how far floats may be apart, and whole numbers at least."""
 
 
