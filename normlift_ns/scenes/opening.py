@@ -144,26 +144,24 @@ def open_splat(
 def _is_checkpoint(path: Path) -> bool:
     """What torch.save writes is a ZIP archive; a missing file goes by its suffix."""
     if not path.is_file():
-        return path.suffix in (".pt", ".pth", ".ckpt")
+        return path.suffix == ".pt"
     with path.open("rb") as file:
-        return file.read(2) == b"PK" or (path.suffix in (".pt", ".pth", ".ckpt") and path.stat().st_size != 0)
+        return file.read(2) == b"PK" or path.suffix == ".pt"
 
 
 def _best(
     placed: Callable[[World], SplatScene], worlds: Sequence[tuple[str, World]], say: Callable[[str], None]
 ) -> SplatScene:
-    """The scene in the first world that its photographs confirm; if none does, in that which fits best."""
+    """The scene in the first world that its photographs confirm; if none does, in the first of all."""
     (_, first), *others = worlds
     scene = placed(first)
-    if len(others) == 0 or (best := mean_psnr(scene)) >= LEAST_PSNR:
+    if len(others) == 0 or mean_psnr(scene) >= LEAST_PSNR:
         return scene
-    found = ""
     for text, world in others:
         other = placed(world)
-        if (psnr := mean_psnr(other)) > best + 1:
-            scene, best, found = other, psnr, text
-    if found != "":
-        say(found)
+        if mean_psnr(other) >= LEAST_PSNR:
+            say(text)
+            return other
     return scene
 
 
