@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from normlift_ns.core.refine import unsupported as unsupported
     from normlift_ns.core.scene import Scene as Scene
     from normlift_ns.core.scene import View as View
+    from normlift_ns.errors import InputError as InputError
     from normlift_ns.front_door import lift_run as lift_run
     from normlift_ns.front_door import open_run as open_run
     from normlift_ns.front_door import open_scene as open_scene
@@ -52,6 +53,7 @@ _HOMES = {
     "core.query": ("BACKGROUND_WORDS", "CANONICAL_NEGATIVES", "relevancy"),
     "core.refine": ("refine", "unsupported"),
     "core.scene": ("Scene", "View"),
+    "errors": ("InputError",),
     "front_door": ("lift_run", "open_run", "open_scene"),
     "lifted_run": ("LiftedRun",),
     "options": ("LiftOptions", "RefineConfig", "SourceOptions", "SplatOptions"),

@@ -22,6 +22,7 @@ from normlift_ns.encoders.cache import CachedTexts
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.source import FeatureSource, TextEncoder
 from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.errors import InputError
 from normlift_ns.objects import SceneObject, find_objects
 from normlift_ns.options import THRESHOLDS, Rule, SourceOptions
 
@@ -238,10 +239,10 @@ def encoder_of(field: SemanticField, device: str = "cpu", cache: Path | None = N
 def _options(field: SemanticField) -> SourceOptions:
     stored = field.manifest.get("encoder")
     if not isinstance(stored, Mapping) or set(stored) != set(ENCODER_KEYS):
-        raise ValueError(f"the field's manifest names no encoder (found {stored!r}); lift again with: ns-normlift")
+        raise InputError(f"the field's manifest names no encoder (found {stored!r}); lift again with: ns-normlift")
     vectors = stored["text_vectors"]
     if stored["encoder"] == GIVEN and vectors is None:
-        raise ValueError(
+        raise InputError(
             "this run was lifted from features of your own, without texts; name a file of texts and their vectors "
             "(--text-vectors), or lift again and give texts"
         )
@@ -281,11 +282,11 @@ def make_question(
         ValueError: a text that is empty or that the encoder does not understand.
     """
     if isinstance(negatives, str):
-        raise ValueError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
+        raise InputError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
     if rule not in ("auto", *get_args(Rule)):
-        raise ValueError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
+        raise InputError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
     if not 0 <= min_reliability <= 1 or (threshold is not None and not math.isfinite(threshold)):
-        raise ValueError(
+        raise InputError(
             f"the minimum reliability must be in 0..1 and the threshold finite, got {min_reliability} and {threshold}"
         )
     negatives = tuple(default_negatives(field) if negatives is None else negatives)

@@ -19,6 +19,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.given import GivenFeatures, given_features
 from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.lifting import Export, lift_scene
 from normlift_ns.options import LiftOptions, SourceOptions
@@ -152,11 +153,11 @@ def lift_run(
     True
     """
     if features is None and texts is not None:
-        raise ValueError("texts are for features of your own; give features too, or leave texts out")
+        raise InputError("texts are for features of your own; give features too, or leave texts out")
     if features is not None and source is not None:
-        raise ValueError("features of your own take the place of source; give one of the two")
+        raise InputError("features of your own take the place of source; give one of the two")
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
-        raise ValueError("data and load_step are for a config; give them to open_scene")
+        raise InputError("data and load_step are for a config; give them to open_scene")
     device, options = choose_device(device), source or SourceOptions()
     made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
     if made is not None and len(queries) > 0:
@@ -205,7 +206,7 @@ def _refuse_equal_stems(names: Sequence[str]) -> None:
     stems = [Path(name).stem for name in names]
     for i, stem in enumerate(stems):
         if stem in stems[:i]:
-            raise ValueError(
+            raise InputError(
                 f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
                 "Give the images other names, or lift without --export-langsplat."
             )
@@ -216,7 +217,7 @@ def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str
         return None
     length = source.text(queries).shape[1]
     if length != field.dimension:
-        raise ValueError(
+        raise InputError(
             f"the vectors of --queries have {length} numbers, the features {field.dimension}; name the model that made "
             "the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
         )

@@ -20,6 +20,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.source import TextEncoder
+from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.runs.files import FIELD_FOLDER, texts_cache
@@ -88,7 +89,7 @@ class LiftedRun:
             ValueError: no text, an empty one, or one that the encoder does not understand.
         """
         if not all(isinstance(text, str) for text in texts):
-            raise ValueError(f'ask takes texts one after the other, as in ask("red", "blue"); got {texts!r}')
+            raise InputError(f'ask takes texts one after the other, as in ask("red", "blue"); got {texts!r}')
         question = make_question(
             self.field,
             self.texts,
@@ -114,7 +115,7 @@ class LiftedRun:
         """
         question = question.question if isinstance(question, Answer) else question
         if question.vectors.shape[1] != self.field.dimension:
-            raise ValueError(
+            raise InputError(
                 f"the question has vectors of {question.vectors.shape[1]} numbers, the features of {self.folder} have "
                 f"{self.field.dimension}; ask this run, then save its answer"
             )
@@ -150,7 +151,7 @@ class LiftedRun:
         else:
             keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else torch.as_tensor(part)
         if keep.dtype != torch.bool or keep.shape != (len(self.field),):
-            raise ValueError(
+            raise InputError(
                 f"part must be an answer of this run, what it says of one text, or a mask of {len(self.field)} "
                 f"booleans; got {keep.dtype} {tuple(keep.shape)}"
             )
@@ -183,7 +184,7 @@ class LiftedRun:
             if name in (str(Path(known).with_suffix("")), Path(known).name, Path(known).stem)
         ]
         if len(found) > 1:
-            raise ValueError(f"{len(found)} training images are called {name!r}: {', '.join(names[i] for i in found)}")
+            raise InputError(f"{len(found)} training images are called {name!r}: {', '.join(names[i] for i in found)}")
         if len(found) == 0:
             raise KeyError(f"there is no training image {name!r}; there are {len(names)}, {names[0]} to {names[-1]}")
         return cameras[found[0]]

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from normlift_ns.errors import InputError
+
 RasterizeMode = Literal["classic", "antialiased"]
 """How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
 Background = Literal["black", "white"]
@@ -139,14 +141,14 @@ class SplatOptions:
         if isinstance(self.holdout, str | float):
             object.__setattr__(self, "holdout", (str(self.holdout),))
         if self.test_every is not None and not isinstance(self.test_every, int):
-            raise ValueError(f"test_every must be a whole number, got {self.test_every!r}")
+            raise InputError(f"test_every must be a whole number, got {self.test_every!r}")
         for name, known in (
             ("views", ("train", "all")),
             ("rasterize_mode", (None, *get_args(RasterizeMode))),
             ("background", get_args(Background)),
         ):
             if getattr(self, name) not in known:
-                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
+                raise InputError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ class RefineConfig:
             ("delta", self.delta >= 0, "not negative"),
         ):
             if not valid:
-                raise ValueError(f"RefineConfig.{name} must be {expected}, got {getattr(self, name)}")
+                raise InputError(f"RefineConfig.{name} must be {expected}, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -228,7 +230,7 @@ class LiftOptions:
     def __post_init__(self) -> None:
         for name, value in (("max_views", self.max_views), ("lift_downscale", self.lift_downscale)):
             if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+                raise InputError(f"{name} must be at least 1, got {value}")
         for name, known in (
             ("image_source", ("photos", "render")),
             ("unlabeled", get_args(Unlabeled)),
@@ -237,7 +239,7 @@ class LiftOptions:
             ("precision", ("standard", "double")),
         ):
             if getattr(self, name) not in known:
-                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
+                raise InputError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Configs of version 0.1 call `storage` `form`."""

@@ -12,6 +12,7 @@ import normlift_ns
 
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
+    ("errors",),
     ("options",),
     ("kernels",),
     ("core",),
@@ -30,6 +31,7 @@ LAYERS = (
 FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 FOREIGN = {
+    "errors": set(),
     "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
     "core": BASE | {"xxhash"},

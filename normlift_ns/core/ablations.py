@@ -11,6 +11,7 @@ from torch import Tensor
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import decay_width, refine, voting_weights
+from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 Variant = Literal["none", "knn", "linear", "norm", "support", "full"]
@@ -63,7 +64,7 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
         ValueError: an unknown variant.
     """
     if variant not in get_args(Variant):
-        raise ValueError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
+        raise InputError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
     if variant == "knn":
         return (scalars.norm > 0).to(scalars.norm.dtype)
     if variant == "norm":

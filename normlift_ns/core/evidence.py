@@ -16,6 +16,7 @@ from torch import Tensor
 
 from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
+from normlift_ns.errors import InputError
 
 _FORMAT = "normlift_ns.evidence/1"
 _COUNTS = ("num_views", "weight_power", "num_excluded")
@@ -71,16 +72,16 @@ class Evidence:
     def __post_init__(self) -> None:
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
         if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
-            raise ValueError(
+            raise InputError(
                 f"Evidence arrays disagree: offsets end at {offsets[-1:].tolist()}, {column.numel()} columns, "
                 f"{weight.numel()} weights"
             )
         if len(self.unlabeled) != self.num_gaussians:
-            raise ValueError(
+            raise InputError(
                 f"Evidence.unlabeled has {len(self.unlabeled)} rows, expected one per Gaussian: {self.num_gaussians}"
             )
         if column.numel() > 0 and not (int(column.min()) >= 0 and int(column.max()) < self.num_regions):
-            raise ValueError(
+            raise InputError(
                 f"Evidence.rows.column must be in 0..{self.num_regions - 1}, found "
                 f"{int(column.min())}..{int(column.max())}"
             )
@@ -88,7 +89,7 @@ class Evidence:
             bool((self.region_view.diff() < 0).any())
             or not 0 <= int(self.region_view[0]) <= int(self.region_view[-1]) < self.num_views
         ):
-            raise ValueError(f"Evidence.region_view must be non-decreasing in 0..{self.num_views - 1}")
+            raise InputError(f"Evidence.region_view must be non-decreasing in 0..{self.num_views - 1}")
 
     @property
     def num_gaussians(self) -> int:
@@ -155,7 +156,7 @@ class Evidence:
     def _checked_views(self, views: Sequence[int] | Tensor) -> list[int]:
         chosen = views.tolist() if isinstance(views, Tensor) else list(views)
         if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
-            raise ValueError(f"views must be distinct and in 0..{self.num_views - 1}, got {chosen}")
+            raise InputError(f"views must be distinct and in 0..{self.num_views - 1}, got {chosen}")
         return chosen
 
     def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
@@ -188,14 +189,14 @@ class Evidence:
             ValueError: a new column that does not exist, or of another view than its old one.
         """
         if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
-            raise ValueError(
+            raise InputError(
                 f"columns must be [levels, {self.num_regions}] with values in -1..{len(region_view) - 1}, got "
                 f"{tuple(columns.shape)}"
             )
         columns, region_view = (x.to(self.region_view.device) for x in (columns.long(), region_view))
         level, column = (columns >= 0).nonzero(as_tuple=True)
         if not torch.equal(region_view[columns[level, column]], self.region_view[column]):
-            raise ValueError("a new column must be of the same view as the columns that it joins")
+            raise InputError("a new column must be of the same view as the columns that it joins")
         if torch.equal(columns, torch.arange(len(region_view), device=columns.device)[None]):
             return self
         old = self.rows.column.long()
@@ -220,11 +221,11 @@ class Evidence:
             ValueError: no part, or parts of different scenes or weight powers.
         """
         if not parts:
-            raise ValueError("Evidence.merge needs at least one part")
+            raise InputError("Evidence.merge needs at least one part")
         for name in ("num_gaussians", "weight_power", "num_excluded"):
             values = [getattr(part, name) for part in parts]
             if len(set(values)) > 1:
-                raise ValueError(f"Evidence.merge: parts must agree in {name}, found {values}")
+                raise InputError(f"Evidence.merge: parts must agree in {name}, found {values}")
         views = torch.tensor([0, *(part.num_views for part in parts)]).cumsum(0).tolist()
         regions = torch.tensor([0, *(part.num_regions for part in parts)]).cumsum(0).tolist()
         rows = SparseRows.append_columns([part.rows for part in parts], regions)
@@ -247,7 +248,7 @@ class Evidence:
             ValueError: `relative` outside 0..1.
         """
         if not 0 <= relative <= 1:
-            raise ValueError(f"relative must be in 0..1, got {relative}")
+            raise InputError(f"relative must be in 0..1, got {relative}")
         weight, row = self.rows.weight, self.rows.row_index()
         largest = weight.new_zeros(self.num_gaussians).scatter_reduce_(0, row, weight, "amax", include_self=False)
         keep = weight >= relative * largest[row]
@@ -303,7 +304,7 @@ class Evidence:
         old = None if key else ("format", *_COUNTS)
         tensors, facts, digest = load_tensors(path, key=key, undigested=old, remedy=remedy)
         if facts.get("format") != _FORMAT:
-            raise ValueError(
+            raise InputError(
                 f"{path} is not an evidence file of this version: format {facts.get('format')!r}, expected {_FORMAT!r}"
             )
         try:
@@ -311,12 +312,12 @@ class Evidence:
             unlabeled = SparseRows(*(tensors[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
             region_view, counts = tensors["region_view"], [int(facts[name]) for name in _COUNTS]
             if region_view.ndim != 1 or region_view.dtype != torch.int32:
-                raise ValueError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")
+                raise InputError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")
             rows.check("weights of regions", len(region_view))
             unlabeled.check("weights of unlabelled pixels", counts[0])
             return Evidence(rows, region_view, unlabeled, *counts), digest
         except (KeyError, ValueError) as error:
-            raise ValueError(f"{path} is damaged ({error}); {remedy}") from error
+            raise InputError(f"{path} is damaged ({error}); {remedy}") from error
 
 
 def _column_table(

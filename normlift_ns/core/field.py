@@ -28,6 +28,7 @@ from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import smallest_basis
 from normlift_ns.core.query import relevancy
 from normlift_ns.core.storage import StoredDirections, StoredEvidence, sizes_and_bounds, store_directions
+from normlift_ns.errors import InputError
 from normlift_ns.options import Rule, Storage
 
 _FIELD, _EVIDENCE = "field.safetensors", "evidence.safetensors"
@@ -93,14 +94,14 @@ class SemanticField:
         """
         n, dimension = len(lifted.scalars.norm), lifted.features.shape[1]
         if len(means) != n or (source is not None and len(source) != n):
-            raise ValueError(
+            raise InputError(
                 f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
                 f"{None if source is None else len(source)}"
             )
         if not tolerance > 0:
-            raise ValueError(f"tolerance must be positive, got {tolerance}")
+            raise InputError(f"tolerance must be positive, got {tolerance}")
         if storage not in (*get_args(Storage), "auto"):
-            raise ValueError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
+            raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
         basis = smallest_basis(lifted, tolerance)
         ways = sizes_and_bounds(lifted, basis)
         if storage == "auto":
@@ -109,7 +110,7 @@ class SemanticField:
                 key=lambda name: ways[name]["bytes"],
             )  # type: ignore[assignment]
         if storage not in ways:
-            raise ValueError(
+            raise InputError(
                 f"no basis keeps every Gaussian within tolerance {tolerance}; raise it, or take storage float16 or "
                 "evidence"
             )
@@ -143,14 +144,14 @@ class SemanticField:
             ValueError: vectors of another dimension, zero or not finite.
         """
         if text_vectors.ndim != 2 or text_vectors.shape[1] != self.dimension:
-            raise ValueError(
+            raise InputError(
                 f"text vectors must be [Q, {self.dimension}] like the field's features, got "
                 f"{tuple(text_vectors.shape)}; use the encoder that made them"
             )
         vectors = text_vectors.to(self.scalars.norm.device, torch.float64)
         length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
         if not bool((length.isfinite() & (length > 0)).all()):
-            raise ValueError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
+            raise InputError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
         cosine = self.store.products(vectors / length, self.scalars)
         return cosine[self.source.long()] if refined else cosine
 
@@ -224,7 +225,7 @@ class SemanticField:
             check_digests(folder, found, digests)
             _check_tensors(folder / _FIELD, tensors, manifest, evidence)
         except KeyError as error:
-            raise ValueError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
+            raise InputError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
         scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
         if evidence is not None:
             store = StoredEvidence(evidence, tensors["features"])
@@ -268,7 +269,7 @@ def _check_tensors(
         if evidence is not None:
             check_tensor("features", tensors["features"], torch.float32, (evidence.num_regions, dimension), -LARGEST)
             if evidence.num_gaussians != n:
-                raise ValueError(f"{_EVIDENCE} has {evidence.num_gaussians} Gaussians, expected {n}")
+                raise InputError(f"{_EVIDENCE} has {evidence.num_gaussians} Gaussians, expected {n}")
             return
         rank = dimension
         if manifest["form"] == "low_rank":
@@ -277,17 +278,17 @@ def _check_tensors(
         rows = int((tensors["norm"] > 0).sum())
         check_tensor("coordinates", tensors["coordinates"], torch.float16, (rows, rank), -LARGEST)
     except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}; {REMEDY}") from error
+        raise InputError(f"{path} is damaged: {error}; {REMEDY}") from error
 
 
 def _check_belongs(manifest: Mapping[str, Any], means: Tensor, folder: Path, checkpoint: str | Path) -> None:
     if manifest["num_gaussians"] != len(means):
-        raise ValueError(
+        raise InputError(
             f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "
             f"{len(means)}; {REMEDY}"
         )
     if manifest["means_fingerprint"] != fingerprint(means):
-        raise ValueError(
+        raise InputError(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
             f"number, other means); {REMEDY}"
         )

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from normlift_ns.errors import InputError
+
 
 @dataclass(frozen=True)
 class GaussianScene:
@@ -45,19 +47,19 @@ class GaussianScene:
         for name, shape in (("means", (n, 3)), ("quats", (n, 4)), ("scales", (n, 3)), ("opacities", (n,))):
             value: Tensor = getattr(self, name)
             if tuple(value.shape) != shape:
-                raise ValueError(f"GaussianScene.{name} has shape {tuple(value.shape)}, expected {shape}")
+                raise InputError(f"GaussianScene.{name} has shape {tuple(value.shape)}, expected {shape}")
             if not value.dtype.is_floating_point or value.device != self.means.device:
-                raise ValueError(
+                raise InputError(
                     f"GaussianScene.{name} is {value.dtype} on {value.device}, expected a floating-point tensor on "
                     f"{self.means.device}"
                 )
         if bool((self.scales < 0).any()):
-            raise ValueError(
+            raise InputError(
                 "GaussianScene.scales has negative values; pass linear scales: exp() of a splatfacto "
                 "checkpoint's `scales`"
             )
         if bool(((self.opacities < 0) | (self.opacities > 1)).any()):
-            raise ValueError(
+            raise InputError(
                 "GaussianScene.opacities leaves 0..1; pass activated opacities: sigmoid() of a splatfacto "
                 "checkpoint's `opacities`"
             )
@@ -106,22 +108,22 @@ class Camera:
         for name, shape in (("K", (3, 3)), ("world_to_camera", (4, 4))):
             value: Tensor = getattr(self, name)
             if tuple(value.shape) != shape or not value.dtype.is_floating_point or not bool(value.isfinite().all()):
-                raise ValueError(
+                raise InputError(
                     f"Camera.{name} must be a finite floating-point tensor of shape {shape}, got {value.dtype} "
                     f"{tuple(value.shape)}: {value}"
                 )
         (fx, skew, _), (zero, fy, _), last = self.K.tolist()
         if fx <= 0 or fy <= 0 or skew != 0 or zero != 0 or last != [0, 0, 1]:
-            raise ValueError(
+            raise InputError(
                 f"Camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, got {self.K.tolist()}"
             )
         pose = self.world_to_camera.double()
         rotation = pose[:3, :3]
         gap = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=pose.device)).abs().max().item()
         if gap > 1e-3 or torch.linalg.det(rotation).item() < 0 or pose[3].tolist() != [0, 0, 0, 1]:
-            raise ValueError(
+            raise InputError(
                 "Camera.world_to_camera must be a rotation and a translation (no scale, no mirror), got "
                 f"{self.world_to_camera.tolist()}"
             )
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"Camera size must be at least 1x1 pixel, got width {self.width}, height {self.height}")
+            raise InputError(f"Camera size must be at least 1x1 pixel, got width {self.width}, height {self.height}")

@@ -24,6 +24,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, SparseRows, segment_sum
+from normlift_ns.errors import InputError
 from normlift_ns.options import Unlabeled
 
 
@@ -163,9 +164,9 @@ def lift(
     (tensor([[1., 0.]]), tensor([0.6000]), tensor([0.4000]))
     """
     if unlabeled not in ("ignore", "dilute"):
-        raise ValueError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
+        raise InputError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
     if not beta >= 0:
-        raise ValueError(f"beta must be >= 0, got {beta}")
+        raise InputError(f"beta must be >= 0, got {beta}")
     table = _unit_table(evidence, features)
     total, by_view, weight, weight_squared, view_count = _sums(evidence, table)
     if unlabeled == "dilute":
@@ -188,7 +189,7 @@ def lift(
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     if features.ndim != 2 or features.shape[0] != evidence.num_regions or not features.dtype.is_floating_point:
-        raise ValueError(
+        raise InputError(
             f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
             f"{features.dtype} {tuple(features.shape)}"
         )
@@ -197,7 +198,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     bad = (~((length - 1).abs() < 1e-2)).nonzero().squeeze(1)
     if bad.numel() > 0:
         shown = ", ".join(f"row {i} has length {length[i]:.3g}" for i in bad[:3].tolist())
-        raise ValueError(
+        raise InputError(
             f"{bad.numel()} of {len(features)} feature rows are not unit vectors ({shown}); normalise them, "
             "and label regions without a feature -1"
         )

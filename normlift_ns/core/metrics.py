@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int64
 from scipy import stats
 from torch import Tensor
 
+from normlift_ns.errors import InputError
 from normlift_ns.options import WithoutDirection
 
 NO_CLASS = -1
@@ -48,7 +49,7 @@ def confusion(truth: Int[Tensor, "*m"], found: Int[Tensor, "*m"], classes: int) 
     """
     for name, values in (("truth", truth), ("found", found)):
         if values.numel() > 0 and int(values.max()) >= classes:
-            raise ValueError(f"{name} holds class {int(values.max())}, expected 0..{classes - 1}, or -1 for none")
+            raise InputError(f"{name} holds class {int(values.max())}, expected 0..{classes - 1}, or -1 for none")
     counts = truth >= 0
     row, column = truth[counts].long(), found[counts].long()
     column = torch.where(column < 0, classes, column)
@@ -131,7 +132,7 @@ def bin_means(
         ValueError: fewer points than bins.
     """
     if len(key) < bins:
-        raise ValueError(f"{bins} bins need at least as many points, got {len(key)}")
+        raise InputError(f"{bins} bins need at least as many points, got {len(key)}")
     parts = key.argsort(stable=True).tensor_split(bins)
     return tuple(torch.stack([x.double()[part].mean() for part in parts]) for x in (key, values))  # type: ignore[return-value]
 

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.errors import InputError
 
 _MOST_UNSURE = 1000
 """Gaussians whose neighbours a GPU finds by looking at all others; with more of them the CPU's tree is faster."""
@@ -54,7 +55,7 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     ([[1], [0], [1]], [[1.0], [1.0], [2.0]])
     """
     if k < 1:
-        raise ValueError(f"k must be at least 1, got {k}")
+        raise InputError(f"k must be at least 1, got {k}")
     found = _on_gpu(means.detach(), k) if kernels_apply(means) else None
     return _on_cpu(means, k) if found is None else found
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
+from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
@@ -41,9 +42,9 @@ def relevancy(
     if rule == "cosine":
         return positive
     if rule not in ("lerf", "margin"):
-        raise ValueError(f'rule must be "cosine", "lerf" or "margin", got {rule!r}')
+        raise InputError(f'rule must be "cosine", "lerf" or "margin", got {rule!r}')
     if negative is None or negative.shape[-1] == 0:
-        raise ValueError(
+        raise InputError(
             f'rule "{rule}" compares with negative prompts; '
             f"give at least one, for example {', '.join(CANONICAL_NEGATIVES)}"
         )

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = 2**24
@@ -60,12 +61,12 @@ def refine(
     given = directions if isinstance(directions, Tensor) else None
     shape = (n, 0) if given is None else tuple(given.shape)
     if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
-        raise ValueError(
+        raise InputError(
             f"means, directions and reliability must have the same rows, got {n}, {shape}, {tuple(reliability.shape)}"
         )
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
-        raise ValueError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
+        raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
     width = decay_width(neighbors, config)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=means.device) for _ in range(2))
     # Where no neighbour is reliable, nobody can win.

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.errors import InputError
 
 CANCELLED = 1e-3
 """Below this share of its weight a vector sum is recomputed in float64: its float32 digits have cancelled."""
@@ -101,13 +102,13 @@ class SparseRows:
         size, lengths = self.column.numel(), self.offsets.diff()
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []
         if ends != [0, size] or self.weight.numel() != size or bool((lengths < 0).any()):
-            raise ValueError(
+            raise InputError(
                 f"offsets of rows must rise from 0 to the number of entries, found {ends} for {size} columns and "
                 f"{self.weight.numel()} weights"
             )
         low, high = (int(x) for x in self.column.aminmax()) if size > 0 else (0, -1)
         if low < 0:
-            raise ValueError(f"columns must be 0 or more, found {low}")
+            raise InputError(f"columns must be 0 or more, found {low}")
         return high + 1
 
     def check(self, name: str, num_columns: int) -> None:
@@ -122,12 +123,12 @@ class SparseRows:
         arrays = (("offsets", self.offsets, torch.int64), ("columns", self.column, torch.int32))
         for what, array, dtype in (*arrays, ("weights", self.weight, weights)):
             if array.ndim != 1 or array.dtype != dtype:
-                raise ValueError(f"{name}: {what} are {array.dtype} {tuple(array.shape)}, expected one row of {dtype}")
+                raise InputError(f"{name}: {what} are {array.dtype} {tuple(array.shape)}, expected one row of {dtype}")
         if self.num_columns > num_columns:
-            raise ValueError(f"{name}: columns reach to {self.num_columns - 1}, expected 0..{num_columns - 1}")
+            raise InputError(f"{name}: columns reach to {self.num_columns - 1}, expected 0..{num_columns - 1}")
         least, most = (float(x) for x in self.weight.aminmax()) if len(self.weight) > 0 else (0, 0)
         if not 0 <= least <= most < math.inf:
-            raise ValueError(f"{name}: weights are in {least}..{most}, expected finite ones that are not negative")
+            raise InputError(f"{name}: weights are in {least}..{most}, expected finite ones that are not negative")
 
     def to(self, device: torch.device | str) -> SparseRows:
         """A copy on another device."""
@@ -175,7 +176,7 @@ class SparseRows:
             return torch.stack(columns, dim=1)
         if table.device.type == "cpu" and table.shape[1] <= _FEW_COLUMNS:  # ten times as fast as a bag of one column
             if self.num_columns > len(table):
-                raise ValueError(f"a matrix with {self.num_columns} columns needs as many rows, got {len(table)}")
+                raise InputError(f"a matrix with {self.num_columns} columns needs as many rows, got {len(table)}")
             offsets = self.offsets.int() if self.weight.numel() < 2**31 else self.offsets
             arrays = (x.numpy() for x in (self.weight, self.column, offsets))
             product = csr_array(tuple(arrays), shape=(len(self), len(table))) @ table.numpy()

@@ -30,6 +30,7 @@ from normlift_ns.demo.shapes import (
     torus,
     union,
 )
+from normlift_ns.errors import InputError
 
 HALF_WIDTH = 1.6
 """The floor is the square -HALF_WIDTH..HALF_WIDTH in x and y at z = 0, metres; z is up."""
@@ -137,7 +138,7 @@ def demo_room(num_gaussians: int = 40_000, seed: int = 0) -> DemoRoom:
         ValueError: too few Gaussians.
     """
     if num_gaussians < 2000:
-        raise ValueError(f"num_gaussians must be at least 2000, or solids have no shape; got {num_gaussians}")
+        raise InputError(f"num_gaussians must be at least 2000, or solids have no shape; got {num_gaussians}")
     rng = np.random.default_rng(seed)
     parts = _parts()
     names = tuple(part.name for part in parts)

@@ -15,6 +15,7 @@ from normlift_ns.encoders.sam.masks import SamMasks
 from normlift_ns.encoders.sam.weights import local_sam
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
 from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, EncoderName, FeaturesName, RegionsName, SourceOptions
 
 
@@ -29,14 +30,14 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
     """
     if options.features not in get_args(FeaturesName):
         known = ", ".join(get_args(FeaturesName))
-        raise ValueError(f"unknown features {options.features!r}; --features is one of {known}")
+        raise InputError(f"unknown features {options.features!r}; --features is one of {known}")
     if options.features == "none":
         if options.features_dir is not None:
-            raise ValueError(
+            raise InputError(
                 f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
             )
         if options.text_vectors is not None:
-            raise ValueError(
+            raise InputError(
                 f"--text-vectors {options.text_vectors} is for imported features; add --features langsplat"
             )
         options = replace(options, regions=resolve_regions(options, device))
@@ -44,13 +45,13 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             return _make_patches(options, device)
         return RegionFeatures(make_regions(options, device), make_encoder(options, device))
     if options.features_dir is None:
-        raise ValueError(f"features {options.features!r} need their folder: give it with --features-dir")
+        raise InputError(f"features {options.features!r} need their folder: give it with --features-dir")
     if options.regions != "auto" or options.regions_dir is not None:
-        raise ValueError(
+        raise InputError(
             "--regions and --regions-dir cut images up, but --features brings regions of its own; leave one out"
         )
     if options.encoder != "open_clip" and options.text_vectors is None:
-        raise ValueError(
+        raise InputError(
             f"encoder {options.encoder!r} did not make the features in {options.features_dir}; name the OpenCLIP model "
             "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
         )
@@ -77,9 +78,9 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
         return _make_clip(options, device)
     if options.encoder == "colour":
         if options.text_template != "{}":
-            raise ValueError(f"--text-template {options.text_template!r} is for --encoder open_clip; leave it out")
+            raise InputError(f"--text-template {options.text_template!r} is for --encoder open_clip; leave it out")
         return ColourEncoder()
-    raise ValueError(f"unknown encoder {options.encoder!r}; --encoder is one of {', '.join(get_args(EncoderName))}")
+    raise InputError(f"unknown encoder {options.encoder!r}; --encoder is one of {', '.join(get_args(EncoderName))}")
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
@@ -89,7 +90,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
         ValueError: unknown regions.
     """
     if options.regions not in get_args(RegionsName):
-        raise ValueError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionsName))}")
+        raise InputError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionsName))}")
     if options.regions != "auto":
         return options.regions
     if options.regions_dir is not None:
@@ -118,7 +119,7 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
         _refuse(options.sam_model, "--sam-model", kind, "sam")
     if kind == "files":
         if options.regions_dir is None:
-            raise ValueError(
+            raise InputError(
                 'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
             )
         level = _number(options.level)
@@ -130,7 +131,7 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
     _refuse(options.level, "--level", kind, "files or sam")
     count = 256 if options.region_count is None else options.region_count
     if kind == "patches":
-        raise ValueError("patches are no regions that another encoder could look at; use make_source")
+        raise InputError("patches are no regions that another encoder could look at; use make_source")
     return Superpixels(count) if kind == "superpixel" else Grid(count)
 
 
@@ -139,7 +140,7 @@ def _make_patches(options: SourceOptions, device: str) -> PatchFeatures:
     _refuse(options.regions_dir, "--regions-dir", "patches", "files")
     _refuse(options.level, "--level", "patches", "files or sam")
     if options.encoder != "open_clip":
-        raise ValueError(f"--regions patches are those of --encoder open_clip; {options.encoder!r} has none")
+        raise InputError(f"--regions patches are those of --encoder open_clip; {options.encoder!r} has none")
     return PatchFeatures(_make_clip(options, device), 1024 if options.region_count is None else options.region_count)
 
 
@@ -151,10 +152,10 @@ def _make_clip(options: SourceOptions, device: str) -> OpenClipEncoder:
 
 def _refuse(value: object, flag: str, kind: str, meant: str) -> None:
     if value is not None:
-        raise ValueError(f'{flag} {value} is for --regions {meant}, not for "{kind}"; leave one of the two out')
+        raise InputError(f'{flag} {value} is for --regions {meant}, not for "{kind}"; leave one of the two out')
 
 
 def _number(level: str | None) -> int | None:
     if level is not None and not (level.isascii() and level.isdigit()):
-        raise ValueError(f"--level of --regions files is the number of a map, 0, 1, ...; got {level!r}")
+        raise InputError(f"--level of --regions files is the number of a map, 0, 1, ...; got {level!r}")
     return None if level is None else int(level)

@@ -35,6 +35,7 @@ from skimage.color import rgb2lab
 from torch import Tensor
 
 from normlift_ns.encoders.source import check_prompts
+from normlift_ns.errors import InputError
 
 SIGMA = 30.0
 """Width of the kernel, in units of `shading_coordinates`."""
@@ -77,7 +78,7 @@ class ColourEncoder:
         for prompt in prompts:
             found = colour_names(prompt)
             if len(found) == 0:
-                raise ValueError(_unknown(prompt))
+                raise InputError(_unknown(prompt))
             rows.append(embed(torch.stack([_names()[name] for name in found])).mean(dim=0))
         return torch.nn.functional.normalize(torch.stack(rows), dim=1).float()
 

@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 
 from normlift_ns.encoders.source import ViewFeatures, check_prompts
 from normlift_ns.encoders.text_vectors import look_up
+from normlift_ns.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -35,22 +36,22 @@ class GivenFeatures:
         lengths = set()
         for name, (labels, vectors) in self.views.items():
             if vectors.ndim != 2 or not bool((vectors.isfinite().all(dim=1) & (vectors != 0).any(dim=1)).all()):
-                raise ValueError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
+                raise InputError(f"vectors of {name} must be [regions, D], finite and not zero; got {vectors.shape}")
             low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
             if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
-                raise ValueError(
+                raise InputError(
                     f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
                     f"{tuple(labels.shape)} with values in {low}..{high}"
                 )
             lengths.add(vectors.shape[1])
         for text, vector in self.texts.items():
             if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
-                raise ValueError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
+                raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
             if text.strip() == "" or text.endswith(".npy") or "\0" in text:
-                raise ValueError(f"{text!r} cannot be a text: it is empty, ends in .npy, or holds a zero character")
+                raise InputError(f"{text!r} cannot be a text: it is empty, ends in .npy, or holds a zero character")
             lengths.add(len(vector))
         if len(lengths) > 1:
-            raise ValueError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
+            raise InputError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -65,7 +66,7 @@ class GivenFeatures:
     def available(self, names: Sequence[str]) -> list[str]:
         unknown = sorted(set(self.views) - set(names))
         if len(unknown) > 0:
-            raise ValueError(
+            raise InputError(
                 f"there is no training image {unknown[0]!r} for the features given; there are {len(names)}, from "
                 f"{names[0]!r} to {names[-1]!r}"
             )
@@ -74,7 +75,7 @@ class GivenFeatures:
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         labels, vectors = self.views[name]
         if labels.shape != image.shape[:2]:
-            raise ValueError(
+            raise InputError(
                 f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
                 "width, undistorted, after lift_downscale); give labels of that size"
             )
@@ -99,23 +100,23 @@ def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequen
     if not isinstance(features, Mapping):
         features = list(features)
         if len(features) != len(names):
-            raise ValueError(
+            raise InputError(
                 f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; give one "
                 "pair per image in the order of scene.train.names, or a dictionary by those names"
             )
         features = dict(zip(names, features))
     if len(features) == 0:
-        raise ValueError("features are empty; give labels and vectors of at least one training image")
+        raise InputError("features are empty; give labels and vectors of at least one training image")
     views = {name: _pair(name, pair) for name, pair in features.items()}
     return GivenFeatures(views, {text: _floats(vector) for text, vector in (texts or {}).items()})
 
 
 def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise ValueError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
+        raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
     labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
     if labels.dtype.kind not in "iub":
-        raise ValueError(f"labels of {name} must be integers, got {labels.dtype}")
+        raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     return torch.from_numpy(labels.astype(np.int64)), _floats(pair[1])
 
 

@@ -10,6 +10,8 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from normlift_ns.errors import InputError
+
 
 def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
     """A picture file as RGB, 0..255; an alpha channel is dropped.
@@ -30,7 +32,7 @@ def read_pixels(path: Path, mode: str | None = None) -> np.ndarray:
         with Image.open(path) as picture:
             return np.array(picture if mode is None else picture.convert(mode))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(
+        raise InputError(
             f"image {path} is damaged or no picture ({error}); expected a file that Pillow can decode, such as PNG "
             "or JPEG: replace it"
         ) from error
@@ -50,4 +52,4 @@ def read_npy(path: Path, what: str) -> np.ndarray:
     except FileNotFoundError:
         raise FileNotFoundError(f"{what} {path} does not exist; check the folder") from None
     except Exception as error:  # whatever a foreign header makes NumPy's parser raise
-        raise ValueError(f"{what} {path} is damaged or no NPY file ({error}); write it again with numpy.save") from None
+        raise InputError(f"{what} {path} is damaged or no NPY file ({error}); write it again with numpy.save") from None

@@ -14,6 +14,7 @@ from skimage.segmentation import slic
 from torch import Tensor
 
 from normlift_ns.encoders.images import read_npy, read_pixels
+from normlift_ns.errors import InputError
 
 _SUFFIXES = (".png", ".npy")
 
@@ -34,7 +35,7 @@ class Superpixels:
     def __post_init__(self) -> None:
         _check_count(self.count)
         if not self.compactness > 0:
-            raise ValueError(f"compactness of superpixels must be positive, got {self.compactness}")
+            raise InputError(f"compactness of superpixels must be positive, got {self.compactness}")
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -136,7 +137,7 @@ class LabelFiles:
             base = self.folder.joinpath(*parts[first:])
             found = [base.with_suffix(suffix) for suffix in _SUFFIXES if base.with_suffix(suffix).is_file()]
             if len(found) > 1:
-                raise ValueError(f"image {name} has two label maps, {found[0]} and {found[1]}; keep one of them")
+                raise InputError(f"image {name} has two label maps, {found[0]} and {found[1]}; keep one of them")
             if len(found) == 1:
                 return found[0]
         raise FileNotFoundError(
@@ -156,7 +157,7 @@ class LabelFiles:
         height, width = image.shape[:2]
         if found.shape[1:] != (height, width):
             if not self.resample:
-                raise ValueError(
+                raise InputError(
                     f"label map {path} is {found.shape[2]}x{found.shape[1]} (width x height), its image {name} is "
                     f"{width}x{height}; make label maps of the image's size (undistorting an image crops it), or "
                     "resample them by nearest neighbour: --regions-resample True"
@@ -167,22 +168,22 @@ class LabelFiles:
     def _read(self, path: Path) -> np.ndarray:
         found = read_npy(path, "label map") if path.suffix == ".npy" else read_pixels(path)
         if found.ndim == 3 and path.suffix == ".png":
-            raise ValueError(
+            raise InputError(
                 f"label map {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "
                 "grey, 16-bit grey or palette PNG, or as NPY"
             )
         if found.dtype.kind not in "iub":
-            raise ValueError(
+            raise InputError(
                 f"label map {path} holds {found.dtype}; expected an integer type: save it with .astype(numpy.int32)"
             )
         if found.ndim not in (2, 3) or found.size == 0:
-            raise ValueError(f"label map {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
+            raise InputError(f"label map {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
         return found.reshape(-1, *found.shape[-2:])
 
 
 def _check_count(count: int) -> None:
     if count < 1:
-        raise ValueError(f"number of regions per image must be at least 1, got {count}")
+        raise InputError(f"number of regions per image must be at least 1, got {count}")
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:

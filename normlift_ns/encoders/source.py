@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
+from normlift_ns.errors import InputError
+
 UNIT_TOLERANCE = 1e-3
 """Rows of this length, 1 give or take, are unit vectors: half precision leaves 5e-4."""
 
@@ -50,7 +52,7 @@ class ViewFeatures:
         for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
             value: Tensor | None = getattr(self, name)
             if value is not None and (value.ndim != 2 or value.dtype != dtype or value.device.type != "cpu"):
-                raise ValueError(
+                raise InputError(
                     f"ViewFeatures.{name} must be a {dtype} matrix on the CPU, got {value.dtype} "
                     f"{tuple(value.shape)} on {value.device}"
                 )
@@ -62,7 +64,7 @@ class ViewFeatures:
         bad = (~((length - 1).abs() < UNIT_TOLERANCE)).nonzero().squeeze(1)
         if bad.numel() > 0:
             first = int(bad[0])
-            raise ValueError(
+            raise InputError(
                 f"{bad.numel()} of {len(self.features)} rows of ViewFeatures.features are not unit vectors (row "
                 f"{first} has length {length[first]:.3g}); normalise them, and label regions without a feature -1"
             )
@@ -75,7 +77,7 @@ class ViewFeatures:
 
 def _check_range(name: str, values: Tensor, count: int, what: str) -> None:
     if values.numel() > 0 and not -1 <= int(values.min()) <= int(values.max()) < count:
-        raise ValueError(
+        raise InputError(
             f"ViewFeatures.{name} must be in -1..{count - 1} (there are {count} {what}s), found "
             f"{int(values.min())}..{int(values.max())}"
         )
@@ -227,7 +229,7 @@ class RegionFeatures:
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
             found = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
-            raise ValueError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
+            raise InputError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
         return maps
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -245,7 +247,7 @@ def each_view(source: FeatureSource, images: Iterable[tuple[UInt8[Tensor, "h w 3
 def check_image(image: Tensor, name: str) -> None:
     """Raises ValueError unless `image` is a picture."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
-        raise ValueError(
+        raise InputError(
             f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
         )
 
@@ -253,12 +255,12 @@ def check_image(image: Tensor, name: str) -> None:
 def check_prompts(prompts: Sequence[str]) -> None:
     """Raises ValueError unless `prompts` is a list of at least one text, none of them empty."""
     if isinstance(prompts, str):
-        raise ValueError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
+        raise InputError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
-        raise ValueError('no text given; name at least one thing to look for, such as --text "orange"')
+        raise InputError('no text given; name at least one thing to look for, such as --text "orange"')
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
-        raise ValueError(
+        raise InputError(
             f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or say what to look "
             "for in words"
         )

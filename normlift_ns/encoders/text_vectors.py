@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 from normlift_ns.core.disk.tensors import tensor_digest
 from normlift_ns.core.files import new_file
 from normlift_ns.encoders.source import check_prompts
+from normlift_ns.errors import InputError
 
 _SEAL = b"normlift_ns "
 """How the comment begins of an archive that we wrote; the digest follows. Those of NumPy have none."""
@@ -72,21 +73,21 @@ class TextVectors:
                 arrays, comment = {name: archive[name] for name in archive.files}, archive.zip.comment
             expected = _seal({name: torch.from_numpy(array) for name, array in arrays.items()})
             if comment.startswith(_SEAL) and comment != expected:
-                raise ValueError(f"its content has {expected.decode()!r}, expected {comment.decode()!r}")
+                raise InputError(f"its content has {expected.decode()!r}, expected {comment.decode()!r}")
         except Exception as error:  # whatever a foreign file makes NumPy and zipfile raise
-            raise ValueError(
+            raise InputError(
                 f"file of text vectors {self.file} is damaged or no NPZ file ({error}); write it again with "
                 "numpy.savez(file, **{text: vector, ...})"
             ) from None
         lengths = {array.shape for array in arrays.values()}
         for name, array in arrays.items():
             if array.ndim != 1 or array.dtype.kind != "f" or len(lengths) > 1:
-                raise ValueError(
+                raise InputError(
                     f"{self.file}: the array of {name!r} is {array.dtype} {array.shape}; expected floats, [D], with "
                     f"the same D for every text (found {', '.join(map(str, sorted(lengths)))})"
                 )
             if not np.isfinite(array).all() or not array.any():
-                raise ValueError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the text again")
+                raise InputError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the text again")
         return {name: torch.tensor(array, dtype=torch.float64) for name, array in arrays.items()}
 
 
@@ -104,7 +105,7 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -
             hint = (
                 f"which holds {len(vectors)}; near names: {', '.join(near)}" if len(vectors) > 0 else "which holds none"
             )
-            raise ValueError(f"text {prompt!r} has no vector in {where}, {hint}")
+            raise InputError(f"text {prompt!r} has no vector in {where}, {hint}")
     return torch.stack([normalize(vectors[prompt].double().cpu(), dim=0).float() for prompt in prompts])
 
 

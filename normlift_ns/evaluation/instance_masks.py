@@ -16,6 +16,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, confusion
 from normlift_ns.encoders.images import read_pixels
 from normlift_ns.encoders.regions import LabelFiles
+from normlift_ns.errors import InputError
 from normlift_ns.evaluation.results import Evaluation
 
 
@@ -43,9 +44,9 @@ def read_names(path: Path) -> Names:
         labels = document.get("labels", document)
         of_value = {int(value): str(name) for value, name in labels.items()}
     except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, ValueError) as error:
-        raise ValueError(f'{path} names no masks ({error}); expected {{"labels": {{"1": "table", ...}}}}') from error
+        raise InputError(f'{path} names no masks ({error}); expected {{"labels": {{"1": "table", ...}}}}') from error
     if len(of_value) == 0:
-        raise ValueError(f'{path} names no masks; expected {{"labels": {{"1": "table", ...}}}}')
+        raise InputError(f'{path} names no masks; expected {{"labels": {{"1": "table", ...}}}}')
     classes = tuple(dict.fromkeys(of_value.values()))
     return Names(classes, {value: classes.index(name) for value, name in of_value.items()})
 
@@ -59,7 +60,7 @@ def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width:
     path = masks.path(name)
     values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else read_pixels(path)
     if values.shape != (height, width):
-        raise ValueError(
+        raise InputError(
             f"mask {path} has shape {values.shape}, its image {name} is {height} x {width} (height x width); make "
             "masks of the size of the (undistorted) image"
         )

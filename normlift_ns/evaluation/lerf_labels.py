@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from normlift_ns.errors import InputError
+
 
 class LabeledFrame(NamedTuple):
     """One annotated frame."""
@@ -51,12 +53,12 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
         labelled = int(info["width"]), int(info["height"])
         shapes = [(str(o["category"]), _points(o["segmentation"]), o.get("bbox")) for o in objects]
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"{file} is no label file of LERF-OVS ({type(error).__name__}: {error}); expected "
             '{"info": {"width", "height"}, "objects": [{"category", "segmentation": [[x, y], ...], "bbox"}]}'
         ) from error
     if abs(labelled[0] * height - labelled[1] * width) > 0.01 * labelled[0] * height:
-        raise ValueError(
+        raise InputError(
             f"{file} labels an image of {labelled[0]} x {labelled[1]} pixels, the run's is {width} x {height}; use the "
             "images that the labels were drawn on"
         )
@@ -75,7 +77,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 def _points(segmentation: Any) -> np.ndarray:
     points = np.array(segmentation, dtype=float)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
-        raise ValueError(f"a segmentation has shape {points.shape}, expected at least three points [x, y]")
+        raise InputError(f"a segmentation has shape {points.shape}, expected at least three points [x, y]")
     return points
 
 
@@ -88,7 +90,7 @@ def match_views(files: list[Path], names: Mapping[str, Any]) -> tuple[list[Path]
     found = [file for file in files if file.stem in names]
     if len(found) == 0:
         some = ", ".join(sorted(names)[:3])
-        raise ValueError(
+        raise InputError(
             f"none of the {len(files)} label files in {files[0].parent} has an image in the run; the first is "
             f"{files[0].name}, the run has {some}, …"
         )

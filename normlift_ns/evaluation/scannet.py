@@ -14,6 +14,7 @@ from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, WithoutDirection, class_scores, classify, confusion
+from normlift_ns.errors import InputError
 from normlift_ns.evaluation.results import Evaluation, mean
 
 NYU40 = {
@@ -60,10 +61,10 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
     try:
         vertices = PlyData.read(str(path))["vertex"]
     except (PlyParseError, KeyError, ValueError, OSError) as error:
-        raise ValueError(f"{path} is damaged or no PLY file with vertices ({error}); download it again") from error
+        raise InputError(f"{path} is damaged or no PLY file with vertices ({error}); download it again") from error
     names = [found.name for found in vertices.properties]
     if "label" not in names:
-        raise ValueError(
+        raise InputError(
             f"{path} has no vertex property label (found {', '.join(names)}); the file *_vh_clean_2.labels.ply has it"
         )
     return torch.from_numpy(np.asarray(vertices["label"]).astype(np.int64))
@@ -76,7 +77,7 @@ def check_identity(name: str, gaussians: int, labels: Int64[Tensor, " n"], path:
         ValueError: their numbers differ.
     """
     if len(labels) != gaussians:
-        raise ValueError(
+        raise InputError(
             f"run {name} has {gaussians:,} Gaussians, {path} {len(labels):,} vertices; the protocol needs one Gaussian "
             "per vertex, in their order: train from all vertices with densification and culling off and positions fixed"
         )

@@ -14,6 +14,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
+from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
 from normlift_ns.runs.files import FIELD_FOLDER
 
@@ -78,21 +79,21 @@ def read_config(path: Path) -> TrainerConfig:
         text = path.read_text("utf8")
         root = yaml.compose(text, Loader=_ConfigLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path} is not a nerfstudio config: it is no valid YAML ({_brief(error)}). {expected}"
         ) from error
     method = _method_name(root)
     if method is None:
-        raise ValueError(f"{path} is not a nerfstudio config: it has no method_name. {expected}")
+        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {expected}")
     if method not in SUPPORTED_METHODS:
-        raise ValueError(
+        raise InputError(
             f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
             "Train the capture with: ns-train splatfacto --data ..."
         )
     try:
         config = yaml.load(text, Loader=_ConfigLoader)
     except (yaml.YAMLError, TypeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path} cannot be read: {_brief(error)}. Only the configuration classes of nerfstudio, normlift_ns and "
             "torch.optim are read; runs that use a plugin's dataparser or datamanager are not supported."
         ) from error
@@ -126,7 +127,7 @@ def _check_types(config: Any, path: Path) -> None:
     )
     for name, part, accepted in parts:
         if type(part) not in accepted:
-            raise ValueError(
+            raise InputError(
                 f"{path} says method {config.method_name!r}, but its {name} is a {type(part).__name__}, expected "
                 f"{' or '.join(cls.__name__ for cls in accepted)}; only stock splatfacto runs can be lifted. "
                 "Train the capture with: ns-train splatfacto --data ..."

@@ -19,6 +19,7 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.appearance import LOADED_STEP, background, shading_degree
 from normlift_ns.nerfstudio_plugin.config import RunLocation, locate, read_config, rerooted, stored_data
 from normlift_ns.nerfstudio_plugin.views import DatasetViews
@@ -161,7 +162,7 @@ def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
             "say where it is with --data."
         ) from error
     except (AssertionError, LookupError, OSError, RuntimeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"nerfstudio cannot read the dataset {data} ({type(error).__name__}: {error}). Expected the dataset that "
             "the run was trained with; say where it is with --data."
         ) from error
@@ -185,7 +186,7 @@ def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: Ru
     trained = json.loads(file.read_text("utf8"))
     gap = _world(torch.tensor(trained["transform"]), trained["scale"]) - _world(transform, scale)
     if float(gap.abs().max()) > _TRANSFORM_TOLERANCE or abs(scale / trained["scale"] - 1) > _TRANSFORM_TOLERANCE:
-        raise ValueError(
+        raise InputError(
             f"The dataset {location.data} is not the one that {location.run_dir} was trained with: its poses give "
             f"scale {scale:.6g}, the training had {trained['scale']:.6g}, and the world coordinates differ by up to "
             f"{float(gap.abs().max()):.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json "
@@ -204,7 +205,7 @@ def _training_poses(cameras: Cameras, model: SplatfactoModelConfig, checkpoint: 
         return cameras.camera_to_worlds
     adjustment = checkpoint.model.get("camera_optimizer.pose_adjustment")
     if adjustment is None or len(adjustment) != len(cameras):
-        raise ValueError(
+        raise InputError(
             f"The run optimised its camera poses (mode {model.camera_optimizer.mode}), but {checkpoint.path} has "
             f"{0 if adjustment is None else len(adjustment)} of them for {len(cameras)} training images. Use the "
             "checkpoint and the dataset of the run; say where the dataset is with --data."

@@ -31,6 +31,7 @@ from torch import Tensor
 from normlift_ns.asking import Answer, Question, default_negatives, encoder_of, make_question
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders.source import TextEncoder
+from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.widgets import FreeButton, Markdown, TextBox, set_value
 from normlift_ns.options import THRESHOLDS, RasterizeMode
 from normlift_ns.runs.files import texts_cache
@@ -183,7 +184,7 @@ class Panel(torch.nn.Module):
         session, rule = self._session, cast(Any, self.ask_3_rule.value)
         prompts, negatives = split_prompts(self.ask_1_prompts.value), split_prompts(self.ask_2_negatives.value)
         if session is None:
-            raise ValueError(_WAITING)
+            raise InputError(_WAITING)
         check_prompts(prompts)
         with self._encoding:  # an encoder is loaded at its first text, and must not be loaded twice
             self._busy = _READING
@@ -276,7 +277,7 @@ class Panel(torch.nn.Module):
     def _export(self) -> None:
         """Writes the selection to a PLY file in the run."""
         if self._session is None or self._folder is None:
-            raise ValueError(_WAITING)
+            raise InputError(_WAITING)
         parameters, harmonics, mode = self._host[0].splats()
         how: dict[str, Any] = {"spherical_harmonics": harmonics, "rasterize_mode": mode}
         self.note(self._session.export(self._folder.parent / "exports", parameters, **how))
@@ -284,7 +285,7 @@ class Panel(torch.nn.Module):
     @_reported
     def _save(self) -> None:
         if self._session is None:
-            raise ValueError(_WAITING)
+            raise InputError(_WAITING)
         self.note(self._session.save(self._folder))
 
     def _as_chosen(self, session: Session) -> Session:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.photographs import to_camera
 
 _DRAWN_AS_PINHOLE = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
@@ -85,7 +86,7 @@ class DatasetViews:
     def _camera(self, index: int) -> Camera:
         camera = self._dataset.cameras[index].reshape(())
         if int(camera.camera_type) not in _DRAWN_AS_PINHOLE:
-            raise ValueError(
+            raise InputError(
                 f"{self.files[index]} was taken with a {CameraType(int(camera.camera_type)).name} camera; splatfacto "
                 "draws perspective and fisheye cameras only."
             )
@@ -103,12 +104,12 @@ class DatasetViews:
                 "with --data."
             ) from error
         except (OSError, SyntaxError, ValueError, AssertionError) as error:
-            raise ValueError(
+            raise InputError(
                 f"{file} or its mask cannot be read ({error}). Expected an 8-bit image; copy it again from the capture."
             ) from error
         found, expected = tuple(data["image"].shape[1::-1]), (int(camera.width), int(camera.height))
         if found != expected:
-            raise ValueError(
+            raise InputError(
                 f"{file} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} (width x height). "
                 "Use the images that the run was trained with."
             )

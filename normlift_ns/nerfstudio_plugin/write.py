@@ -17,6 +17,7 @@ from normlift_ns.asking import Question
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.files import draft_directory, new_file, numbered, publish, write_text
 from normlift_ns.encoders.text_vectors import write_text_vectors
+from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.config import set_data, skip_seed_points
 from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
@@ -60,7 +61,7 @@ def write_run(
     if exact:
         refuse_existing_run(run_dir, overwrite)
     if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
-        raise ValueError(
+        raise InputError(
             f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
             f"{source.checkpoint_path}; lift that again."
         )

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.errors import InputError
 from normlift_ns.raster.projection import Projected, Tiles, World, assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
@@ -83,7 +84,7 @@ class TileBackend:
     def check(self, job: Job, *, pictures: bool) -> None:  # noqa: D102 (as in the protocol)
         device = job.scene.means.device
         if self.on is not None and device.type != self.on:
-            raise ValueError(
+            raise InputError(
                 f'backend "{self.name}" needs a scene on the {self.on.upper()}, this one is on {device}; move it, or '
                 'use backend="torch"'
             )

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import torch
 
 from normlift_ns.core.gpu import has_triton
+from normlift_ns.errors import InputError
 from normlift_ns.raster.backend import Backend, Job, TileBackend
 
 BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
@@ -52,7 +53,7 @@ def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend
     if name == "auto":
         name = _fastest(job, pictures)
     if name not in BACKENDS:
-        raise ValueError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
+        raise InputError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
     backend = BACKENDS[name]()
     backend.check(job, pictures=pictures)
     return name, backend

@@ -19,6 +19,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
+from normlift_ns.errors import InputError
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.settings import RasterSettings
 
@@ -68,19 +69,19 @@ def check(job: Job, *, pictures: bool = False) -> None:
     those that gsplat has compiled."""
     means = job.scene.means
     if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
-        raise ValueError(
+        raise InputError(
             f"gsplat computes in float32 on a GPU; this scene is {means.dtype} on {means.device}, and wanted is "
             f'{job.dtype}. Move it (scene.to("cuda")), or use backend="torch", which knows every device and precision'
         )
     if not _gsplat_version().startswith("1.4."):
-        raise ValueError(
+        raise InputError(
             f"gsplat {_gsplat_version()} is installed, but nerfstudio 1.1.5 trains with 1.4.0, and other versions draw "
             'differently; install it (pip install "gsplat==1.4.0"), or use backend="torch"'
         )
     ours = RasterSettings()
     other = [name for name in _COMPILED if getattr(job.settings, name) != getattr(ours, name)]
     if len(other) > 0:
-        raise ValueError(f'gsplat has compiled its {", ".join(other)}; to change them use backend="torch"')
+        raise InputError(f'gsplat has compiled its {", ".join(other)}; to change them use backend="torch"')
 
 
 @cache
@@ -95,7 +96,7 @@ def views_evidence(job: Job, batch: Batch) -> Entries:
         ValueError: weight_power other than 1, which a gradient cannot give.
     """
     if job.weight_power != 1:
-        raise ValueError(
+        raise InputError(
             f'backend "gsplat" sums A_ij alone, weight_power {job.weight_power} is not a gradient; use backend="triton"'
         )
     parts, before = [], 0

@@ -15,6 +15,7 @@ from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.gpu import in_parts
 from normlift_ns.core.scene import Scene
+from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.backends import BackendName, choose_backend
@@ -81,7 +82,7 @@ def rasterize_evidence(
     ([0.5, 0.25], [0.5, 0.25])
     """
     if weight_power not in (0, 1, 2):
-        raise ValueError(f"weight_power must be 0, 1 or 2, got {weight_power}")
+        raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     job = _job(scene, rasterize_mode, settings, dtype, weight_power)
     name, chosen = choose_backend(backend, job, pictures=False)
     in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS // max(1, len(scene)))) if name in _SEVERAL_VIEWS else 1
@@ -144,7 +145,7 @@ def render(
     ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
     if values.ndim != 2 or len(values) != len(scene):
-        raise ValueError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
+        raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
     _, chosen = choose_backend(backend, job, pictures=True)
     with torch.no_grad():
@@ -175,7 +176,7 @@ def _job(
     weight_power: int = 1,
 ) -> Job:
     if rasterize_mode not in ("classic", "antialiased"):
-        raise ValueError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
+        raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
     antialiased = rasterize_mode == "antialiased"
     return Job(scene, antialiased, settings or RasterSettings(), dtype or scene.means.dtype, weight_power)
 
@@ -197,7 +198,7 @@ def _zip_views(
     for index, items in enumerate(zip_longest(*streams, fillvalue=end)):
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
-                raise ValueError(
+                raise InputError(
                     f"{name} ended after {index} views, but more views follow; "
                     "give one camera, one label map and one count per view"
                 )
@@ -211,15 +212,15 @@ def _check_labels(index: int, camera: Camera, labels: Tensor, count: int | None)
         or labels.dtype in (torch.bool, torch.complex64)
     ):
         kind = labels.dtype if isinstance(labels, Tensor) else type(labels).__name__
-        raise ValueError(f"labels of view {index} must be an integer tensor, got {kind}")
+        raise InputError(f"labels of view {index} must be an integer tensor, got {kind}")
     if tuple(labels.shape) != (camera.height, camera.width):
-        raise ValueError(
+        raise InputError(
             f"labels of view {index} have shape {tuple(labels.shape)}, but its camera is {camera.height} x "
             f"{camera.width} (height x width)"
         )
     low, high = torch.stack(labels.aminmax()).tolist()
     if low < MASKED:
-        raise ValueError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
+        raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
     if count is not None and high >= count:
-        raise ValueError(f"labels of view {index} contain region {high}, but num_regions says {count}")
+        raise InputError(f"labels of view {index} contain region {high}, but num_regions says {count}")
     return max(high, UNLABELED) + 1 if count is None else count

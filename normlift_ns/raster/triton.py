@@ -10,6 +10,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_equal_keys
+from normlift_ns.errors import InputError
 from normlift_ns.kernels.regions import region_sums
 from normlift_ns.raster import gsplat
 from normlift_ns.raster.backend import Batch, Job
@@ -18,7 +19,7 @@ from normlift_ns.raster.backend import Batch, Job
 def check(job: Job, *, pictures: bool) -> None:
     """Raises ValueError for pictures, and where gsplat's projection cannot be used."""
     if pictures:
-        raise ValueError(
+        raise InputError(
             'backend "triton" sums evidence and draws no pictures; render with backend="torch" or "gsplat" on a GPU, '
             '"numba" on a CPU, or "auto"'
         )

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean, refuse_existing
+from normlift_ns.errors import InputError
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
@@ -30,7 +31,7 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
     stamp = datetime.now().strftime("%Y-%m-%d_%H%M%S") if timestamp is None else timestamp
     for what, folder in (("timestamp", stamp), ("experiment name", name)):
         if folder.startswith(".") or folder.strip() == "" or {"/", "\\", "\0"} & set(folder):
-            raise ValueError(
+            raise InputError(
                 f"the {what} {folder!r} is not the name of a folder; give one without slashes, such as 'run'"
             )
     return Path(os.path.abspath(output_dir)) / name / "normlift" / stamp

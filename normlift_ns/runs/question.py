@@ -11,6 +11,7 @@ from typing import get_args
 
 from normlift_ns.asking import Question
 from normlift_ns.core.disk.tensors import load_tensors, save_tensors
+from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
 
 QUERIES_FILE = "queries.safetensors"
@@ -52,7 +53,7 @@ def load_question(folder: Path) -> Question | None:
             refined=bool(facts["refined"]),
         )
         if len(question.vectors) != len(question.texts) or question.rule not in get_args(Rule):
-            raise ValueError(f"{len(question.vectors)} vectors of {len(question.texts)} texts, rule {question.rule!r}")
+            raise InputError(f"{len(question.vectors)} vectors of {len(question.texts)} texts, rule {question.rule!r}")
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
+        raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
     return question

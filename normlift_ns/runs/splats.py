@@ -16,6 +16,7 @@ from normlift_ns.asking import Answer
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import new_files
 from normlift_ns.core.query import strongest
+from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 
 _LEAST_OPACITY = -5.5373
@@ -97,7 +98,7 @@ def write_splats(
     columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
     rows = exported_rows(columns, keep)
     if len(rows) == 0:
-        raise ValueError(f"{path} is not written: none of the {int(keep.sum()):,} Gaussians wanted is ever drawn")
+        raise InputError(f"{path} is not written: none of the {int(keep.sum()):,} Gaussians wanted is ever drawn")
     columns |= semantic_columns(field, answer)
     table = np.empty(len(rows), [(name, "<i4" if name == "label" else "<f4") for name in columns])
     for name, column in columns.items():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 from normlift_ns.scenes.colmap import model_folder, read_cameras, read_images
 from normlift_ns.scenes.frames import Frame, World, check_frames, find_masks, find_photographs, sized
@@ -38,7 +39,7 @@ def read_camera_file(options: SplatOptions) -> Cameras:
     given = {"--colmap": options.colmap, "--transforms": options.transforms}
     count = sum(value is not None for value in given.values())
     if count != 1:
-        raise ValueError(
+        raise InputError(
             f"A splat needs one file of cameras, got {'two' if count else 'none'}: give the folder of a COLMAP project "
             "with --colmap, or a transforms.json with --transforms."
         )
@@ -67,7 +68,7 @@ def _colmap(options: SplatOptions, folder: Path) -> Cameras:
     lost = [image for image in registered if image.camera not in cameras]
     if lost or len(registered) == 0:
         what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
-        raise ValueError(
+        raise InputError(
             f"{model} has {len(cameras)} cameras and {len(registered)} registered images: {what}. Expected a camera "
             "for every image; copy the whole reconstruction again."
         )

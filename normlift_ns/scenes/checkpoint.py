@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from normlift_ns.errors import InputError
+
 GAUSSIAN_PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 
 
@@ -63,11 +65,11 @@ def read_checkpoint(path: Path) -> Checkpoint:
     state = loaded.get("pipeline") if isinstance(loaded, dict) else None
     if not isinstance(state, dict) or not isinstance(loaded.get("step"), int):
         keys = sorted(map(str, loaded)) if isinstance(loaded, dict) else type(loaded).__name__
-        raise ValueError(f"{path} is no nerfstudio checkpoint: expected `step` and `pipeline` in it, found {keys}.")
+        raise InputError(f"{path} is no nerfstudio checkpoint: expected `step` and `pipeline` in it, found {keys}.")
     model = dict(_model_state(state))
     missing = [name for name in GAUSSIAN_PARAMETERS if f"gauss_params.{name}" not in model]
     if missing:
-        raise ValueError(
+        raise InputError(
             f"{path} has no Gaussians of splatfacto: gauss_params.{', gauss_params.'.join(missing)} missing. "
             "Train the capture with: ns-train splatfacto --data ..."
         )
@@ -86,7 +88,7 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
         ValueError: a truncated or damaged file, or one that holds other Python objects.
     """
     if not zipfile.is_zipfile(path):
-        raise ValueError(
+        raise InputError(
             f"{path} is truncated or no checkpoint: its {path.stat().st_size:,} bytes are not the zip archive that "
             f"torch.save writes. Copy it again, or {advice}."
         )
@@ -96,12 +98,12 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL (\S+)", str(error))
-        raise ValueError(
+        raise InputError(
             f"{path} is not read, because it holds Python objects{f' ({found[1]})' if found else ''}: only tensors and "
             f"numbers are expected, {writer}. {advice[0].upper()}{advice[1:]}."
         ) from error
     except (RuntimeError, EOFError, OSError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path} is damaged ({str(error).strip().split('. ')[0]}). Copy it again, or {advice}."
         ) from error
 
@@ -114,7 +116,7 @@ def _check_sums(path: Path, advice: str) -> None:
     except Exception as error:  # whatever a damaged file makes zipfile raise
         damaged = str(error)
     if damaged is not None:
-        raise ValueError(
+        raise InputError(
             f"{path} is damaged ({damaged}): a checksum in it is not that of its content. Copy it again, or {advice}."
         )
 

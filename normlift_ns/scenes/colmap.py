@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Intrinsics
 
 _MODELS = {
@@ -69,7 +70,7 @@ def read_cameras(model: Path) -> dict[int, Intrinsics]:
     cameras = {}
     for number, name, width, height, parameters in _read(model, "cameras", _cameras_text, _cameras_binary):
         if name not in _MODELS:
-            raise ValueError(
+            raise InputError(
                 f"{model}: camera {number} has the model {name}; read are {', '.join(_MODELS)}. Undistort the images "
                 "with: colmap image_undistorter, train the scene on those, and give that folder."
             )
@@ -87,7 +88,7 @@ def read_images(model: Path) -> list[ColmapImage]:
     images = []
     for name, rotation, translation, camera in _read(model, "images", _images_text, _images_binary):
         if not np.isfinite([*rotation, *translation]).all() or not np.any(rotation):
-            raise ValueError(
+            raise InputError(
                 f"{model}: the pose of {name} is not finite or has no rotation: {rotation} {translation}. {_ADVICE}"
             )
         matrix = Rotation.from_quat(np.roll(rotation, -1)).as_matrix()  # SciPy has w last
@@ -105,7 +106,7 @@ def read_points(model: Path) -> Float[np.ndarray, "n 3"]:
     found = dict(_read(model, "points3D", _points_text, _points_binary))
     points = np.array([found[number] for number in sorted(found)], dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
-        raise ValueError(f"{model}: points3D has coordinates that are NaN or infinite. {_ADVICE}")
+        raise InputError(f"{model}: points3D has coordinates that are NaN or infinite. {_ADVICE}")
     return points
 
 
@@ -128,7 +129,7 @@ def _read(
             f"writes them. {_ADVICE}"
         ) from None
     except (ValueError, IndexError, struct.error, KeyError, OverflowError) as error:
-        raise ValueError(f"{path} is damaged or no file of COLMAP ({error}). {_ADVICE}") from error
+        raise InputError(f"{path} is damaged or no file of COLMAP ({error}). {_ADVICE}") from error
 
 
 class _Bytes:
@@ -150,26 +151,26 @@ class _Bytes:
 
     def skip(self, count: int) -> None:
         if self.at + count > len(self.data):
-            raise ValueError(f"it ends after {len(self.data):,} bytes")
+            raise InputError(f"it ends after {len(self.data):,} bytes")
         self.at += count
 
     def count(self) -> int:
         """How many entries follow: each takes eight bytes or more, so that a damaged number shows at once."""
         number = self.take("Q")[0]
         if number > len(self.data) // 8:
-            raise ValueError(f"it says {number:,} entries, but has {len(self.data):,} bytes")
+            raise InputError(f"it says {number:,} entries, but has {len(self.data):,} bytes")
         return number
 
     def end(self) -> None:
         if self.at != len(self.data):
-            raise ValueError(f"{len(self.data) - self.at:,} bytes too many")
+            raise InputError(f"{len(self.data) - self.at:,} bytes too many")
 
 
 def _cameras_binary(data: _Bytes) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("iiQQ")
         if not 0 <= model < len(_NUMBERED):
-            raise ValueError(f"camera {number} has the model number {model}, which is not known")
+            raise InputError(f"camera {number} has the model number {model}, which is not known")
         name, count = _NUMBERED[model]
         yield number, name, width, height, data.take(f"{count}d")
 
@@ -179,7 +180,7 @@ def _cameras_text(lines: list[str]) -> Iterator[tuple[int, str, int, int, tuple[
     for line in filter(None, lines):
         number, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
-            raise ValueError(f"camera {number} has {len(parameters)} parameters, {name} needs {counts[name]}")
+            raise InputError(f"camera {number} has {len(parameters)} parameters, {name} needs {counts[name]}")
         yield int(number), name, int(width), int(height), tuple(map(float, parameters))
 
 
@@ -198,7 +199,7 @@ def _images_text(lines: list[str]) -> Iterator[tuple[str, list[float], list[floa
             continue
         points = next(rest, "").split()  # of the image, in the line after it, which may be empty
         if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
-            raise ValueError(f"the line after that of {line.split()[-1]} holds no points, as x, y and their numbers")
+            raise InputError(f"the line after that of {line.split()[-1]} holds no points, as x, y and their numbers")
         _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
         yield name, list(map(float, (qw, qx, qy, qz))), list(map(float, (tx, ty, tz))), int(camera)
 

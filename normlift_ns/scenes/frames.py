@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
+from normlift_ns.errors import InputError
+
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _RIGID = 1e-3
 """How far a rotation may be from orthonormal: files round."""
@@ -77,29 +79,29 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
         ValueError: no camera, numbers that are not finite, no focal length, a pose that is not rigid, names twice.
     """
     if len(frames) == 0:
-        raise ValueError(f"{source} has no cameras with photographs. Expected one for every image of the training.")
+        raise InputError(f"{source} has no cameras with photographs. Expected one for every image of the training.")
     for frame in frames:
         if not np.isfinite([*frame.pose.ravel(), *frame.intrinsics]).all():
-            raise ValueError(
+            raise InputError(
                 f"{source}: the camera of {frame.name} has numbers that are NaN or infinite. Expected finite ones; "
                 "make the file again, or remove the image from it."
             )
         if min(frame.intrinsics[:2]) <= 0 or min(frame.intrinsics[4:6]) < 1:
-            raise ValueError(
+            raise InputError(
                 f"{source}: the camera of {frame.name} has focal lengths {frame.intrinsics.fx:g}, "
                 f"{frame.intrinsics.fy:g} and size {frame.intrinsics.width} x {frame.intrinsics.height}. Expected "
                 "positive numbers."
             )
         rotation = frame.pose[:, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
-            raise ValueError(
+            raise InputError(
                 f"{source}: the pose of {frame.name} is no rotation and translation. Expected a rigid camera-to-world "
                 "matrix without scale or mirror."
             )
     names = [frame.name for frame in frames]
     twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if twice:
-        raise ValueError(f"{source} names {twice[0]} more than once. Expected every photograph once.")
+        raise InputError(f"{source} names {twice[0]} more than once. Expected every photograph once.")
 
 
 def photograph_size(file: Path) -> tuple[int, int]:
@@ -116,7 +118,7 @@ def photograph_size(file: Path) -> tuple[int, int]:
             f"{file} is missing, which the cameras name. Say where the images are: --images."
         ) from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{file} cannot be read as an image ({error}). Copy it again from the capture.") from error
+        raise InputError(f"{file} cannot be read as an image ({error}). Copy it again from the capture.") from error
 
 
 def find_photographs(names: Sequence[str], folder: Path, source: Path, advice: str, *, copies: bool) -> list[Path]:
@@ -138,7 +140,7 @@ def find_photographs(names: Sequence[str], folder: Path, source: Path, advice: s
     files = [file.absolute() for file in found if file is not None]
     if len(set(files)) < len(files):
         first = next(i for i, file in enumerate(files) if file in files[:i])
-        raise ValueError(
+        raise InputError(
             f"{source} names {names[files.index(files[first])]} and {names[first]}, but in {folder} there is only "
             f"{files[first]} for both. Put the photographs into the folders that it names, or {advice}."
         )
@@ -193,14 +195,14 @@ def sized(frame: Frame, source: Path) -> Frame:
     if (width, height) != (camera.width, camera.height):
         scale = (width / camera.width + height / camera.height) / 2
         if abs(camera.width * scale - width) > 1 or abs(camera.height * scale - height) > 1:
-            raise ValueError(
+            raise InputError(
                 f"{frame.file} is {width} x {height} pixels, but its camera in {source} {camera.width} x "
                 f"{camera.height}: the aspect differs. Give the images that the cameras were computed from, or copies "
                 "of them at a fraction of the size, with --images."
             )
         camera = camera.resized(width, height)
     if frame.mask is not None and (found := photograph_size(frame.mask)) != (width, height):
-        raise ValueError(
+        raise InputError(
             f"The mask {frame.mask} is {found[0]} x {found[1]} pixels, its image {frame.file} {width} x {height}. "
             "Expected masks of the size of the images; give a folder of such with --masks."
         )

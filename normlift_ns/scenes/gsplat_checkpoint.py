@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.checkpoint import read_tensors
 from normlift_ns.scenes.splat import Splat, check_splat, from_parameters
 
@@ -44,13 +45,13 @@ def read_gsplat(path: Path) -> GsplatCheckpoint:
     loaded = [_read_rank(file) for file in files]
     steps = {step for step, _, _ in loaded}
     if len(steps) > 1:
-        raise ValueError(
+        raise InputError(
             f"{files[0].parent} has ranks of different steps: {', '.join(map(str, sorted(steps)))}. Expected the files "
             "of one training; keep those in a folder of their own."
         )
     harmonics = {tensors["features_rest"].shape[1:] for _, tensors, _ in loaded}
     if len(harmonics) > 1:
-        raise ValueError(
+        raise InputError(
             f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training; keep "
             "those in a folder of their own."
         )
@@ -91,22 +92,22 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
     if not isinstance(splats, Mapping):
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
         hint = "; for a run of nerfstudio give its config.yml with --load-config" if "pipeline" in keys else ""
-        raise ValueError(f"{path} is no checkpoint of gsplat: expected `splats` in it, found {keys}{hint}.")
+        raise InputError(f"{path} is no checkpoint of gsplat: expected `splats` in it, found {keys}{hint}.")
     for key, meaning in _REFUSED.items():
         if key in loaded:
-            raise ValueError(
+            raise InputError(
                 f"{path} holds `{key}`: {meaning}. Train it again without that option, or export a PLY file with the "
                 "trainer's --save_ply and give that with --load-ply."
             )
     missing = [name for name in ("means", "quats", "scales", "opacities", "sh0", "shN") if name not in splats]
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):
-        raise ValueError(
+        raise InputError(
             f"{path} has no {', '.join(missing) or 'tensors'} in its `splats`, which holds "
             f"{', '.join(sorted(map(str, splats)))}. Expected those of 3D Gaussians with spherical harmonics, as "
             "gsplat's simple_trainer writes them."
         )
     if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
-        raise ValueError(
+        raise InputError(
             f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
             "expected (N, 1, 3) and (N,)."
         )
@@ -127,7 +128,7 @@ def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] 
         return None
     moved = state.get("embeds.weight") if isinstance(state, Mapping) else None
     if not isinstance(moved, Tensor) or moved.ndim != 2 or moved.shape[1] != 9 or not bool(moved.isfinite().all()):
-        raise ValueError(
+        raise InputError(
             f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected finite numbers "
             f"embeds.weight (views, 9); {_ADVICE}."
         )

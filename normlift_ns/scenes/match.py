@@ -11,6 +11,7 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene, View
+from normlift_ns.errors import InputError
 from normlift_ns.raster.rasterize import render_picture
 from normlift_ns.raster.settings import RasterSettings
 
@@ -96,12 +97,12 @@ def judge(match: Match, *, own_cameras: bool) -> str | None:
             "training was stopped early"
         )
     if match.in_view < _LEAST_IN_VIEW:
-        raise ValueError(
+        raise InputError(
             f"The cameras do not look at this splat: at most {match.in_view:.2%} of its Gaussians are in any of three "
             f"training views. {causes}. --check False lifts nevertheless."
         )
     if match.psnr < match.grey_psnr and not own_cameras:
-        raise ValueError(
+        raise InputError(
             f"The splat does not show what its photographs show: rendered from three of their cameras, it is further "
             f"from them ({match.psnr:.1f} dB) than their mean colour is ({match.grey_psnr:.1f} dB). {causes}. --check "
             "False lifts nevertheless."
@@ -125,7 +126,7 @@ def _some_views(scene: Scene) -> list[_Small]:
     views = [_small(scene.train[index]) for index in sorted({0, last // 2, last})]
     seen = [small for small in views if small.view.mask is None or bool(small.view.mask.any())]
     if len(seen) == 0:
-        raise ValueError(
+        raise InputError(
             f"The masks of {', '.join(small.view.name for small in views)} leave no pixel. Expected masks that are "
             "zero where a pixel does not count; are they inverted?"
         )

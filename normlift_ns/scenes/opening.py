@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.errors import InputError
 from normlift_ns.options import Background, RasterizeMode, SplatOptions
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.cameras import Cameras, read_camera_file
@@ -111,7 +112,7 @@ def open_splat(
         names = [frame.name for frame in frames]
         held_out = held_out_names(names, test_every=options.test_every, holdout=options.holdout)
     if len(held_out) == len(frames) and options.views == "train":
-        raise ValueError(f"All {len(frames)} photographs are held out, none is left to lift; give --views all.")
+        raise InputError(f"All {len(frames)} photographs are held out, none is left to lift; give --views all.")
     for text in _assumptions(path, options, mode, held_out, frames, cameras):
         say(text)
     worlds = _worlds(checkpoint, options, cameras)
@@ -196,7 +197,7 @@ def _worlds(checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras:
 def _normalized(options: SplatOptions, cameras: Cameras) -> list[World]:
     """How gsplat's trainer normalized the world, from its COLMAP project."""
     if options.colmap is None:
-        raise ValueError(
+        raise InputError(
             "gsplat's trainer normalized the world of the splat by the points of its COLMAP project, so a "
             "transforms.json is not enough. Give the project with --colmap; or --world-transform with the map that you "
             "know; or --gsplat-normalize False, if the training had --no-normalize-world-space."
@@ -206,7 +207,7 @@ def _normalized(options: SplatOptions, cameras: Cameras) -> list[World]:
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{error} gsplat's trainer normalized the world by points3D.") from error
     if len(points) < _FEW_POINTS:
-        raise ValueError(
+        raise InputError(
             f"{cameras.source} has {len(points)} points, so the normalization of gsplat's trainer cannot be computed "
             "again. Give the project that the splat was trained with; or --gsplat-normalize False, if the training had "
             "--no-normalize-world-space."
@@ -222,7 +223,7 @@ def _adjusted(
     if len(trained) != len(moves):
         eighth = len(frames) - len(range(0, len(frames), 8))
         hint = " The trainer holds out every eighth: give --test-every 8." if len(moves) == eighth else ""
-        raise ValueError(
+        raise InputError(
             f"{path} moved the cameras of {len(moves)} training views (--pose_opt), but there are {len(trained)} of "
             f"{len(frames)} photographs. Say which were held out with --test-every or --holdout.{hint}"
         )
@@ -230,7 +231,7 @@ def _adjusted(
     for frame, move in zip(trained, moves.numpy()):
         first, second = move[3:6] + np.eye(3)[0], move[6:9] + np.eye(3)[1]
         if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
-            raise ValueError(f"{path}: its `pose_adjust` turns {frame.name} by no rotation. Expected two axes.")
+            raise InputError(f"{path}: its `pose_adjust` turns {frame.name} by no rotation. Expected two axes.")
         x = first / np.linalg.norm(first)
         y = second - (x @ second) * x
         y /= np.linalg.norm(y)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Frame, Intrinsics
 
 
@@ -109,7 +110,7 @@ def _read(frame: Frame) -> UInt8[np.ndarray, "h w c"]:
     try:
         with Image.open(frame.file) as image:
             if image.mode[0] in "IF":
-                raise ValueError(f"its pixels are of mode {image.mode}, expected 8 bits per channel")
+                raise InputError(f"its pixels are of mode {image.mode}, expected 8 bits per channel")
             mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
             pixels = np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
     except FileNotFoundError:
@@ -117,10 +118,10 @@ def _read(frame: Frame) -> UInt8[np.ndarray, "h w c"]:
             f"{frame.file} is missing, which the cameras name. Put it back, or say where the images are."
         ) from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{frame.file} cannot be read ({error}). Copy it again from the capture.") from error
+        raise InputError(f"{frame.file} cannot be read ({error}). Copy it again from the capture.") from error
     found, expected = pixels.shape[1::-1], (frame.intrinsics.width, frame.intrinsics.height)
     if found != expected:
-        raise ValueError(
+        raise InputError(
             f"{frame.file} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} (width x "
             "height). Use the images that the splat was trained with."
         )
@@ -135,9 +136,9 @@ def _mask(frame: Frame) -> Bool[Tensor, "h w"] | None:
         with Image.open(frame.mask) as image:
             values = np.array(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(f"The mask {frame.mask} cannot be read ({error}). Copy it again from the capture.") from error
+        raise InputError(f"The mask {frame.mask} cannot be read ({error}). Copy it again from the capture.") from error
     if values.shape != size:
-        raise ValueError(
+        raise InputError(
             f"The mask {frame.mask} has shape {values.shape}, expected {size}: one channel, as large as its image. "
             "Save it in grey."
         )

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyParseError
 
+from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.scenes.splat import DEGREES, Splat, check_splat
 
@@ -50,39 +51,39 @@ def read_ply(path: Path) -> PlySplat:
     try:
         found = PlyData.read(str(path), mmap="c")
     except UnicodeDecodeError as error:
-        raise ValueError(
+        raise InputError(
             f"The header of {path} has characters beyond ASCII, perhaps in a comment ({error}). Remove them from it, "
             f"or write the file again, for example with: splat-transform {path.name} clean.ply"
         ) from error
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
         if path.open("rb").read(3) == b"ply":
-            raise ValueError(
+            raise InputError(
                 f"{path} is truncated or damaged ({' '.join(str(error).split())}): its {path.stat().st_size:,} bytes "
                 "do not hold what its header says. Copy it again."
             ) from error
-        raise ValueError(
+        raise InputError(
             f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in the PLY "
             "format; splat-transform turns other formats into it, for example: splat-transform scene.sog scene.ply"
         ) from error
     elements = {element.name: element for element in found.elements}
     vertex = elements.get("vertex")
     if vertex is None or vertex.count == 0:
-        raise ValueError(f"{path} has no vertices, so it is no splat. Give the PLY file of a trained splat.")
+        raise InputError(f"{path} has no vertices, so it is no splat. Give the PLY file of a trained splat.")
     names = {item.name for item in vertex.properties}
     if "packed_position" in names:
-        raise ValueError(
+        raise InputError(
             f"{path} is a compressed PLY file. Expand it first: splat-transform {path.name} scene.ply, then give that."
         )
     missing = [name for name in _NEEDED if name not in names]
     if missing:
-        raise ValueError(
+        raise InputError(
             f"{path} is no splat: its {vertex.count:,} vertices have no {', '.join(missing)}. Expected the properties "
             f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
             f"{', '.join([item for item in sorted(names) if not item.startswith('f_rest_')][:16])}. {_advice(missing)}"
         )
     lists = [item.name for item in vertex.properties if item.name in _NEEDED and hasattr(item, "len_dtype")]
     if lists:
-        raise ValueError(f"{path} is no splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+        raise InputError(f"{path} is no splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
     splat = _read_columns(path, vertex.data, _rest_names(path, names))
     check_splat(splat, path)
     return PlySplat(splat, _mode([*found.comments, *vertex.comments]))
@@ -102,7 +103,7 @@ def _rest_names(path: Path, names: set[str]) -> list[str]:
     wanted = [f"f_rest_{i}" for i in range(count)]
     if count % 3 != 0 or count // 3 not in DEGREES or not set(wanted) <= names:
         fitting = ", ".join(f"{3 * k} (degree {degree})" for k, degree in DEGREES.items())
-        raise ValueError(
+        raise InputError(
             f"{path} has {count} properties f_rest_*, which fits no degree of spherical harmonics. Expected "
             f"f_rest_0, f_rest_1, … and so on, as many as {fitting}. Export the scene again."
         )

@@ -10,6 +10,7 @@ import msgspec
 import torch
 
 from normlift_ns.core.files import write_text
+from normlift_ns.errors import InputError
 from normlift_ns.options import Background, RasterizeMode
 from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
 from normlift_ns.scenes.frames import check_frames
@@ -71,7 +72,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     try:
         saved = msgspec.convert(read_json(path, _EXPECTED), _Saved)
     except msgspec.ValidationError as error:
-        raise ValueError(f"{path} has another form than expected: {error}. Expected {_EXPECTED}.") from error
+        raise InputError(f"{path} has another form than expected: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_FOLDER, load_step))
     parameters = {name: checkpoint.model[f"gauss_params.{name}"] for name in GAUSSIAN_PARAMETERS}
     if data is not None and not data.is_dir():

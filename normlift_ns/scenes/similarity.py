@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Frame, World
 from normlift_ns.scenes.transforms import read_json
 
@@ -42,13 +43,13 @@ def read_world_transform(
             matrix = matrix @ np.linalg.inv(applied)
         scale = float(values["scale"]) / applied_scale
     except (KeyError, TypeError, IndexError, EOFError, OverflowError, np.linalg.LinAlgError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path} holds no transform ({type(error).__name__}: {error}). Expected {_EXPECTED}."
         ) from error
     except ValueError as error:
         if str(path) in str(error):
             raise
-        raise ValueError(f"{path} holds no transform ({error}). Expected {_EXPECTED}.") from error
+        raise InputError(f"{path} holds no transform ({error}). Expected {_EXPECTED}.") from error
     similarity(matrix * scale + np.diag([0, 0, 0, 1 - scale]), str(path))
     return World(matrix[:3], scale, single=True)
 
@@ -60,12 +61,12 @@ def similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World:
         ValueError: it is no rotation, scale and translation.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError(f"{source} holds numbers of shape {matrix.shape} or not finite. Expected {_EXPECTED}.")
+        raise InputError(f"{source} holds numbers of shape {matrix.shape} or not finite. Expected {_EXPECTED}.")
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     last = np.abs(matrix[3] - [0, 0, 0, 1]).max()
     if scale <= 0 or last > _TOLERANCE or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > _TOLERANCE:
-        raise ValueError(
+        raise InputError(
             f"{source} holds no similarity: {matrix.tolist()}. Expected one rotation without mirror, one scale for all "
             "axes and a translation, with 0 0 0 1 in the last row."
         )
@@ -91,13 +92,13 @@ def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) 
     with np.errstate(all="ignore"):
         upright = _upright(poses)
     if not np.isfinite(upright).all():
-        raise ValueError(
+        raise InputError(
             "gsplat's normalization cannot be computed from these cameras: all of them stand at one point, or look up "
             "in opposite directions. Give --world-transform; or --gsplat-normalize False, if the training had "
             "--no-normalize-world-space."
         )
     if np.linalg.det(upright[:3, :3]) < 0:
-        raise ValueError(
+        raise InputError(
             "The mean up axis of the cameras is exactly +y, and gsplat's trainer mirrors such a world. Train the splat "
             "again with --no-normalize-world-space, and give --gsplat-normalize False."
         )
@@ -137,7 +138,7 @@ def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"
     centre = np.median(points, axis=0)
     covariance = np.cov(points - centre, rowvar=False)
     if not np.isfinite(covariance).all():
-        raise ValueError("gsplat's normalization cannot be computed: the points of the project lie too far away.")
+        raise InputError("gsplat's normalization cannot be computed: the points of the project lie too far away.")
     axes = np.linalg.eigh(covariance)[1][:, ::-1].copy()
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.errors import InputError
 
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 """Degree of the spherical harmonics by their number beyond the constant one."""
@@ -66,22 +67,22 @@ def check_splat(splat: Splat, file: Path) -> None:
             opacities that are no logits.
     """
     if len(splat) == 0:
-        raise ValueError(f"{file} holds no Gaussians at all. Export the scene again.")
+        raise InputError(f"{file} holds no Gaussians at all. Export the scene again.")
     for name, values in _drawn(splat):
         blocks = values.reshape(len(splat), -1).split(_BLOCK)
         wrong = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
         if len(wrong) > 0:
-            raise ValueError(
+            raise InputError(
                 f"{file} has {len(wrong):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first in "
                 f"row {int(wrong[0])}. Expected finite numbers; remove those Gaussians, for a PLY "
                 f"file for example with: splat-transform {file.name} --filter-nan clean.ply"
             )
     lengths = splat.quats.abs().amax(dim=1)
     if bool((lengths == 0).all()):
-        raise ValueError(f"{file} has rotations of zeros only, so nothing of it can be drawn. Export the scene again.")
+        raise InputError(f"{file} has rotations of zeros only, so nothing of it can be drawn. Export the scene again.")
     low, high = float(splat.opacities.min()), float(splat.opacities.max())
     if len(splat) >= _MANY and low >= 0 and high <= 1:
-        raise ValueError(
+        raise InputError(
             f"{file} seems to hold opacities, between {low:.3g} and {high:.3g}, in place of their logits. Expected "
             "logits, as all splat trainers write them; store log(opacity / (1 - opacity))."
         )
@@ -89,7 +90,7 @@ def check_splat(splat: Splat, file: Path) -> None:
     left, right = some.quantile(0.05, dim=0), some.quantile(0.95, dim=0)
     extent, width = float((right - left).amax()), float(splat.scales.median().exp())
     if bool((splat.scales >= 0).all()) and extent > 0 and width > _WIDE * extent:
-        raise ValueError(
+        raise InputError(
             f"{file} seems to hold linear scales, between {float(splat.scales.min()):.3g} and "
             f"{float(splat.scales.max()):.3g}: taken for logarithms, the median Gaussian would be {width:.3g} wide in "
             f"a scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
@@ -117,13 +118,13 @@ def from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat:
     for name, shape in shapes.items():
         value = parameters[name]
         if tuple(value.shape) != (n, *shape) or not value.dtype.is_floating_point:
-            raise ValueError(
+            raise InputError(
                 f"{file}: {name} is {value.dtype} {tuple(value.shape)}, expected floating-point numbers of shape "
                 f"{(n, *shape)}, one row per Gaussian."
             )
     rest = parameters["features_rest"]
     if rest.ndim != 3 or len(rest) != n or rest.shape[2] != 3 or rest.shape[1] not in DEGREES:
-        raise ValueError(
+        raise InputError(
             f"{file}: its spherical harmonics have shape {tuple(rest.shape)}, expected ({n}, K, 3) with K = "
             f"{', '.join(map(str, DEGREES))} for degrees {', '.join(map(str, DEGREES.values()))}."
         )

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 
 from normlift_ns.core.files import write_text
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Frame, Intrinsics, find_masks, find_photographs, photograph_size
 
 _LARGEST = 2**16
@@ -88,7 +89,7 @@ def read_json(path: Path, expected: str) -> Any:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         found = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
         reason = str(error) if found is None else f"it contains {found}"
-        raise ValueError(f"{path} is no valid JSON ({reason}). Expected {expected}.") from error
+        raise InputError(f"{path} is no valid JSON ({reason}). Expected {expected}.") from error
 
 
 def read_transforms(
@@ -116,7 +117,7 @@ def read_transforms(
     try:
         found = msgspec.convert(values, _File)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise ValueError(f"{path} has another form than expected: {error}. Expected {expected}.") from error
+        raise InputError(f"{path} has another form than expected: {error}. Expected {expected}.") from error
     place = path.parent if base is None else base
     listed = [relative_name(Path(frame.file_path), place) for frame in found.frames]
     files = find_photographs(listed, images or place, path, advice, copies=images is not None)
@@ -143,7 +144,7 @@ def _held_out(found: _File, place: Path, path: Path) -> list[bool]:
     for split, names in lists.items():
         strange = [name for name in names or () if place / name not in known]
         if strange:
-            raise ValueError(
+            raise InputError(
                 f"{path}: its {split}_filenames name {strange[0]}, which is no file_path of its frames. Expected the "
                 "same names in both."
             )
@@ -170,7 +171,7 @@ def _masks(
         return [None] * len(named)
     if len(given) < len(named):
         bare = next(frame.file_path for frame in found.frames if frame.mask_path is None)
-        raise ValueError(f"{path} names masks for some images, but none for {bare}. Expected one for each, or none.")
+        raise InputError(f"{path} names masks for some images, but none for {bare}. Expected one for each, or none.")
     found_masks = [_mask(name, place, images) for name in given]
     missing = [name for name, file in zip(given, found_masks) if file is None]
     if missing:
@@ -192,7 +193,7 @@ def _mask(name: str, place: Path, images: Path | None) -> Path | None:
 def _pose(frame: _Frame, path: Path) -> Float[np.ndarray, "3 4"]:
     rows = frame.transform_matrix
     if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows):
-        raise ValueError(
+        raise InputError(
             f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4. Expected a camera-to-world matrix."
         )
     return np.array(rows[:3])
@@ -208,26 +209,26 @@ def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrins
     model = value("camera_model") or "OPENCV"
     model = "OPENCV_FISHEYE" if value("is_fisheye") else model
     if model not in _PERSPECTIVE:
-        raise ValueError(
+        raise InputError(
             f"{path}: the camera_model is {model}; read are {', '.join(_PERSPECTIVE)}. Undistort the images, train the "
             "scene on those, and give their cameras."
         )
     size = (value("w"), value("h"))
     width, height = photograph_size(file) if None in size else size
     if not all(float(side).is_integer() and 0 < side <= _LARGEST for side in (width, height)):
-        raise ValueError(
+        raise InputError(
             f"{path}: w and h of {frame.file_path} are {width} and {height}, expected whole numbers of pixels."
         )
     fx, fy = value("fl_x"), value("fl_y")
     for angle in (value("camera_angle_x"), value("camera_angle_y")):
         if angle is not None and not 0 < angle < math.pi:
-            raise ValueError(f"{path}: a camera_angle is {angle}, expected radians between 0 and pi.")
+            raise InputError(f"{path}: a camera_angle is {angle}, expected radians between 0 and pi.")
     if fx is None and value("camera_angle_x") is not None:
         fx = 0.5 * width / math.tan(0.5 * value("camera_angle_x"))
     if fy is None and value("camera_angle_y") is not None:
         fy = 0.5 * height / math.tan(0.5 * value("camera_angle_y"))
     if fx is None:
-        raise ValueError(f"{path} has neither fl_x nor camera_angle_x for {frame.file_path}. Expected a focal length.")
+        raise InputError(f"{path} has neither fl_x nor camera_angle_x for {frame.file_path}. Expected a focal length.")
     cx, cy = value("cx"), value("cy")
     return Intrinsics(
         fx,
@@ -249,7 +250,7 @@ def _distortion(common: _File, frame: _Frame, path: Path) -> tuple[float, ...]:
         values = [*holder.distortion_params, *[0.0] * 6][:6]
     k1, k2, k3, k4, p1, p2 = values
     if k4 != 0:
-        raise ValueError(
+        raise InputError(
             f"{path}: {frame.file_path} has the distortion k4 = {k4:g}; only k1, k2, k3, p1 and p2 can be undone. "
             "Undistort the images, train the scene on those, and give their cameras."
         )
@@ -264,10 +265,10 @@ def _applied(found: _File, path: Path) -> Float[np.ndarray, "4 4"]:
     matrix = np.eye(4)
     if rows is not None:
         if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not np.isfinite(rows).all():
-            raise ValueError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
+            raise InputError(f"{path}: applied_transform is not 3 x 4 finite numbers.")
         matrix[:3] = rows[:3]
     if abs(np.linalg.det(matrix)) < _SINGULAR or not 0 < found.applied_scale < math.inf:
-        raise ValueError(
+        raise InputError(
             f"{path}: applied_transform cannot be inverted, or applied_scale is {found.applied_scale}. Expected a "
             "rotation and a positive number."
         )

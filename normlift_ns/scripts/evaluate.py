@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from rich.table import Table
 
 from normlift_ns.core.files import refuse_existing
+from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
@@ -58,12 +59,12 @@ class NormLiftEval:
     def main(self) -> Evaluation:
         """Evaluates, prints and writes."""
         if len(self.load_config) == 0 or len(self.load_config) != len(self.labels):
-            raise ValueError(
+            raise InputError(
                 f"{len(self.load_config)} runs and {len(self.labels)} --labels were given; give one for each run, in "
                 "the same order"
             )
         if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
-            raise ValueError("protocol masks and --data take one run at a time; name a single --load-config")
+            raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
         figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
         refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)

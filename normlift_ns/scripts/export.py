@@ -9,6 +9,7 @@ from typing import Any, Literal
 from rich.table import Table
 
 from normlift_ns.core.files import refuse_existing
+from normlift_ns.errors import InputError
 from normlift_ns.options import MIN_SIZE, REACH, AskOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
@@ -44,7 +45,7 @@ class NormLiftExport:
         """Writes the files; returns the path of the PLY file."""
         name = Path(self.output_filename).name
         if name == "":
-            raise ValueError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
+            raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
         target = self.output_dir / name
         files = (target, *(target.with_name(f"{target.stem}_{name}") for name in ("rows.npy", "objects.json")))
         refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
@@ -60,7 +61,7 @@ class NormLiftExport:
         )
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
         if answer is None and self.part != "scene":
-            raise ValueError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
+            raise InputError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
         part = None if answer is None or self.part == "scene" else answer.mask
         part = ~part if part is not None and self.part == "rest" else part
         objects: dict[str, Any] | None = None

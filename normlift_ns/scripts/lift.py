@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
+from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.scripts.shared import CONSOLE, run_command
 
@@ -89,7 +90,7 @@ class NormLift:
         """Raises a ValueError unless one trained splat is given, and only options that fit it."""
         given = [path for path in (self.load_config, self.load_ply, self.load_gsplat) if path is not None]
         if len(given) != 1:
-            raise ValueError(
+            raise InputError(
                 f"Give one trained splat, got {len(given)}: --load-config with the config.yml of a splatfacto run, "
                 "--load-ply with a PLY file, or --load-gsplat with a checkpoint of gsplat's trainer."
             )
@@ -100,7 +101,7 @@ class NormLift:
             options, names, hint = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
         for name in names:
             if getattr(options, name) != getattr(default, name, None):
-                raise ValueError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
+                raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
 
     def _trained(self) -> Path | Scene:
         """The run, or the splat, opened."""

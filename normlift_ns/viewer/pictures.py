@@ -14,6 +14,7 @@ from normlift_ns.asking import Answer, pixel_relevancy
 from normlift_ns.core.files import file_name, new_file
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
+from normlift_ns.errors import InputError
 from normlift_ns.observing import spread
 from normlift_ns.raster.rasterize import render, render_picture
 
@@ -78,7 +79,7 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     stems = list(cameras)
     unknown = [name for name in names if name not in cameras]
     if len(unknown) > 0:
-        raise ValueError(
+        raise InputError(
             f"--render-views: there is no training image {unknown[0]!r}; there are {len(stems)}, from {stems[0]!r} to "
             f"{stems[-1]!r} (names without suffix; others are held out for evaluation)"
         )

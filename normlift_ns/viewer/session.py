@@ -18,6 +18,7 @@ from torch import Tensor
 from normlift_ns.asking import Answer, Question, answer, reselect
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import file_name, free_path
+from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.runs.question import save_question
 from normlift_ns.runs.splats import write_splats
@@ -138,7 +139,7 @@ class Session:
         """
         chosen = self.chosen
         if self.answer is None or chosen is None or not bool(chosen.any()):
-            raise ValueError("Nothing is selected; there is nothing to export.")
+            raise InputError("Nothing is selected; there is nothing to export.")
         texts = self.answer.texts
         name = file_name("_".join(texts) if self.shown is None else texts[self.shown])
         folder.mkdir(exist_ok=True)
@@ -158,7 +159,7 @@ class Session:
             ValueError: there is no question, or no folder.
         """
         if self.answer is None or folder is None:
-            raise ValueError("No query yet; there is nothing to save.")
+            raise InputError("No query yet; there is nothing to save.")
         path = save_question(folder, self.answer.question)
         return f"Saved {len(self.answer.texts)} queries in {path}; ns-render draws them."
 
@@ -175,6 +176,6 @@ def split_prompts(text: str) -> list[str]:
 def check_prompts(prompts: list[str]) -> None:
     """Raises ValueError unless there is at least one prompt and not too many."""
     if len(prompts) == 0:
-        raise ValueError("Type what to look for, then press Query.")
+        raise InputError("Type what to look for, then press Query.")
     if len(prompts) > MOST_PROMPTS:
-        raise ValueError(f"{len(prompts)} prompts; ask for {MOST_PROMPTS} at most at a time.")
+        raise InputError(f"{len(prompts)} prompts; ask for {MOST_PROMPTS} at most at a time.")

@@ -10,6 +10,7 @@ from typing import Any
 
 from normlift_ns.core.disk.tensors import text_digest
 from normlift_ns.core.files import write_text
+from normlift_ns.errors import InputError
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
@@ -41,11 +42,11 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         text = path.read_text("utf8")
         facts = dict(json.loads(text))
     except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(
+        raise InputError(
             f"the semantic field in {folder} is damaged ({path}: {type(error).__name__}: {error}); {REMEDY}"
         ) from error
     if facts.get("schema_version") != SCHEMA_VERSION:
-        raise ValueError(
+        raise InputError(
             f"{folder}: schema version {facts.get('schema_version')!r}, this program reads {SCHEMA_VERSION}; lift again"
         )
     expected, digests = facts.pop("digest", None), facts.pop("digests", None)
@@ -53,7 +54,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         return facts, None
     found = text_digest(text.replace(f'"digest": {json.dumps(expected)}', '"digest": ""', 1))
     if found != expected or not isinstance(digests, dict):
-        raise ValueError(f"{path} is damaged: its text has digest {found}, expected {expected}; {REMEDY}")
+        raise InputError(f"{path} is damaged: its text has digest {found}, expected {expected}; {REMEDY}")
     return facts, digests
 
 
@@ -75,7 +76,7 @@ def check_digests(folder: Path, found: Mapping[str, str | None], expected: Mappi
     for name, digest in found.items():
         wanted = None if expected is None else expected.get(name)
         if digest is None or digest != wanted:
-            raise ValueError(
+            raise InputError(
                 f"{folder / name} and the manifest beside it are of different lifts: the file has digest {digest}, the "
                 f"manifest expects {wanted}; {REMEDY}"
             )

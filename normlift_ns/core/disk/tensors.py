@@ -18,6 +18,7 @@ from torch import Tensor
 from xxhash import xxh3_128
 
 from normlift_ns.core.files import new_file
+from normlift_ns.errors import InputError
 
 _DIGEST = "digest"
 
@@ -116,13 +117,13 @@ def load_tensors(
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing; {remedy}") from None
     except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, UnicodeError) as error:
-        raise ValueError(f"{path} is damaged or no safetensors file ({error}); {remedy}") from error
+        raise InputError(f"{path} is damaged or no safetensors file ({error}); {remedy}") from error
     if undigested is not None and set(facts) == set(undigested):
         return TensorFile(tensors, facts, None)
     expected = facts.pop(_DIGEST, None)
     found = tensor_digest(tensors, facts, key)
     if found != expected:
-        raise ValueError(
+        raise InputError(
             f"{path} is damaged: its content has digest {found}, expected {expected or 'one, but it names none'}; "
             f"{remedy}"
         )
@@ -140,7 +141,7 @@ def check_tensor(
         ValueError: it is not; the message says what was found and expected.
     """
     if tensor.dtype != dtype or tuple(tensor.shape) != tuple(shape):
-        raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {tuple(shape)}")
+        raise InputError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {tuple(shape)}")
     least, most = (x.item() for x in tensor.aminmax()) if tensor.numel() > 0 else (low, low)
     if not low <= least <= most <= high:
-        raise ValueError(f"{name} has numbers in {least}..{most}, expected {low:g}..{high:g}")
+        raise InputError(f"{name} has numbers in {least}..{most}, expected {low:g}..{high:g}")

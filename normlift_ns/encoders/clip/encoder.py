@@ -21,6 +21,7 @@ from normlift_ns.encoders.clip.network import ClipNetwork, load_clip
 from normlift_ns.encoders.clip.weights import check_names, import_open_clip
 from normlift_ns.encoders.source import check_prompts
 from normlift_ns.encoders.weights import content_identity
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
 
 ENSEMBLE = "ensemble"
@@ -51,9 +52,9 @@ class OpenClipEncoder:
 
     def __post_init__(self) -> None:
         if self.fill not in get_args(Fill):
-            raise ValueError(f"fill of crops must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
+            raise InputError(f"fill of crops must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
         if self.template != ENSEMBLE and "{}" not in self.template:
-            raise ValueError(
+            raise InputError(
                 f"text template {self.template!r} has no {{}} where the text belongs; write it like "
                 f'"a photo of a {{}}", or {ENSEMBLE} for the mean of several'
             )

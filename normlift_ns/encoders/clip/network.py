@@ -10,6 +10,7 @@ from torch import Tensor
 
 from normlift_ns.encoders.clip.weights import REMEDY, find_weights, import_open_clip
 from normlift_ns.encoders.weights import first_line
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
 
@@ -47,14 +48,14 @@ def load_clip(model: str, pretrained: str, device: str) -> ClipNetwork:
             force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
         )
     except Exception as error:  # whatever foreign packages raise
-        raise ValueError(
+        raise InputError(
             f"OpenCLIP model {model} cannot be built with the packages installed here ({first_line(error)}); take "
             f"another with --encoder-model, such as {DEFAULT_MODEL}"
         ) from None
     try:
         open_clip.load_checkpoint(network, str(path), weights_only=True)
     except Exception as error:  # whatever a foreign file makes torch, safetensors and open_clip raise
-        raise ValueError(
+        raise InputError(
             f"weight file {path} is damaged or not of OpenCLIP model {model} ({first_line(error)}); name its "
             f"architecture with --encoder-model, or {REMEDY}"
         ) from None

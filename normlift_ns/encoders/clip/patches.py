@@ -25,6 +25,7 @@ from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.weights import import_open_clip
 from normlift_ns.encoders.regions import resample_nearest
 from normlift_ns.encoders.source import ViewFeatures, check_image
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
 
@@ -53,10 +54,10 @@ class PatchFeatures:
 
     def __post_init__(self) -> None:
         if self.count < 1:
-            raise ValueError(f"number of regions per image must be at least 1, got {self.count}")
+            raise InputError(f"number of regions per image must be at least 1, got {self.count}")
         reason = why_not_dense(self.encoder.model)
         if reason is not None:
-            raise ValueError(
+            raise InputError(
                 f"--regions patches needs a vision transformer of open_clip; {self.encoder.model} is none: {reason}. "
                 f"Take --encoder-model {DEFAULT_MODEL}, or other regions"
             )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from normlift_ns.encoders.weights import first_line, probe
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
 REMEDY = (
@@ -38,14 +39,14 @@ def check_names(model: str, pretrained: str) -> None:
     open_clip = import_open_clip()
     if open_clip.get_model_config(model) is None:
         near = ", ".join(difflib.get_close_matches(model, open_clip.list_models()) or [DEFAULT_MODEL])
-        raise ValueError(
+        raise InputError(
             f"unknown OpenCLIP model {model!r} (--encoder-model); near names: {near}. All of them: "
             'python -c "import open_clip; print(open_clip.list_models())"'
         )
     tower = open_clip.get_model_config(model)["vision_cfg"].get("timm_model_name")
     timm = importlib.import_module("timm")
     if tower is not None and not timm.is_model(tower):
-        raise ValueError(
+        raise InputError(
             f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
             f"{timm.__version__} does not have (nerfstudio pins an old one); take a model that open_clip builds "
             f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
@@ -56,7 +57,7 @@ def check_names(model: str, pretrained: str) -> None:
     if path.suffix in _SUFFIXES or len(path.parts) > 1:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {REMEDY}")
     tags = ", ".join(open_clip.list_pretrained_tags_by_model(model)) or "none"
-    raise ValueError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; known: {tags}. Otherwise {REMEDY}")
+    raise InputError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; known: {tags}. Otherwise {REMEDY}")
 
 
 def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:

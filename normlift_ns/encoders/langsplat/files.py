@@ -23,6 +23,7 @@ from torch import Tensor
 from normlift_ns.core.files import new_file
 from normlift_ns.encoders.images import read_npy
 from normlift_ns.encoders.source import UNIT_TOLERANCE
+from normlift_ns.errors import InputError
 
 LEVELS = ("default", "s", "m", "l")
 """Channels of `_s`."""
@@ -41,7 +42,7 @@ def open_segments(path: Path) -> np.ndarray:
     found = read_npy(path, "segment map")
     found = found[None] if found.ndim == 2 else found
     if found.dtype.kind not in "fiu" or found.ndim != 3 or len(found) not in (1, len(LEVELS)) or found.size == 0:
-        raise ValueError(
+        raise InputError(
             f"segment map {path} holds {found.dtype} {found.shape}, expected numbers [4, H, W], [1, H, W] or [H, W]"
         )
     return found
@@ -62,12 +63,12 @@ def read_segments(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
     broken = np.argwhere(values != np.round(values))
     if len(broken) > 0:
         channel, y, x = broken[0].tolist()
-        raise ValueError(
+        raise InputError(
             f"segment map {path}: channel {channel}, row {y}, column {x} holds {values[channel, y, x]:g}, which is no "
             "id; the map was interpolated: make it again, with nearest neighbour"
         )
     if found.dtype.kind == "f" and found.dtype.itemsize == 2 and bool((values >= _LARGEST_HALF).any()):
-        raise ValueError(
+        raise InputError(
             f"segment map {path} holds float16 with ids of {_LARGEST_HALF} and more, which are rounded; save it as "
             "float32"
         )
@@ -88,7 +89,7 @@ def open_table(path: Path) -> np.ndarray:
     """[T, D], mapped into memory, its values unchecked; raises as `open_segments`."""
     found = read_npy(path, "feature table")
     if found.dtype.kind != "f" or found.ndim != 2 or found.shape[1] < _SMALLEST_DIMENSION:
-        raise ValueError(
+        raise InputError(
             f"feature table {path} holds {found.dtype} {found.shape}, expected floats [T, D], one CLIP vector per mask "
             "(codes of LangSplat's autoencoder, language_features_dim3, cannot be asked: give language_features)"
         )

@@ -31,6 +31,7 @@ from normlift_ns.encoders.langsplat.files import (
 )
 from normlift_ns.encoders.regions import resample_nearest
 from normlift_ns.encoders.source import FeatureSource, RegionFeatures, TextEncoder, ViewFeatures, joint_partition
+from normlift_ns.errors import InputError
 from normlift_ns.options import Missing
 
 Level = Literal["default", "s", "m", "l", "sum"]
@@ -69,7 +70,7 @@ class LangSplat:
     def __post_init__(self) -> None:
         for flag, value, known in (("--level", self.level, Level), ("--features-missing", self.missing, Missing)):
             if value not in get_args(known):
-                raise ValueError(f"{flag} of features langsplat is one of {', '.join(get_args(known))}; got {value!r}")
+                raise InputError(f"{flag} of features langsplat is one of {', '.join(get_args(known))}; got {value!r}")
         _ = self.folder
 
     @cached_property
@@ -110,7 +111,7 @@ class LangSplat:
         dimensions: dict[int, Path] = {}
         for name, files in found.items():
             if files in owner:
-                raise ValueError(
+                raise InputError(
                     f"images {owner[files]} and {name} would share the features {files.segments}; name the images so "
                     "that they differ before the first dot"
                 )
@@ -119,7 +120,7 @@ class LangSplat:
             open_segments(files.segments)
         if len(dimensions) > 1:
             (a, first), (b, second) = list(dimensions.items())[:2]
-            raise ValueError(
+            raise InputError(
                 f"the rows of {first} have {a} numbers, those of {second} {b}; all must come from one encoder"
             )
         return list(found)
@@ -166,7 +167,7 @@ class LangSplat:
             return maps
         ratio = (width / height) / (maps.shape[2] / maps.shape[1])
         if abs(ratio - 1) > _ASPECT and not self.resample:
-            raise ValueError(
+            raise InputError(
                 f"{path} is {maps.shape[2]}x{maps.shape[1]} (width x height), its image {width}x{height}: another "
                 "aspect ratio, so another crop or orientation; preprocess the images that the run was trained with "
                 "(nerfstudio undistorts them), or stretch the maps: --regions-resample True"
@@ -204,7 +205,7 @@ def write_langsplat(
     if len(levels) == 0:
         view = source.view(image, name)
         if len(view.region_of_cell) != 1:
-            raise ValueError("regions of several levels at once cannot be written in LangSplat's format; choose one")
+            raise InputError("regions of several levels at once cannot be written in LangSplat's format; choose one")
         nothing = torch.tensor([-1], dtype=torch.int32)
         levels = [(torch.cat([view.region_of_cell[0], nothing])[view.labels.long()], view.features)]
     first = torch.tensor([0, *(len(rows) for _, rows in levels)]).cumsum(0).tolist()

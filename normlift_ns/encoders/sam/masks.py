@@ -32,6 +32,7 @@ from normlift_ns.encoders.sam.network import SamNetwork
 from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.sam.weights import check_sam, sam_identity
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM
 
 Level = Literal["default", "s", "m", "l"]
@@ -105,7 +106,7 @@ class SamMasks:
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
-            raise ValueError(f"SAM has the levels {', '.join(LEVELS)}; got {self.level!r}: choose with --level")
+            raise InputError(f"SAM has the levels {', '.join(LEVELS)}; got {self.level!r}: choose with --level")
         check_sam(self.checkpoint)
 
     @property

@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from normlift_ns.encoders.weights import content_identity, first_line, probe
+from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM
 
 REMEDY = (
@@ -65,7 +66,7 @@ def import_transformers() -> Any:
     try:
         return importlib.import_module("transformers")
     except ImportError as error:
-        raise ValueError(
+        raise InputError(
             f"--regions sam needs the package transformers ({first_line(error)}); install it with: "
             'pip install "normlift-ns[sam]", or cut the images without SAM: --regions patches or superpixel'
         ) from None
@@ -85,7 +86,7 @@ def check_sam(checkpoint: str) -> None:
     if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
         raise FileNotFoundError(f"SAM checkpoint {checkpoint} does not exist; check the path, or {REMEDY}")
     if len(path.parts) != 2:
-        raise ValueError(
+        raise InputError(
             f"SAM checkpoint {checkpoint!r} is neither a path nor a name of the hub such as {DEFAULT_SAM}; {REMEDY}"
         )
 
@@ -127,7 +128,7 @@ def load_sam(checkpoint: str) -> Any:
             model = import_transformers().SamModel(config)
         model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
     except Exception as error:  # whatever a foreign file makes torch, safetensors and transformers raise
-        raise ValueError(f"SAM checkpoint {path} is damaged or not of SAM ({first_line(error)}); {REMEDY}") from None
+        raise InputError(f"SAM checkpoint {path} is damaged or not of SAM ({first_line(error)}); {REMEDY}") from None
     return model.eval().requires_grad_(False)
 
 
@@ -147,10 +148,10 @@ def _download(checkpoint: str) -> Path:
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     if _model_type(folder) != "sam":
-        raise ValueError(f"config.json is of model type {_model_type(folder)!r}, expected 'sam', {_FIRST}")
+        raise InputError(f"config.json is of model type {_model_type(folder)!r}, expected 'sam', {_FIRST}")
     found = _weights(folder)
     if len(found) == 0:
-        raise ValueError(f"the folder has no {_FILES[0]}")
+        raise InputError(f"the folder has no {_FILES[0]}")
     config = json.loads((folder / "config.json").read_text())
     return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
 
@@ -168,11 +169,11 @@ def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
     for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
         for part, kind in _OTHERS.items():
             if str(name).startswith(part):
-                raise ValueError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}")
+                raise InputError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}")
     if "image_encoder.pos_embed" not in state:
         if (path.parent / "config.json").is_file():
             return _read_folder(path.parent)
-        raise ValueError(f"it has no image_encoder.pos_embed, which Meta's files of {_FIRST} have")
+        raise InputError(f"it has no image_encoder.pos_embed, which Meta's files of {_FIRST} have")
     return published_config(state), {published_name(name): value for name, value in state.items()}
 
 
