@@ -67,7 +67,7 @@ class Evidence:
     weight_power: int = 1
     """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code)."""
     num_excluded: int = 0
-    """Gaussians that were not drawn because a parameter was not finite."""
+    """Gaussians that were not drawn because a parameter was not finite or out of range."""
 
     def __post_init__(self) -> None:
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight

@@ -11,18 +11,26 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 
+LARGEST_SCALE = 4.8517e8
+"""e^20 world units. The projected covariance of a larger Gaussian may not be a float32 number."""
+LARGEST_MEAN = 1e18
+"""In world units along each axis: the square of a distance must be a float32 number."""
+QUATERNION_LENGTHS = (1e-18, 1e18)
+"""Range of the largest component: the squared length must be a normal float32 number, or else the rotation is NaN, or
+silently none at all.
+"""
+
 
 @dataclass(frozen=True)
 class GaussianScene:
     """N Gaussians with activated parameters, as the rasterizer sees them.
 
-    A Gaussian with a NaN, an infinity or a zero quaternion stays in the scene, so that rows keep their meaning, but
-    is never drawn:
-    see `drawable`.
+    A Gaussian whose parameters are not finite or out of range stays in the scene, so that rows keep their meaning, but
+    is never drawn: see `drawable`.
 
     Raises:
-        ValueError: wrong shapes, no floating point, mixed devices, a negative scale or an opacity outside 0..1 in a
-            finite row.
+        ValueError: wrong shapes, no floating point, mixed devices, a negative scale or an opacity outside 0..1 (NaN is
+            neither).
 
     >>> import torch
     >>> from normlift_ns import GaussianScene
@@ -73,9 +81,17 @@ class GaussianScene:
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:
-        """True where all parameters are finite and the quaternion is not zero."""
-        finite = torch.cat([self.means, self.quats, self.scales, self.opacities[:, None]], dim=1).isfinite().all(dim=1)
-        return finite & (self.quats != 0).any(dim=1)
+        """True where all parameters are finite and small enough for float32, and the quaternion is not too short.
+
+        The limits are those of float32 whatever the precision, so that every backend draws the same Gaussians. Scales
+        that are 0 are drawn as dots.
+        """
+        length = self.quats.float().abs().amax(dim=1)  # but for a factor of 2
+        least, most = QUATERNION_LENGTHS
+        small = (self.means.float().abs() <= LARGEST_MEAN).all(dim=1) & (self.scales.float() <= LARGEST_SCALE).all(
+            dim=1
+        )
+        return small & (length >= least) & (length <= most) & self.opacities.isfinite()
 
 
 @dataclass(frozen=True)

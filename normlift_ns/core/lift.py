@@ -23,14 +23,17 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
-from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, SparseRows, segment_sum
+from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.options import Unlabeled
+
+_LEAST_WEIGHT, _LARGEST_WEIGHT = 1e-15, 1e15
+"""Range of W_j with evidence and of E_js: squares of sums are float32 numbers. A rasterizer's are in 1e-13..1e9."""
 
 
 @dataclass(frozen=True)
 class Scalars:
-    """The numbers of every Gaussian. Without evidence (W_j = 0 or f_j = 0) all are 0 but `view_count` and `weight`.
+    """The numbers of every Gaussian. Without evidence (W_j < 1e-15 or f_j = 0) all are 0 but `view_count` and `weight`.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
@@ -117,7 +120,7 @@ class Lifted:
             from normlift_ns.kernels.sums import unit_sums  # noqa: PLC0415 (needs triton)
 
             arrays = (rows.offsets, rows.column, rows.weight, table, self.scalars.norm)
-            return unit_sums(gaussians.long(), *arrays, dtype, CANCELLED)
+            return unit_sums(gaussians.long(), *arrays, dtype, CANCELLED, MANY_ENTRIES)
         sums = rows.select_rows(gaussians).sums_of_unit_rows(table)
         length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
         return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
@@ -151,7 +154,8 @@ def lift(
     Returns:
         `Lifted`, in float64 if the evidence or the features are, else in float32.
     Raises:
-        ValueError: a table of another length; zero, non-finite or non-unit rows; beta < 0; an unknown `unlabeled`.
+        ValueError: a table of another length; zero, non-finite or non-unit rows; weights outside 0..1e15; beta < 0; an
+            unknown `unlabeled`.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, lift, rasterize_evidence
@@ -167,12 +171,16 @@ def lift(
         raise InputError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
     if not beta >= 0:
         raise InputError(f"beta must be >= 0, got {beta}")
+    for what, rows in (("regions", evidence.rows), ("unlabelled pixels", evidence.unlabeled)):
+        if not bool(((rows.weight >= 0) & (rows.weight <= _LARGEST_WEIGHT)).all()):
+            low, high = (float(x) for x in rows.weight.aminmax())
+            raise InputError(f"weights of {what} must be in 0..{_LARGEST_WEIGHT:g}, found {low:g}..{high:g}")
     table = _unit_table(evidence, features)
     total, by_view, weight, weight_squared, view_count = _sums(evidence, table)
     if unlabeled == "dilute":
         weight, weight_squared, view_count = _weights(SparseRows.add(evidence.view_weights(), evidence.unlabeled))
 
-    found = (weight > 0) & (total > (1e-12 if table.dtype == torch.float64 else 1e-6) * weight)
+    found = (weight >= _LEAST_WEIGHT) & (total > (1e-12 if table.dtype == torch.float64 else 1e-6) * weight)
     norm = _ratio(total, weight, found).clamp(max=1)
     n_eff = _ratio(weight**2, weight_squared, found)
     values = {
@@ -211,7 +219,9 @@ def _sums(evidence: Evidence, table: Tensor) -> _Sums:
         from normlift_ns.kernels.sums import row_norms  # noqa: PLC0415 (needs triton)
 
         rows = evidence.rows
-        return _Sums(*row_norms(rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLED))
+        return _Sums(
+            *row_norms(rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLED, MANY_ENTRIES)
+        )
     total, by_view = _row_norms(evidence.rows, table), _sum_of_view_norms(evidence, table)
     return _Sums(total, by_view, *_weights(evidence.view_weights()))
 

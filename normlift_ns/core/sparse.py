@@ -18,6 +18,8 @@ from normlift_ns.errors import InputError
 
 CANCELLED = 1e-3
 """Below this share of its weight a vector sum is recomputed in float64: its float32 digits have cancelled."""
+MANY_ENTRIES = 4096
+"""Sums of more vectors than this are taken in float64: float32 would lose a digit after the other."""
 CHUNK_ELEMENTS = 2**24
 """Of a dense array that is made block by block."""
 _FEW_COLUMNS = 32
@@ -203,13 +205,14 @@ class SparseRows:
             yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
 
     def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """`matmul` with a table of unit rows; sums that nearly cancel are recomputed in float64, so that their
-        direction is right.
+        """`matmul` with a table of unit rows; sums that nearly cancel, and sums of very many, are recomputed in float64,
+        so that their direction is right.
         """
         sums = self.matmul(table)
         if table.dtype == torch.float64:
             return sums
-        weak = (torch.linalg.vector_norm(sums, dim=1) < CANCELLED * self.row_sums()).nonzero().squeeze(1)
+        weak = torch.linalg.vector_norm(sums, dim=1) < CANCELLED * self.row_sums()
+        weak = (weak | (self.offsets.diff() > MANY_ENTRIES)).nonzero().squeeze(1)
         if weak.numel() > 0:
             rows = self.select_rows(weak)
             used, column = rows.column.unique(return_inverse=True)

@@ -61,7 +61,7 @@ class StoredDirections:
         out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
         step = max(1, (_GPU_BLOCK if self.coordinates.is_cuda else _CPU_BLOCK) // projected.shape[1])
         out[scalars.norm > 0] = torch.cat([block.float() @ projected.T for block in self.coordinates.split(step)])
-        return out
+        return out.clamp_(-1, 1)
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
         """Unit directions of some Gaussians, 0 without evidence."""

@@ -86,9 +86,9 @@ def _exact_sum(column, weight, table, start, stop, dimension, BLOCK: tl.constexp
 @triton.jit
 def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
-    dimension, cancelled, BLOCK: tl.constexpr,
+    dimension, cancelled, many, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One row per program. Where float32 digits have cancelled, the sum is taken again in float64."""
+    """One row per program. Where float32 digits have cancelled or worn away, the sum is taken again in float64."""
     j = tl.program_id(0)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     d = tl.arange(0, BLOCK)
@@ -106,7 +106,7 @@ def _row_norms(
             norm = view_weight  # of a single unit row
             if e - first > 1:
                 norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
-                if norm < cancelled * view_weight:
+                if (norm < cancelled * view_weight) | (e - first > many):
                     exact = _exact_sum(column, weight, table, first, e, dimension, BLOCK)
                     norm = tl.sqrt(tl.sum(exact * exact, axis=0))
             by_view += norm
@@ -123,7 +123,7 @@ def _row_norms(
             view_weight += w.to(tl.float64)
         view = next_view
     norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
-    if norm < cancelled * all_weight:
+    if (norm < cancelled * all_weight) | (stop - start > many):
         exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
         norm = tl.sqrt(tl.sum(exact * exact, axis=0))
     tl.store(out_total + j, norm)
@@ -140,12 +140,14 @@ def row_norms(
     column_view: Int32[Tensor, " s"],
     table: Float32[Tensor, "s d"],
     cancelled: float,
+    many: int,
 ) -> RowNorms:
     """All that the lift needs of E, in one pass and without any [N, D] array.
 
     Args:
         column: ascending in each row, so that entries of a view follow each other.
-        cancelled: sums shorter than this share of their weight are taken again in float64.
+        cancelled, many: sums shorter than this share of their weight, and sums of more entries than this, are taken
+            again in float64.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
     out = RowNorms(
@@ -153,14 +155,14 @@ def row_norms(
         torch.empty(n, dtype=torch.int32, device=device),
     )
     _row_norms[(n,)](
-        offsets, column, weight, column_view, table, *out, dimension, cancelled,
+        offsets, column, weight, column_view, table, *out, dimension, cancelled, many,
         BLOCK=triton.next_power_of_2(dimension), num_warps=1,
     )  # fmt: skip
     return out
 
 
 @triton.jit
-def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, cancelled, BLOCK: tl.constexpr):
+def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, cancelled, many, BLOCK: tl.constexpr):
     j = tl.load(rows + tl.program_id(0))
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     d = tl.arange(0, BLOCK)
@@ -173,7 +175,7 @@ def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, canc
             total += w * tl.load(table + row, mask=d < dimension, other=0.0)
             all_weight += w
         norm = tl.sqrt(tl.sum(total * total, axis=0))
-        if norm < cancelled * all_weight:
+        if (norm < cancelled * all_weight) | (stop - start > many):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
             total = (exact / tl.sqrt(tl.sum(exact * exact, axis=0))).to(tl.float32)
         else:
@@ -190,13 +192,14 @@ def unit_sums(
     known: Float32[Tensor, " n"],
     dtype: torch.dtype,
     cancelled: float,
+    many: int,
 ) -> Float[Tensor, "m d"]:
     """sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 where `known` is 0."""
     dimension = table.shape[1]
     out = torch.empty(len(rows), dimension, dtype=dtype, device=table.device)
     if len(rows) > 0:
         _unit_sums[(len(rows),)](
-            rows, offsets, column, weight, table, known, out, dimension, cancelled,
+            rows, offsets, column, weight, table, known, out, dimension, cancelled, many,
             BLOCK=triton.next_power_of_2(dimension), num_warps=1,
         )  # fmt: skip
     return out

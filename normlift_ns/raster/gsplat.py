@@ -17,15 +17,22 @@ from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
 from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.projection import camera_depths, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
 _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_discriminant", "radius_sigmas", "max_alpha", "min_alpha", "min_transmittance")
 """Constants that stand in gsplat's compiled code."""
+_LARGE = 100.0
+"""Scale in world units up to which no camera (focal length below 400,000 pixels) makes a determinant overflow."""
+_OVERFLOWS = 1e10
+"""Radius in pixels of every Gaussian whose determinant, of the order of (radius / 3) ** 4, overflows."""
+_LONGEST_RADIUS = 2**31 - 128
+"""An int32 that is a float32 number too."""
 
 
 class Projections(NamedTuple):
@@ -57,11 +64,40 @@ def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
         calc_compensations=job.antialiased,
     )  # fmt: skip
+    radii = radii * scene.drawable
     opacities = scene.opacities.expand(len(cameras), -1)
     opacities = opacities * compensations if job.antialiased else opacities.contiguous()
+    _project_enormous(job, cameras, radii, means2d, depths, conics, opacities)
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
     _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down, n_cameras=len(cameras))
     return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
+
+
+def _project_enormous(
+    job: Job,
+    cameras: Sequence[Camera],
+    radii: Tensor,
+    means2d: Tensor,
+    depths: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+) -> None:
+    """Replaces what gsplat projected of Gaussians whose determinant is no float32 number there: inf or NaN."""
+    scene = job.scene
+    rows = (scene.drawable & (scene.scales.amax(dim=1) > _LARGE)).nonzero().squeeze(1)
+    if len(rows) == 0:
+        return
+    some = GaussianScene(*(x[rows] for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
+    world = to_world(some, torch.float32)
+    for view, camera in enumerate(cameras):
+        seen = project(world, camera, job.settings, job.antialiased)
+        there = seen.radii > _OVERFLOWS
+        place = rows[seen.gaussian[there]]
+        radii[view, place], means2d[view, place] = _LONGEST_RADIUS, seen.means2d[there]
+        conics[view, place] = seen.conics[there]
+        depths[view, place] = camera_depths(scene.means[place], camera)
+        if job.antialiased:
+            opacities[view, place] = seen.opacities[there]
 
 
 def check(job: Job, *, pictures: bool = False) -> None:
@@ -111,28 +147,19 @@ def views_evidence(job: Job, batch: Batch) -> Entries:
 def composite(
     job: Job, camera: Camera, values: Float32[Tensor, "n c"]
 ) -> tuple[Float32[Tensor, "h w c"], Float32[Tensor, "h w"]]:
-    """sum_j A_ij values_j and sum_j A_ij of every pixel, by gsplat's own renderer."""
-    from gsplat.rendering import rasterization  # noqa: PLC0415 (needs a GPU)
+    """sum_j A_ij values_j and sum_j A_ij of every pixel, by gsplat's own kernel."""
+    from gsplat.cuda._wrapper import rasterize_to_pixels  # noqa: PLC0415 (needs a GPU)
 
-    scene, settings = job.scene, job.settings
-    if len(scene) == 0 or values.shape[1] == 0:
-        return values.new_zeros(camera.height, camera.width, values.shape[1]), values.new_zeros(
-            camera.height, camera.width
-        )
-    image, alpha, _ = rasterization(
-        *(scene.means, scene.quats, scene.scales, scene.opacities, values.to(scene.means)),
-        camera.world_to_camera.to(scene.means)[None],
-        camera.K.to(scene.means)[None],
-        camera.width,
-        camera.height,
-        near_plane=settings.near_plane,
-        far_plane=settings.far_plane,
-        eps2d=settings.eps2d,
-        tile_size=settings.tile_size,
-        packed=False,
-        rasterize_mode="antialiased" if job.antialiased else "classic",
-    )
-    return image[0], alpha[0, :, :, 0]
+    size = (camera.height, camera.width)
+    if len(job.scene) == 0 or values.shape[1] == 0:
+        return values.new_zeros(*size, values.shape[1]), values.new_zeros(size)
+    seen = project_views(job, [camera])
+    drawing = (camera.width, camera.height, job.settings.tile_size, seen.offsets, seen.members)
+    parts = [
+        rasterize_to_pixels(seen.means2d, seen.conics, part[None].contiguous(), seen.opacities, *drawing)
+        for part in values.to(job.scene.means).split(_CHANNELS, dim=1)
+    ]
+    return torch.cat([image[0] for image, _ in parts], dim=-1), parts[0][1][0, :, :, 0]
 
 
 def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:

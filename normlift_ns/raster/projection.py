@@ -13,6 +13,9 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.raster.settings import RasterSettings
 
+_ENORMOUS = 2.0**60
+"""Covariance in square pixels above which it is multiplied by 1 / _ENORMOUS."""
+
 
 class World(NamedTuple):
     """The drawable Gaussians of a scene, ready for any camera."""
@@ -73,7 +76,7 @@ def project(world: World, camera: Camera, settings: RasterSettings, antialiased:
     pose = camera.world_to_camera.to(device)
     fx, _, cx, _, fy, cy, *_ = camera.K.double().flatten().tolist()
     width, height = camera.width, camera.height
-    depth = _camera_axis(world.means, pose[2])
+    depth = camera_depths(world.means, camera)
     near = ((depth >= settings.near_plane) & (depth <= settings.far_plane)).nonzero().squeeze(1)
     near = near[torch.argsort(depth[near], stable=True)]
     means, rotation = world.means[near].to(dtype), pose[:3, :3].to(dtype)
@@ -88,24 +91,31 @@ def project(world: World, camera: Camera, settings: RasterSettings, antialiased:
     )
     to_image = jacobian @ rotation
     covariance = to_image @ world.covariances[near] @ to_image.transpose(1, 2)
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    # Of enormous Gaussians in smaller units: their determinants are no float32 numbers. A power of two rounds nothing.
+    unit = torch.where(covariance.diagonal(dim1=1, dim2=2).amax(dim=1) > _ENORMOUS, 1 / _ENORMOUS, 1.0).to(dtype)
+    a, b, c = (unit * x for x in (covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]))
     det_sharp = a * c - b * b
-    a, c = a + settings.eps2d, c + settings.eps2d
+    a, c = a + unit * settings.eps2d, c + unit * settings.eps2d
     det = a * c - b * b
     opacities = world.opacities[near]
     if antialiased:
         opacities = opacities * (det_sharp / det).clamp(min=0).sqrt()
 
     mean = 0.5 * (a + c)
-    larger = mean + (mean * mean - det).clamp(min=settings.min_discriminant).sqrt()
-    radii = (settings.radius_sigmas * larger.sqrt()).ceil()
+    larger = mean + torch.maximum(mean * mean - det, unit * unit * settings.min_discriminant).sqrt()
+    radii = (settings.radius_sigmas * (larger / unit).sqrt()).ceil()
     u, v = fx * x / z + cx, fy * y / z + cy
     seen = (det > 0) & radii.isfinite() & (u + radii > 0) & (u - radii < width) & (v + radii > 0) & (v - radii < height)
-    conics = torch.stack([c, -b, a], 1) / det[:, None]
+    conics = unit[:, None] * (torch.stack([c, -b, a], 1) / det[:, None])
     seen = (seen & conics.isfinite().all(1)).nonzero().squeeze(1)
     return Projected(
         world.gaussian[near[seen]], torch.stack([u, v], 1)[seen], conics[seen], opacities[seen], radii[seen]
     )
+
+
+def camera_depths(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, " m"]:
+    """Distance of every mean along the camera's axis, as gsplat rounds it."""
+    return _camera_axis(means, camera.world_to_camera.to(means.device)[2])
 
 
 def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float[Tensor, " m"]:

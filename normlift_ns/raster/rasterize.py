@@ -51,8 +51,8 @@ def rasterize_evidence(
     Views stream: cameras, labels and num_regions may be generators, and nothing of a view is kept but its entries.
 
     Args:
-        scene: N Gaussians. Those with non-finite parameters are not drawn; they are counted in the result, with a
-            warning.
+        scene: N Gaussians. Those with parameters that are not finite or out of range (`GaussianScene.drawable`) are
+            not drawn; they are counted in the result, with a warning.
         cameras: one per view.
         labels: per view an integer tensor [height, width] of view-local region ids 0, 1, …; -1 = unlabelled;
             -2 = masked: the pixel is no observation at all, whatever `lift` does with unlabelled ones.
@@ -89,7 +89,9 @@ def rasterize_evidence(
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
-            f"{num_excluded} of {len(scene)} Gaussians have non-finite parameters and are not drawn", stacklevel=2
+            f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, and are not "
+            "drawn",
+            stacklevel=2,
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
     parts: list[Entries] = []

@@ -5,7 +5,7 @@ import torch
 
 from normlift_ns import Evidence, lift
 from normlift_ns.core.lift import _sums
-from normlift_ns.core.sparse import CANCELLED, SparseRows, segment_sum
+from normlift_ns.core.sparse import CANCELLED, MANY_ENTRIES, SparseRows, segment_sum
 from normlift_ns.kernels import sums
 from tests.scenes import generator, random_evidence, unit_rows
 
@@ -19,7 +19,7 @@ def on_device(*tensors):
 def kernel_norms(evidence, table):
     rows = evidence.rows
     arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
-    return [x.cpu() for x in sums.row_norms(*arrays, CANCELLED)]
+    return [x.cpu() for x in sums.row_norms(*arrays, CANCELLED, MANY_ENTRIES)]
 
 
 def test_segments_are_added_in_float64():
@@ -63,7 +63,7 @@ def test_cancelled_sums_are_right():
     assert torch.allclose(total, torch.stack([sum(within), exact[4] - exact[5]]), rtol=1e-12)
     assert torch.allclose(by_view, torch.stack([sum(within), exact[4] + exact[5]]), rtol=1e-12)
     arrays = on_device(torch.arange(2), offsets, region, weight, table, torch.ones(2))
-    found = sums.unit_sums(*arrays, torch.float32, CANCELLED).cpu()
+    found = sums.unit_sums(*arrays, torch.float32, CANCELLED, MANY_ENTRIES).cpu()
     assert torch.equal(found, torch.eye(1, 8).expand(2, -1))
 
 
@@ -75,7 +75,7 @@ def test_directions_equal_those_of_the_cpu(dtype):
     given = evidence.rows
     arrays = on_device(rows, given.offsets, given.column, given.weight, lifted.features, lifted.scalars.norm)
     found = torch.empty(30, 20, dtype=dtype)
-    found[rows] = sums.unit_sums(*arrays, dtype, CANCELLED).cpu()
+    found[rows] = sums.unit_sums(*arrays, dtype, CANCELLED, MANY_ENTRIES).cpu()
     assert found.dtype == dtype
     assert torch.allclose(found.float(), lifted.directions(), atol=2e-7 if dtype == torch.float32 else 5e-4)
     assert torch.equal(found[lifted.scalars.norm == 0], torch.zeros_like(found[lifted.scalars.norm == 0]))
