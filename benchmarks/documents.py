@@ -53,7 +53,9 @@ Documents = Mapping[str, Document]
 
 
 def read(path: Path) -> Document:
-    """The document of one results file."""
+    """The document of one results file; one without metrics where there is no file."""
+    if not path.exists():
+        return Document(f"python -m benchmarks.{path.stem}", "no machine so far", ())
     content = json.loads(path.read_text())
     rows = ({**row, "value": nan if row["value"] is None else row["value"]} for row in content["metrics"])
     return Document(content["command"], content["hardware"], tuple(Metric(**row) for row in rows))
@@ -61,7 +63,7 @@ def read(path: Path) -> Document:
 
 def documents() -> Documents:
     """All results files that the pages speak of, by their names."""
-    names = ("cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses")
+    names = ("cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu")
     return {name: read(RESULTS / f"{name}.json") for name in names}
 
 

@@ -1,4 +1,4 @@
-"""The tables of docs/accuracy.md and docs/speed_and_error.md, as Markdown, from the results files."""
+"""The tables of docs/accuracy.md, docs/numerics.md and docs/speed_and_error.md, as Markdown, from the results files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from benchmarks.accuracy import OTHERS
 from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps
+from benchmarks.hard_case import DOUBLE, QUANTITIES
+from benchmarks.numerics import CASES
 from benchmarks.signals import STEP
 
 PREFIXES = {"tabletop": "", "demo": "demo."}
@@ -35,6 +37,9 @@ def tables(found: Documents) -> dict[str, str]:
         "core-gpu": every_metric(h100),
         "core-cpu": every_metric(found["cpu"]),
         "forms": every_metric(found["forms"], "_tol0.01_"),
+        "numerics-rule": numerics_rule(),
+        "numerics-cases": numerics_cases(),
+        "numerics-errors": numerics_errors(found["numerics"], found["numerics_gpu"]),
     }
 
 
@@ -172,3 +177,36 @@ def every_metric(document: Document, having: str = "") -> str:
         if having in m.key
     ]
     return table(("what", "value", "relative error against float64"), rows)
+
+
+def numerics_rule() -> str:
+    """What is measured of hard cases, and the bounds where a case names no other."""
+    rows = [
+        (name, quantity.unit, f"{quantity.bound:g}", f"{QUANTITIES[name + DOUBLE].bound:g}" if name != "wrong" else "0")
+        for name, quantity in QUANTITIES.items()
+        if not name.endswith(DOUBLE)
+    ]
+    return table(("error of", "in units of", "at most", "at most, `--precision double`"), rows)
+
+
+def numerics_cases() -> str:
+    """Every hard case in words."""
+    return table(
+        ("case", "what it is", "expected", "what a person sees"),
+        [(f"`{case.key}`", case.title, case.expected, case.seen) for case in CASES],
+    )
+
+
+def numerics_errors(cpu: Document, gpu: Document) -> str:
+    """The errors of every hard case on both kinds of device, bounds in brackets where they are not the rule's."""
+    rows = []
+    for case in CASES:
+        for name in (x for x in QUANTITIES if f"{case.key}.{x}" in cpu.values and not x.endswith(DOUBLE)):
+            cells = []
+            for quantity in (name, name + DOUBLE):
+                key = f"{case.key}.{quantity}"
+                errors = [f"{one.values[key]:.1g}" if key in one.values else "" for one in (cpu, gpu)]
+                cells += [*errors, f"{case.bound(quantity):g}" if key in cpu.values else ""]
+            rows.append((f"`{case.key}`", name, *cells))
+    devices = ("CPU", "GPU", "at most")
+    return table(("case", "error of", *devices, *(f"{x}, double" for x in devices)), rows)

@@ -205,8 +205,8 @@ class SparseRows:
             yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
 
     def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """`matmul` with a table of unit rows; sums that nearly cancel, and sums of very many, are recomputed in float64,
-        so that their direction is right.
+        """`matmul` with a table of unit rows; sums that nearly cancel, and those of very many rows, are recomputed in
+        float64, so that their direction is right.
         """
         sums = self.matmul(table)
         if table.dtype == torch.float64:

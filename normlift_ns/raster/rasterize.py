@@ -89,8 +89,8 @@ def rasterize_evidence(
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
-            f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, and are not "
-            "drawn",
+            f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, "
+            "and are not drawn",
             stacklevel=2,
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None

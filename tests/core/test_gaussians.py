@@ -31,7 +31,7 @@ def test_scene_names_what_is_wrong(change, message):
         GaussianScene(**{**GOOD, **change})
 
 
-def test_drawable_excludes_non_finite_rows_and_zero_quaternions():
+def test_drawable_excludes_rows_that_are_not_finite_and_zero_quaternions():
     scene = GaussianScene(**{name: value.clone() for name, value in GOOD.items()})
     scene.means[0, 1] = torch.nan
     scene.quats[2] = 0

@@ -199,6 +199,40 @@ def test_weights_from_1e_minus_12_to_1e6(dtype):
     assert lifted.scalars.norm[0].item() == pytest.approx(((features[0] + 2 * features[1]) / 3).norm().item(), rel=1e-6)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("weight", [1e-16, 1e-20, 1e-30, 1e-38, 1e-44])
+def test_weights_too_small_for_float32_are_no_evidence(dtype, weight):
+    lifted = lift(evidence_of([[weight, 0.0], [1.0, weight]], [0, 1], dtype), unit_rows(2, D, 0, dtype))
+    for name in STATISTICS[:5]:
+        assert getattr(lifted.scalars, name)[0] == 0
+        assert getattr(lifted.scalars, name)[1] > 0
+    assert lifted.directions()[0].abs().max() == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("weight", [1.1e15, 1e30, math.inf, math.nan, -1.0])
+def test_weights_too_large_for_float32_are_refused(dtype, weight):
+    """Their squares overflow: C_inter was NaN from 1e19 on."""
+    with pytest.raises(ValueError, match=r"weights of regions must be in 0\.\.1e\+15, found"):
+        lift(evidence_of([[1.0, weight]], [0, 1], dtype), unit_rows(2, D, 0, dtype))
+    blank = SparseRows(torch.tensor([0, 1]), torch.tensor([0], dtype=torch.int32), torch.tensor([weight], dtype=dtype))
+    evidence = replace(evidence_of([[1.0, 1.0]], [0, 1], dtype), unlabeled=blank)
+    with pytest.raises(ValueError, match="weights of unlabelled pixels must be in"):
+        lift(evidence, unit_rows(2, D, 0, dtype))
+
+
+def test_very_many_entries_keep_their_digits():
+    """Added up one after the other in float32 they lose three digits."""
+    n = 200_000
+    features = unit_rows(1, 8, 0, torch.float32).expand(n, -1)
+    offsets, column = torch.tensor([0, n]), torch.arange(n, dtype=torch.int32)
+    rows = SparseRows(offsets, column, torch.full((n,), 1.1e-6))
+    none = SparseRows(torch.zeros(2, dtype=torch.int64), column[:0], rows.weight[:0])
+    lifted = lift(Evidence(rows, torch.zeros(n, dtype=torch.int32), none, 1), features)
+    assert abs(lifted.scalars.norm.item() - 1) < 1e-6
+    assert (lifted.directions() - features[:1]).norm() < 1e-6
+
+
 def test_a_single_view():
     lifted = lift(evidence_of([[1.0, 3.0]], [0, 0]), unit_rows(2, D, 0))
     assert lifted.scalars.n_eff.item() == pytest.approx(1)

@@ -67,6 +67,22 @@ def test_cancelled_sums_are_right():
     assert torch.equal(found, torch.eye(1, 8).expand(2, -1))
 
 
+def test_sums_of_many_entries_are_taken_in_float64():
+    evidence, table = random_evidence(3, [40, 40], 8, dtype=torch.float32), unit_rows(80, 16, 2, torch.float32)
+    rows = evidence.rows
+    arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
+    found, exact = sums.row_norms(*arrays, 0.0, 2), _sums(evidence, table.double())
+    for ours, theirs in zip(found, exact):
+        assert torch.allclose(ours.cpu().double(), theirs.double(), rtol=1e-12, atol=0)
+    single = sums.row_norms(*arrays, 0.0, 1000)
+    assert (single.total.cpu() - exact.total).abs().max() > 1e-9 * exact.total.max()
+    arrays = on_device(torch.arange(3), rows.offsets, rows.column, rows.weight, table, torch.ones(3))
+    units = sums.unit_sums(*arrays, torch.float32, 0.0, 10).cpu()
+    sums_of_rows = rows.matmul(table.double())
+    expected = sums_of_rows / sums_of_rows.norm(dim=1, keepdim=True)
+    assert torch.equal(units, expected.float())
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 def test_directions_equal_those_of_the_cpu(dtype):
     evidence = random_evidence(30, [3, 4], 5, dtype=torch.float32)

@@ -8,7 +8,7 @@ import numpy as np
 
 from normlift_ns import Camera, GaussianScene
 
-TILE, NEAR, BLUR, CAP, SKIP, STOP = 16, 0.01, 0.3, 0.999, 1 / 255, 1e-4
+TILE, NEAR, FAR, BLUR, CAP, SKIP, STOP = 16, 0.01, 1e10, 0.3, 0.999, 1 / 255, 1e-4
 
 
 def _rotation(q: list[float]) -> np.ndarray:
@@ -32,7 +32,7 @@ def compositing_matrix(scene: GaussianScene, camera: Camera, antialiased: bool =
         if not bool(scene.drawable[j]):
             continue
         x, y, z = pose[:3, :3] @ scene.means[j].double().numpy() + pose[:3, 3]
-        if z < NEAR:
+        if z < NEAR or z > FAR:
             continue
         R = pose[:3, :3] @ _rotation(scene.quats[j].double().tolist())
         covariance = R @ np.diag(scene.scales[j].double().numpy() ** 2) @ R.T

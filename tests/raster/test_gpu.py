@@ -109,6 +109,21 @@ def test_all_backends_agree(regions, mode, kind):
 
 
 @needs_gpu
+@pytest.mark.parametrize("channels", [0, 1, 40])
+def test_gsplat_draws_the_pictures_of_the_reference(channels):
+    scene = hard_scene()
+    scene.scales[0], scene.scales[1], scene.quats[2], scene.means[3, 0] = 4.8e8, 1e12, 0.0, torch.nan
+    scene, camera = scene.to("cuda"), orbit(1, width=333, height=201, focal=300.0)[0]
+    values = torch.rand(len(scene), channels, generator=generator(0)).cuda()
+    found, expected = (render(scene, camera, values, backend=backend) for backend in ("gsplat", "torch"))
+    assert expected[1].max() > 0.1
+    for ours, theirs in zip(found, expected):
+        assert ours.shape == theirs.shape
+        if channels > 0:
+            assert (ours - theirs).norm() <= 1e-4 * theirs.norm()
+
+
+@needs_gpu
 def test_the_whole_lift_equals_that_of_the_cpu():
     scene, cameras = (
         random_scene(4000, seed=2, dtype=torch.float32, size=0.05),
