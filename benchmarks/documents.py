@@ -55,7 +55,7 @@ Documents = Mapping[str, Document]
 def read(path: Path) -> Document:
     """The document of one results file; one without metrics where there is no file."""
     if not path.exists():
-        return Document(f"python -m benchmarks.{path.stem}", "no machine so far", ())
+        return Document(f"python -m benchmarks.{path.stem.removesuffix('_gpu')}", "no machine so far", ())
     content = json.loads(path.read_text())
     rows = ({**row, "value": nan if row["value"] is None else row["value"]} for row in content["metrics"])
     return Document(content["command"], content["hardware"], tuple(Metric(**row) for row in rows))

@@ -185,7 +185,7 @@ def _cosine_errors(setting: Setting, table: Tensor, rank: int | None) -> tuple[T
     bound = torch.full((n,), half_precision_error(d if rank is None else rank)) + 1e-6
     if basis is not None:
         bound += basis.bound.cpu()
-    return (found - exact @ texts.T).abs().nan_to_num(math.inf).amax(dim=1), bound + 10 * (found.abs() > 1).any(dim=1)
+    return (found - exact @ texts.T).abs().nan_to_num(math.inf).amax(dim=1), bound - 10 * (found.abs() > 1).any(dim=1)
 
 
 def half_precision(setting: Setting) -> dict[str, float]:
@@ -269,7 +269,7 @@ SUMS = (
     Case(
         "one_dominant_view",
         "One view with a million times the weight of the others",
-        "N_eff = 1, R = ||f|| / 2",
+        "N_eff = 1, R = ‖f‖ / 2",
         "it counts as seen once",
         one_dominant_view,
     ),
@@ -287,7 +287,7 @@ SUMS = (
         "a message; a rasterizer never gives such weights",
         weights_beyond,
     ),
-    Case("one_view", "A single view", "N_eff = 1, C_inter = 1, R = ||f|| / 2", "nothing has R above 0.5", one_view),
+    Case("one_view", "A single view", "N_eff = 1, C_inter = 1, R = ‖f‖ / 2", "nothing has R above 0.5", one_view),
     Case(
         "many_entries",
         "A million small weights on one Gaussian",
