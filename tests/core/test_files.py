@@ -18,7 +18,6 @@ from normlift_ns.core.files import (
     clean,
     draft_directory,
     file_name,
-    free_path,
     new_file,
     new_files,
     numbered,
@@ -44,20 +43,6 @@ def test_a_text_never_leaves_its_folder(text: str, tmp_path: Path):
     assert len(path.name) <= 44
     path.write_text("")
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_free_path_leaves_what_exists_alone(tmp_path: Path):
-    path = tmp_path / "red.ply"
-    assert free_path(path) == path
-    path.touch()
-    assert free_path(path) == tmp_path / "red_2.ply"
-    (tmp_path / "red_2.ply").touch()
-    assert free_path(path) == tmp_path / "red_3.ply"
-
-
-def test_no_two_processes_get_the_same_free_path(tmp_path: Path):
-    found = together(8, lambda _: [free_path(tmp_path / "red.ply") for _ in range(10)])
-    assert len({path for paths in found for path in paths}) == 80 == len(list(tmp_path.iterdir()))
 
 
 def test_nothing_is_replaced_unasked(system: str, tmp_path: Path):

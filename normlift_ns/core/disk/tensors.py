@@ -36,15 +36,6 @@ class TensorFile(NamedTuple):
     """None: a file of version 0.1."""
 
 
-def text_digest(text: str) -> str:
-    """Digest of a text.
-
-    >>> text_digest("fox")
-    'xxh3_128:2acc0017ba959fe5c1cfee97854b92cf'
-    """
-    return f"xxh3_128:{xxh3_128(text.encode()).hexdigest()}"
-
-
 def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: str = "") -> str:
     """Digest of names, types, shapes and numbers of tensors, of the facts beside them, and of a key.
 
