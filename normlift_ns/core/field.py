@@ -20,7 +20,6 @@ from normlift_ns.core.disk.manifest import (
     REMEDY,
     SCHEMA_VERSION,
     check_digests,
-    check_files,
     read_manifest,
     write_manifest,
 )
@@ -236,7 +235,6 @@ class SemanticField:
             raise InputError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
         if means is not None:
             _check_belongs(manifest, tensors.get("means"), means, folder, checkpoint)
-        check_files(folder, {name: value for name, value in (digests or {}).items() if name not in found})
         scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
         if evidence is not None:
             store = StoredEvidence(evidence, tensors["features"])

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.disk.digests import file_digest, text_digest
-from normlift_ns.core.disk.manifest import BESIDE
+from normlift_ns.core.disk.manifest import BESIDE, MANIFEST, check_files
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean, refuse_existing
 from normlift_ns.errors import InputError
@@ -60,11 +60,9 @@ def load_field(
 
     Args:
         means, checkpoint: as in `SemanticField.load`.
-    Warns where config.yml is not as we wrote it.
-
     Raises:
         FileNotFoundError: the run has none.
-        ValueError: a damaged field, or one of other Gaussians than the means; another file of the run that is damaged.
+        ValueError: a damaged field, or one of other Gaussians than the means.
     """
     folder = run_dir / FIELD_FOLDER
     if not folder.exists():
@@ -72,7 +70,6 @@ def load_field(
             f"{run_dir} is a run without semantics (no {FIELD_FOLDER}/ in it). Lift it with ns-normlift --load-config, "
             "then give the config.yml that ns-normlift names at its end."
         )
-    _check_seal(run_dir / "config.yml")
     return with_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
 
 
@@ -83,6 +80,19 @@ def with_paths(field: SemanticField, folder: Path) -> SemanticField:
         return field
     path = str(folder / encoder["text_vectors"])  # an absolute one stays
     return replace(field, manifest={**field.manifest, "encoder": {**encoder, "text_vectors": path}})
+
+
+def check_run(run_dir: Path) -> None:
+    """Makes sure that the files of a lifted run are as they were written; warns where config.yml is not.
+
+    Raises:
+        ValueError: a file that is damaged, or of another run.
+    """
+    if not run_dir.exists():
+        clean(run_dir.parent)  # a lift that was killed while it replaced the run
+    _check_seal(run_dir / "config.yml")
+    if (run_dir / FIELD_FOLDER / MANIFEST).exists():
+        check_files(run_dir / FIELD_FOLDER)
 
 
 def digests_beside(folder: Path, files: Iterable[Path]) -> dict[str, str]:
