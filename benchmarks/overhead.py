@@ -1,9 +1,9 @@
 """What a query and a lift cost against another version of the program: as whole commands, run in turns.
 
     git worktree add ../before b9779a0
-    python -m benchmarks.overhead --before ../before                        a demo room of 30,000 Gaussians, 15 runs each
-    python -m benchmarks.overhead --before ../before --config .../config.yml  a trained run of your own
-    python -m benchmarks.overhead --before ../before --quick                3 runs of a small room
+    python -m benchmarks.overhead --before ../before                  a demo room, 15 runs each
+    python -m benchmarks.overhead --before ../before --config FILE    a trained run of your own
+    python -m benchmarks.overhead --before ../before --quick          3 runs of a small room
 
 Both versions run in this Python, one after the other, old and new, so that what the machine does besides meets both.
 Lifts start without caches and leave out the check of photographs against renders, which version 0.1 does not have.
@@ -61,7 +61,7 @@ def run(checkout: Path, command: str, *flags: object) -> Cost:
 
 
 def in_turns(checkouts: dict[str, Path], repeats: int, action) -> dict[str, list[Cost]]:
-    """Costs of an action of (name, checkout), after one run of each that does not count; the order changes each time."""
+    """Costs of an action of (name, checkout), after one that does not count; the order changes each time."""
     found: dict[str, list[Cost]] = {name: [] for name in checkouts}
     for turn in range(repeats + 1):
         names = list(checkouts) if turn % 2 else list(reversed(checkouts))

@@ -1,7 +1,7 @@
 """Single flipped bits in all files that are written for a run and in its caches: what becomes of them.
 
-Noticed: refused with our message, computed again (caches) or warned of (config.yml, which people may edit). Harmless: the
-same answers, parameters and stored vectors, bit for bit. Anything else is a wrong answer without a word.
+Noticed: refused with our message, computed again (caches) or warned of (config.yml, which people may edit).
+Harmless: the same answers, parameters and stored vectors, bit for bit. Anything else is a wrong answer without a word.
 """
 
 from __future__ import annotations

@@ -53,4 +53,3 @@ def test_flipped_bits_are_noticed_or_harmless(server: Server, tmp_path: Path, re
     for kind, counts in sorted(found.items()):
         record(f"one flipped bit, `{kind}`", sum(counts.values()), f"{counts.get('noticed', 0)} noticed, "
                f"{counts.get('harmless', 0)} harmless")  # fmt: skip
-

@@ -1,4 +1,4 @@
-"""Processes that are killed while they write: nothing is lost, nothing is left over, and the command can be run again."""
+"""Processes that are killed while they write: nothing is lost or left over, and the command can be run again."""
 
 from __future__ import annotations
 
@@ -121,8 +121,8 @@ def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record)
     record(
         f"kill -9 during `{name}`",
         INSTANTS,
-        f"nothing lost or left over; the run again equals an undisturbed one. With {TERMS} SIGTERM: {seen['old']} times "
-        f"what was there before, {seen['new']} times the new",
+        "nothing lost or left over; run again it equals an undisturbed one. Found, with "
+        f"{TERMS} SIGTERM: {seen['old']} times what was there before, {seen['new']} times the new",
     )
 
 
@@ -137,7 +137,7 @@ def without_cache(found: Tree) -> Tree:
 
 
 def look(place: Place, command: str) -> None:
-    """The next command, whichever it is: it completes what was under way, and finds a run or an export that is whole."""
+    """The next command, whichever it is, completes what was under way, and finds a run or an export that is whole."""
     answers = place.folder / "answers.json"
     if command == "export":
         words = ("export", "--load-config", place.config, "--output-dir", place.folder / "out")

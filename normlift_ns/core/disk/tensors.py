@@ -101,18 +101,19 @@ def load_tensors(
         FileNotFoundError: no such file.
         ValueError: another digest than the file names, or no safetensors file.
     """
+    if path.exists() and not path.is_file():  # a pipe would never end
+        raise InputError(f"{path} is no file; {remedy}")
     try:
         with safe_open(path, framework="pt") as file:
             facts = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is no mapping)
+        expected = facts.pop(_DIGEST, None)
+        digested = expected is not None or undigested is None or set(facts) != set(undigested)
+        found = tensor_digest(tensors, facts, key) if digested else None
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing; {remedy}") from None
     except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, UnicodeError) as error:
         raise InputError(f"{path} is damaged or no safetensors file ({error}); {remedy}") from error
-    if undigested is not None and set(facts) == set(undigested):
-        return TensorFile(tensors, facts, None)
-    expected = facts.pop(_DIGEST, None)
-    found = tensor_digest(tensors, facts, key)
     if found != expected:
         raise InputError(
             f"{path} is damaged: its content has digest {found}, expected {expected or 'one, but it names none'}; "
