@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from normlift_ns.core.disk.digests import file_digest
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.query import CANONICAL_NEGATIVES
 from normlift_ns.encoders.build import make_texts
@@ -30,6 +31,10 @@ ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "
 """Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
 GIVEN = "given"
 """In the manifest in place of an encoder: features of the user's own."""
+_CHOSEN = "texts_chosen"
+"""Key in the manifest of an opened run: texts are looked up in a file that the user named, whatever the lift had."""
+_OF_FILES = ("xxh3_128:", "blake2b:")
+"""How the identities of weights begin that are the content of a file, and no tag."""
 _CENTRAL = (0.05, 0.95)
 
 
@@ -198,9 +203,10 @@ class Finding:
 
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
-    """What `encoder_of` needs to know, ready for JSON; paths absolute."""
-    vectors = options.text_vectors
+    """What `encoder_of` needs to know, ready for JSON; paths of files absolute, so that they mean the same anywhere."""
+    vectors, pretrained = options.text_vectors, options.encoder_pretrained
     settings = {key: getattr(options, key) for key in ENCODER_KEYS}
+    settings["encoder_pretrained"] = os.path.abspath(pretrained) if os.path.isfile(pretrained) else pretrained
     return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
 
 
@@ -220,7 +226,9 @@ def with_texts(field: SemanticField, *, vectors: Path | None = None, template: s
         "text_template": template,
     }
     given = {key: value for key, value in changes.items() if value is not None}
-    return replace(field, manifest={**field.manifest, "encoder": {**field.manifest.get("encoder", {}), **given}})
+    encoder = {**(field.manifest.get("encoder") or {}), **given}
+    chosen = {} if vectors is None else {_CHOSEN: True}
+    return replace(field, manifest={**field.manifest, "encoder": encoder, **chosen})
 
 
 def encoder_of(field: SemanticField, device: str = "cpu", cache: Path | None = None) -> TextEncoder:
@@ -229,11 +237,46 @@ def encoder_of(field: SemanticField, device: str = "cpu", cache: Path | None = N
     Args:
         cache: folder in which to keep vectors of texts that a network has read.
     Raises:
-        ValueError: the manifest names none that this version knows.
+        ValueError: the manifest names none that this version knows, or other files of weights or text vectors are in
+            the place of those of the lift.
         FileNotFoundError: its weights, or its text vectors, are not there any more.
     """
-    texts = make_texts(_options(field), device)
+    options = _options(field)
+    if not field.manifest.get(_CHOSEN):
+        _check_files(field.manifest.get("features"), options)
+    texts = make_texts(options, device)
     return CachedTexts(texts, cache) if cache is not None and isinstance(texts, OpenClipEncoder) else texts
+
+
+def _check_files(features: object, options: SourceOptions) -> None:
+    """Makes sure that the files of the encoder have the content that they had in the lift, by its digests in the
+    manifest. All of them is read at every use: 0.1 s for weights of 600 MB, those of version 0.1 ten times as long.
+    """
+    remedy = (
+        "put the file of the lift back there; or give texts with vectors of the same network, --text-vectors; or lift "
+        "again with: ns-normlift"
+    )
+    texts = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
+    texts = texts if isinstance(texts, Mapping) else {}
+    if options.text_vectors is not None:
+        path, expected, found = options.text_vectors, texts.get("content"), ""
+        if not path.is_file():
+            raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
+        if isinstance(expected, str):
+            found = TextVectors(path).identity["content"]
+    elif options.encoder == "open_clip":
+        path, expected, found = Path(options.encoder_pretrained), texts.get("pretrained"), options.encoder_pretrained
+        if path.is_file():
+            found = file_digest(path, like=str(expected))
+        elif isinstance(expected, str) and expected.startswith(_OF_FILES):
+            raise FileNotFoundError(f"weight file {path}, with which the run was lifted, does not exist; {remedy}")
+    else:
+        return
+    if isinstance(expected, str) and found != expected:
+        raise InputError(
+            f"{path} is not what the run was lifted with, and would give other answers: its content is {found}, "
+            f"expected {expected}. {remedy[0].upper()}{remedy[1:]}"
+        )
 
 
 def _options(field: SemanticField) -> SourceOptions:

@@ -27,6 +27,7 @@ from normlift_ns.runs.files import (
     FIELD_FOLDER,
     TEXTS_FILE,
     cache_folder,
+    check_run,
     load_field,
     refuse_existing_run,
     run_directory,
@@ -89,8 +90,9 @@ def open_run(
     >>> answer["yellow"].objects[0].size > 20
     True
     """
-    device, scene = choose_device(device), open_scene(load_config, data=data)
     folder = Path(os.path.abspath(load_config)).parent
+    check_run(folder)  # before nerfstudio, which takes 20 s
+    device, scene = choose_device(device), open_scene(load_config, data=data)
     loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
     vectors = None if text_vectors is None else Path(text_vectors)
     return LiftedRun(folder, scene, with_texts(loaded, vectors=vectors, template=text_template), device)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from normlift_ns.asking import Answer, Finding, Question, answer, encoder_of, make_question
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.files import refuse_run_files
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.source import TextEncoder
@@ -139,9 +140,11 @@ class LiftedRun:
             overwrite: replace files of these names; without `objects`, an earlier table of them goes.
         Raises:
             FileExistsError: a file is there and `overwrite` is False.
-            ValueError: no Gaussian of the part is ever drawn; a mask of another type or length.
+            ValueError: no Gaussian of the part is ever drawn; a mask of another type or length; the name of a file of a
+                run.
         """
         path = Path(path)
+        refuse_run_files(*export_files(path), instead="name")
         for file in export_files(path)[: 2 if objects is None else 3]:
             if file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")

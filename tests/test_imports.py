@@ -34,7 +34,7 @@ FOREIGN = {
     "errors": set(),
     "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
-    "core": BASE | {"xxhash"},
+    "core": BASE | {"xxhash", "msgspec"},
     "raster": {"torch", "numpy", "jaxtyping", "numba", "gsplat"},
     "encoders": BASE | {"open_clip", "matplotlib", "skimage", "PIL", "huggingface_hub", "torchvision"},
     "observing": {"torch", "jaxtyping"},

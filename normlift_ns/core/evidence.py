@@ -21,6 +21,8 @@ from normlift_ns.errors import InputError
 _FORMAT = "normlift_ns.evidence/1"
 _COUNTS = ("num_views", "weight_power", "num_excluded")
 
+_MOST_VIEWS = 2**24
+
 UNLABELED, MASKED = -1, -2
 """Labels of pixels without a region, and of pixels that are no observation at all."""
 
@@ -313,6 +315,8 @@ class Evidence:
             region_view, counts = tensors["region_view"], [int(facts[name]) for name in _COUNTS]
             if region_view.ndim != 1 or region_view.dtype != torch.int32:
                 raise InputError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")
+            if not (0 <= counts[0] <= _MOST_VIEWS and counts[1] in (0, 1, 2) and 0 <= counts[2] <= len(rows)):
+                raise InputError(f"{', '.join(_COUNTS)} are {', '.join(map(str, counts))[:50]}, out of range")
             rows.check("weights of regions", len(region_view))
             unlabeled.check("weights of unlabelled pixels", counts[0])
             return Evidence(rows, region_view, unlabeled, *counts), digest

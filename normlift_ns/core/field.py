@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 import torch
@@ -57,6 +58,8 @@ class SemanticField:
     """What is known of the field: its storage (key `form`), sizes and bounds of all three ways (key `forms`),
     fingerprint of the means, provenance. JSON types only.
     """
+    means: Float[Tensor, "n 3"] | None = None
+    """Centres of the Gaussians, float32, as they were lifted; None in fields that version 0.1 wrote."""
 
     def __len__(self) -> int:
         return self.source.numel()
@@ -64,7 +67,8 @@ class SemanticField:
     def to(self, device: torch.device | str) -> SemanticField:
         """A copy on another device."""
         scalars = self.scalars.map(lambda x: x.to(device))
-        return SemanticField(scalars, self.source.to(device), self.store.to(device), self.manifest)
+        means = None if self.means is None else self.means.to(device)
+        return SemanticField(scalars, self.source.to(device), self.store.to(device), self.manifest, means)
 
     @property
     def dimension(self) -> int:
@@ -130,7 +134,8 @@ class SemanticField:
         }
         scalars = lifted.scalars.map(_single)
         identity = torch.arange(n, dtype=torch.int32, device=scalars.norm.device)
-        return SemanticField(scalars, identity if source is None else source.int(), store, manifest)
+        chosen = identity if source is None else source.int()
+        return SemanticField(scalars, chosen, store, manifest, means.detach().float())
 
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """True where a Gaussian has a direction: evidence of its own or, refined, that of the neighbour it copies."""
@@ -179,11 +184,15 @@ class SemanticField:
         rows = self.source.long()[rows] if refined else rows
         return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
 
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
+    def save(
+        self, folder: str | Path, *, overwrite: bool = False, beside: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         """Writes field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
 
         A folder with a manifest is complete. The manifest holds the digests of the files.
 
+        Args:
+            beside: digests of other files that belong to the field, by their paths from the folder.
         Raises:
             FileExistsError: the folder holds a field and `overwrite` is False.
             OSError: it cannot be written, for instance because the disk is full.
@@ -199,7 +208,7 @@ class SemanticField:
             digests[_EVIDENCE] = self.store.evidence.save(folder / _EVIDENCE)
         else:
             (folder / _EVIDENCE).unlink(missing_ok=True)
-        write_manifest(folder, self.manifest, digests)
+        write_manifest(folder, self.manifest, {**digests, **beside})
 
     @staticmethod
     def load(
@@ -216,8 +225,6 @@ class SemanticField:
         folder = Path(folder)
         manifest, digests = read_manifest(folder)
         try:
-            if means is not None:
-                _check_belongs(manifest, means, folder, checkpoint)
             tensors, _, digest = load_tensors(folder / _FIELD, undigested=(), remedy=REMEDY)
             found, evidence = {_FIELD: digest}, None
             if manifest["form"] == "evidence":
@@ -226,12 +233,14 @@ class SemanticField:
             _check_tensors(folder / _FIELD, tensors, manifest, evidence)
         except KeyError as error:
             raise InputError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
+        if means is not None:
+            _check_belongs(manifest, tensors.get("means"), means, folder, checkpoint)
         scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
         if evidence is not None:
             store = StoredEvidence(evidence, tensors["features"])
         else:
             store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
-        return SemanticField(scalars, tensors["source"], store, manifest)
+        return SemanticField(scalars, tensors["source"], store, manifest, tensors.get("means"))
 
 
 def fingerprint(means: Float[Tensor, "n 3"]) -> str:
@@ -245,6 +254,8 @@ def _single(values: Tensor) -> Tensor:
 
 def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
     yield "source", semantic_field.source
+    if semantic_field.means is not None:
+        yield "means", semantic_field.means
     for f in fields(Scalars):
         yield f.name, getattr(semantic_field.scalars, f.name)
     store = semantic_field.store
@@ -263,6 +274,8 @@ def _check_tensors(
     n, dimension = int(manifest["num_gaussians"]), int(manifest["dimension"])
     try:
         check_tensor("source", tensors["source"], torch.int32, (n,), 0, n - 1)
+        if "means" in tensors:  # a Gaussian that was never drawn may have any mean
+            check_tensor("means", tensors["means"].nan_to_num(), torch.float32, (n, 3), -LARGEST)
         for f in fields(Scalars):
             dtype = torch.int32 if f.name == "view_count" else torch.float32
             check_tensor(f.name, tensors[f.name], dtype, (n,), 0)
@@ -281,13 +294,20 @@ def _check_tensors(
         raise InputError(f"{path} is damaged: {error}; {REMEDY}") from error
 
 
-def _check_belongs(manifest: Mapping[str, Any], means: Tensor, folder: Path, checkpoint: str | Path) -> None:
+def _check_belongs(
+    manifest: Mapping[str, Any], stored: Tensor | None, means: Tensor, folder: Path, checkpoint: str | Path
+) -> None:
+    """Makes sure that a field is one of these means, bit for bit."""
     if manifest["num_gaussians"] != len(means):
         raise InputError(
             f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "
             f"{len(means)}; {REMEDY}"
         )
-    if manifest["means_fingerprint"] != fingerprint(means):
+    if stored is None:
+        same = manifest["means_fingerprint"] == fingerprint(means)
+    else:
+        same = torch.equal(stored.view(torch.int32), means.detach().float().contiguous().cpu().view(torch.int32))
+    if not same:
         raise InputError(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
             f"number, other means); {REMEDY}"

@@ -11,16 +11,20 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError
 
 from normlift_ns.core.disk.atomic import exchange, held, hold, release, rename_new
+from normlift_ns.errors import InputError
 
 _TEMPORARY, _JOURNAL = ".normlift-", ".journal"
+_RUN_FILES = {"config.yml", "dataparser_transforms.json", "splat.json", "transforms.json"}
+_RUN_FILES |= {"nerfstudio_models", "normlift"}
 _AGE = 86400
 """Seconds after which a temporary folder counts as left over where the system has no locks."""
 
@@ -33,7 +37,8 @@ class NotWrittenError(OSError):
 def new_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] = ()) -> Iterator[tuple[Path, ...]]:
     """Yields a draft of every path, all of one folder; when they are written, they take their places together.
 
-    Two processes that write the same paths at once never mix their files.
+    Two processes that write the same paths at once never mix their files. If this one dies between the first rename and
+    the last, the next that writes there completes them.
 
     Args:
         overwrite: replace what is there.
@@ -57,14 +62,8 @@ def new_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] = ()
         with held(folder):
             if not overwrite:
                 taken = next((path for path in paths if os.path.lexists(path)), None)
-            for draft, path in zip(drafts, paths):
-                if overwrite:
-                    os.replace(draft, path)
-                elif taken is None and not rename_new(draft, path):  # no process of ours put that there just now
-                    taken = path
             if taken is None:
-                for path in remove:
-                    path.unlink(missing_ok=True)
+                taken = _take_places(temporary, drafts, overwrite, remove)
         _flush_names(folder)
     if taken is not None:
         raise FileExistsError(f"{taken} exists; give another name, or allow to overwrite it")
@@ -113,13 +112,28 @@ def publish(draft: Path, path: Path, *, overwrite: bool = False) -> bool:
     return True
 
 
+def _take_places(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
+    """Renames drafts to their places; returns one that somebody else has taken meanwhile, if there is one."""
+    journal, folder = None, temporary.parent
+    if len(drafts) + len(remove) > 1:
+        clean(folder)  # an older export that was never completed must not be completed after this one
+        names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
+        journal = _write_journal(temporary, names | {"overwrite": overwrite})
+    for draft in drafts:
+        if overwrite:
+            os.replace(draft, folder / draft.name)
+        elif not rename_new(draft, folder / draft.name):  # no process of ours put that there just now
+            if journal is not None:
+                journal.unlink()
+            return folder / draft.name
+    for path in remove:
+        path.unlink(missing_ok=True)
+    return None
+
+
 def _replace_in_steps(draft: Path, path: Path) -> None:
     old, temporary = f"{path.name}.old", draft.parent
-    unfinished = temporary / f"{path.name}.json"  # by hand: the folder, which new_files would lock, is locked
-    unfinished.write_text(json.dumps({"place": path.name, "new": draft.name, "old": old}), "utf8")
-    _flush(temporary)
-    os.rename(unfinished, temporary / f"{path.name}{_JOURNAL}")
-    _flush_names(temporary)
+    _write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
     try:
         os.rename(path, temporary / old)
         os.rename(draft, path)
@@ -127,14 +141,32 @@ def _replace_in_steps(draft: Path, path: Path) -> None:
         _complete(temporary)
 
 
+def _write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
+    """By hand: `new_files` would lock the folder, which is locked."""
+    unfinished, journal = temporary / "steps.json", temporary / f"steps{_JOURNAL}"
+    unfinished.write_text(json.dumps(steps), "utf8")
+    _flush(temporary)
+    os.rename(unfinished, journal)
+    _flush_names(temporary)
+    return journal
+
+
 def _complete(temporary: Path) -> None:
     """Completes, or undoes, what a journal says is under way."""
     for journal in temporary.glob(f"*{_JOURNAL}"):
-        steps = json.loads(journal.read_text("utf8"))
-        place = temporary.parent / Path(steps["place"]).name
-        for name in (steps["new"], steps["old"]):
-            if not os.path.lexists(place) and (temporary / Path(name).name).exists():
-                os.rename(temporary / Path(name).name, place)
+        steps, folder = json.loads(journal.read_text("utf8")), temporary.parent
+        if "place" in steps:
+            place = folder / Path(steps["place"]).name
+            for name in (steps["new"], steps["old"]):
+                if not os.path.lexists(place) and (temporary / Path(name).name).exists():
+                    os.rename(temporary / Path(name).name, place)
+            continue
+        for name in (Path(name).name for name in steps["files"]):
+            if (temporary / name).exists() and (steps["overwrite"] or not os.path.lexists(folder / name)):
+                os.replace(temporary / name, folder / name)
+        for name in steps["remove"]:
+            (folder / Path(name).name).unlink(missing_ok=True)
+        journal.unlink()
 
 
 def clean(folder: Path) -> None:
@@ -226,7 +258,11 @@ def refuse_existing(*paths: Path, overwrite: bool, instead: str) -> None:
         instead: the flags that name another place.
     Raises:
         FileExistsError: one of the paths is there and `overwrite` is False.
+        ValueError: as `refuse_run_files`.
     """
+    refuse_run_files(*paths, instead=instead)
+    for folder in {path.parent for path in paths}:
+        clean(folder)
     for path in paths:
         if not overwrite and os.path.lexists(path):
             raise FileExistsError(f"{path} exists; give another {instead}, or --overwrite True.")
@@ -252,10 +288,24 @@ def numbered(path: Path) -> Iterator[Path]:
     yield from (path.with_name(f"{path.stem}_{number}{path.suffix}") for number in count(2))
 
 
-def free_path(path: Path) -> Path:
-    """The first of `numbered` paths that does not exist, claimed by an empty file that the caller replaces."""
-    for found in numbered(path):
-        with suppress(FileExistsError):
-            found.touch(exist_ok=False)
-            return found
-    raise AssertionError("numbers do not end")
+def refuse_run_files(*paths: Path, instead: str) -> None:
+    """Says, before anything is computed, that an output would take the place of a part of a run, asked or not.
+
+    A run is a folder with config.yml and nerfstudio_models/ in it; pictures, tables and exports beside these are fine.
+
+    Args:
+        instead: the flags that name another place.
+    Raises:
+        ValueError: one of the paths, followed through links, is that of a run's file, or in a folder of its files.
+
+    >>> refuse_run_files(Path("answers.json"), instead="--json")
+    """
+    for path in paths:
+        place = path.resolve()
+        for run in place.parents:
+            inside = place.relative_to(run).parts[0]
+            if inside in _RUN_FILES and (run / "config.yml").is_file() and (run / "nerfstudio_models").is_dir():
+                raise InputError(
+                    f"{path} is part of the run {run}, which it would destroy; give another {instead}, with or without "
+                    "--overwrite True"
+                )

@@ -1,25 +1,12 @@
-"""What weight files of all networks have in common: their identity, and errors of foreign libraries as one line."""
+"""What weight files of all networks have in common: their servers, and errors of foreign libraries as one line."""
 
 from __future__ import annotations
 
 import urllib.error
 import urllib.request
-from hashlib import blake2b
-from pathlib import Path
 
 _PROBE_SECONDS = 10
-_BLOCK = 2**24
 _LONGEST = 300
-
-
-def content_identity(*files: Path) -> str:
-    """Weight files by their content, wherever they lie."""
-    digest = blake2b(digest_size=16)
-    for file in files:
-        with file.open("rb") as stream:
-            while block := stream.read(_BLOCK):
-                digest.update(block)
-    return f"blake2b:{digest.hexdigest()}"
 
 
 def first_line(error: Exception) -> str:

@@ -25,7 +25,7 @@ from normlift_ns.nerfstudio_plugin.panel import Panel
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
-from normlift_ns.runs.files import with_paths
+from normlift_ns.runs.files import check_run, with_paths
 from normlift_ns.runs.question import load_question
 from normlift_ns.scenes.photographs import to_camera
 from normlift_ns.viewer.display import Display, draw
@@ -83,6 +83,7 @@ class NormLiftModel(SplatfactoModel):
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
             folder = self.config.semantics
+            check_run(folder.parent)
             self.attach(with_paths(SemanticField.load(folder, self.means), folder), load_question(folder))
         if self.on_cpu:
             compile_renderer()

@@ -24,7 +24,7 @@ from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
 from normlift_ns.nerfstudio_plugin.views import image_name
 from normlift_ns.options import LiftOptions, SourceOptions
-from normlift_ns.runs.files import FIELD_FOLDER, cache_folder
+from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, digests_beside, sealed
 from normlift_ns.runs.question import save_question
 from normlift_ns.scenes.checkpoint import numpy_numbers
 
@@ -135,13 +135,14 @@ def lift_trained(trainer: Trainer) -> Path:
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"
     result = lift_scene(scene, source, options.lift, cache_folder(path.parent), device=device, encoder=encoder)
     folder = trainer.base_dir / FIELD_FOLDER
-    result.field.save(folder, overwrite=True)
+    files = [scene.checkpoint_path, scene.location.run_dir / "dataparser_transforms.json"]
+    result.field.save(folder, overwrite=True, beside=digests_beside(folder, files))
     question = None
     if len(options.queries) > 0:
         question = make_question(result.field, source, options.queries)
         save_question(folder, question)
     trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
-    write_text(path, yaml.dump(trainer.config), overwrite=True)
+    write_text(path, sealed(yaml.dump(trainer.config)), overwrite=True)
     with trainer.train_lock:
         pipeline.model.attach(result.field, question)
     viewer: Any = trainer.viewer_state

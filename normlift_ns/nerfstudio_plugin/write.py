@@ -22,7 +22,7 @@ from normlift_ns.nerfstudio_plugin.config import set_data, skip_seed_points
 from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
 from normlift_ns.nerfstudio_plugin.splat_config import splat_config
-from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, refuse_existing_run, tidy
+from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, digests_beside, refuse_existing_run, sealed, tidy
 from normlift_ns.runs.question import save_question
 from normlift_ns.scenes.checkpoint import Checkpoint
 from normlift_ns.scenes.opening import SplatScene
@@ -66,17 +66,17 @@ def write_run(
             f"{source.checkpoint_path}; lift that again."
         )
     with draft_directory(run_dir) as folder:
-        _write_tensors(folder, source, field, question, texts)
         if isinstance(source, SplatScene):
             save_splat(folder, source)
             transform = {"transform": torch.eye(4)[:3].tolist(), "scale": 1.0}
         else:
             transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
         write_text(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
+        _write_tensors(folder, source, field, question, texts)
         for place in (run_dir,) if exact else numbered(run_dir):
             of_splat = isinstance(source, SplatScene)
             config = splat_config(source, place) if of_splat else _lifted_config(source, place)
-            write_text(folder / "config.yml", yaml.dump(config), overwrite=True)
+            write_text(folder / "config.yml", sealed(yaml.dump(config)), overwrite=True)
             if publish(folder, place, overwrite=overwrite and exact):
                 return place
     refuse_existing_run(run_dir, overwrite=False)  # another process was faster
@@ -108,14 +108,16 @@ def _write_tensors(
     question: Question | None,
     texts: Mapping[str, Tensor] | None,
 ) -> None:
-    field.save(folder / FIELD_FOLDER)
-    if question is not None:
-        save_question(folder / FIELD_FOLDER, question)
-    if texts:
-        write_text_vectors(folder / FIELD_FOLDER / TEXTS_FILE, texts)
     checkpoint = checkpoint_of(source) if isinstance(source, SplatScene) else _slim(source.checkpoint)
-    with new_file(folder / CHECKPOINT_FOLDER / f"step-{checkpoint['step']:09d}.ckpt") as draft:
+    path = folder / CHECKPOINT_FOLDER / f"step-{checkpoint['step']:09d}.ckpt"
+    with new_file(path) as draft:
         torch.save(checkpoint, draft)
+    inside = folder / FIELD_FOLDER
+    if texts:
+        write_text_vectors(inside / TEXTS_FILE, texts)
+    if question is not None:
+        save_question(inside, question)
+    field.save(inside, beside=digests_beside(inside, [path, inside / TEXTS_FILE, *folder.glob("*.json")]))
 
 
 def _slim(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -10,6 +12,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.core.disk.digests import file_digest, text_digest
+from normlift_ns.core.disk.manifest import BESIDE, MANIFEST, check_files
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean, refuse_existing
 from normlift_ns.errors import InputError
@@ -18,6 +22,8 @@ FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
 TEXTS_FILE = "texts.npz"
 """Texts with vectors of the user's own, in the folder of the field."""
+_SEAL = "# Lines below: "
+"""How a config.yml of ours begins; their digest follows."""
 
 
 def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> Path:
@@ -76,6 +82,42 @@ def with_paths(field: SemanticField, folder: Path) -> SemanticField:
     return replace(field, manifest={**field.manifest, "encoder": {**encoder, "text_vectors": path}})
 
 
+def check_run(run_dir: Path) -> None:
+    """Makes sure that the files of a lifted run are as they were written; warns where config.yml is not.
+
+    Raises:
+        ValueError: a file that is damaged, or of another run.
+    """
+    if not run_dir.exists():
+        clean(run_dir.parent)  # a lift that was killed while it replaced the run
+    _check_seal(run_dir / "config.yml")
+    if (run_dir / FIELD_FOLDER / MANIFEST).exists():
+        check_files(run_dir / FIELD_FOLDER)
+
+
+def digests_beside(folder: Path, files: Iterable[Path]) -> dict[str, str]:
+    """Digests of files of a run by their paths from the folder of its field; what is elsewhere, or absent, has none."""
+    names = {Path(os.path.relpath(file, folder)).as_posix(): file for file in files if file.is_file()}
+    return {name: file_digest(file) for name, file in names.items() if BESIDE.fullmatch(name)}
+
+
+def sealed(config: str) -> str:
+    """The text of a config.yml with its digest in a comment at its top, because people may edit it and should know."""
+    return f"{_SEAL}{text_digest(config)} (to change them without a warning, delete this line)\n{config}"
+
+
+def _check_seal(path: Path) -> None:
+    if not path.is_file():
+        return
+    first, _, rest = path.read_bytes().decode("utf8", "replace").replace("\r\n", "\n").partition("\n")
+    if first.startswith(_SEAL) and first != sealed(rest).partition("\n")[0]:
+        warnings.warn(
+            f"{path} is not as normlift_ns wrote it: it was edited, or is damaged. If you changed it, delete its first "
+            "line; otherwise copy it again from the whole run",
+            stacklevel=3,
+        )
+
+
 def tidy(run_dir: Path) -> None:
     """Completes and removes what lifts that were killed have left beside a run directory and in its cache."""
     for folder in (run_dir.parent, *cache_folder(run_dir).glob("*")):
@@ -83,5 +125,10 @@ def tidy(run_dir: Path) -> None:
 
 
 def refuse_existing_run(run_dir: Path, overwrite: bool) -> None:
-    """Raises FileExistsError if the directory is there and may not be replaced."""
+    """Raises FileExistsError if the directory is there and may not be replaced, or is no run."""
     refuse_existing(run_dir, overwrite=overwrite, instead="--timestamp or --output-dir")
+    if os.path.lexists(run_dir) and not (run_dir / "config.yml").is_file():
+        raise FileExistsError(
+            f"{run_dir} is no run (it has no config.yml), so that --overwrite does not replace it; give another "
+            "--timestamp or --output-dir, or remove it yourself"
+        )

@@ -5,7 +5,9 @@ A session is never changed: every action returns another one, with a message for
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +19,11 @@ from torch import Tensor
 
 from normlift_ns.asking import Answer, Question, answer, reselect
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.files import file_name, free_path
+from normlift_ns.core.files import file_name, numbered
 from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.runs.question import save_question
-from normlift_ns.runs.splats import write_splats
+from normlift_ns.runs.splats import export_files, write_splats
 from normlift_ns.viewer.display import COLORMAPS, PARTS, Colormap, Display, Part, make_display, selection
 from normlift_ns.viewer.status import clipped, report
 
@@ -143,14 +145,13 @@ class Session:
         texts = self.answer.texts
         name = file_name("_".join(texts) if self.shown is None else texts[self.shown])
         folder.mkdir(exist_ok=True)
-        path = free_path(folder / f"{name}.ply")
         how: dict[str, Any] = {"spherical_harmonics": spherical_harmonics, "rasterize_mode": rasterize_mode}
-        try:
-            rows = write_splats(path, parameters, self.field, self.answer, keep=chosen, overwrite=True, **how)
-        except BaseException:
-            path.unlink(missing_ok=True)  # the empty file that claims the name
-            raise
-        return f"{len(rows):,} Gaussians written to {path}"
+        for path in numbered(folder / f"{name}.ply"):
+            if not any(map(os.path.lexists, export_files(path))):
+                with suppress(FileExistsError):  # another process was faster
+                    rows = write_splats(path, parameters, self.field, self.answer, keep=chosen, **how)
+                    return f"{len(rows):,} Gaussians written to {path}"
+        raise AssertionError("numbers do not end")
 
     def save(self, folder: Path | None) -> str:
         """Stores the question in the folder of the field; returns a message.

@@ -312,7 +312,8 @@ def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
 
 
 def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
-    facts = {"schema_version": 1, "digest": "mine", "text": '"digest": ""', "deep": {"digest": "", "ü": [1e-05, None]}}
+    needed = {"schema_version": 1, "num_gaussians": 3, "dimension": 2, "means_fingerprint": "", "form": "float16"}
+    facts = {**needed, "digest": "mine", "text": '"digest": ""', "deep": {"digest": "", "ü": [1e-05, None]}}
     write_manifest(tmp_path, facts, {"a": "b"})
     assert read_manifest(tmp_path) == ({k: v for k, v in facts.items() if k != "digest"}, {"a": "b"})
     path = tmp_path / MANIFEST

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,6 @@ from normlift_ns.core.files import (
     clean,
     draft_directory,
     file_name,
-    free_path,
     new_file,
     new_files,
     numbered,
@@ -44,20 +45,6 @@ def test_a_text_never_leaves_its_folder(text: str, tmp_path: Path):
     assert len(path.name) <= 44
     path.write_text("")
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_free_path_leaves_what_exists_alone(tmp_path: Path):
-    path = tmp_path / "red.ply"
-    assert free_path(path) == path
-    path.touch()
-    assert free_path(path) == tmp_path / "red_2.ply"
-    (tmp_path / "red_2.ply").touch()
-    assert free_path(path) == tmp_path / "red_3.ply"
-
-
-def test_no_two_processes_get_the_same_free_path(tmp_path: Path):
-    found = together(8, lambda _: [free_path(tmp_path / "red.ply") for _ in range(10)])
-    assert len({path for paths in found for path in paths}) == 80 == len(list(tmp_path.iterdir()))
 
 
 def test_nothing_is_replaced_unasked(system: str, tmp_path: Path):
@@ -231,6 +218,55 @@ def test_a_killed_process_writes_no_half_file(tmp_path: Path):
     assert list(path.parent.iterdir()) == [path]  # the last one cleaned up after all others
 
 
+@pytest.mark.parametrize("overwrite", [True, False])
+def test_files_that_belong_together_are_completed_after_a_kill(overwrite: bool, tmp_path: Path):
+    """At every access to the disk: all are old, or all are new once the next process looks; none is of another turn."""
+    names, step, seen, gaps = ("a.ply", "a_rows.npy", "a_objects.json"), 0, [], 0
+    folder = tmp_path / "out"
+    paths = [folder / name for name in names]
+
+    def export(text: str) -> None:
+        written, gone = (paths[:2], paths[2:]) if overwrite else (paths, [])
+        with new_files(*written, overwrite=overwrite, remove=gone) as drafts:
+            for draft in drafts:
+                draft.write_text(text)
+
+    while True:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        if overwrite:
+            for path in paths:
+                write_text(path, "old")
+        step += 1
+        if not killed_at(step, lambda: export("new"), folder):
+            break
+        before = [path.read_text() for path in paths if path.exists()]
+        gaps += before not in (["old"] * 3, ["new"] * 2, ["new"] * 3, [])
+        with suppress(FileExistsError):
+            refuse_existing(*paths, overwrite=False, instead="--output-dir")  # as the next command does
+        after = [path.read_text() for path in paths if path.exists()]
+        assert after in ((["old"] * 3, ["new"] * 2) if overwrite else ([], ["new"] * 3))
+        seen.append("new" in after)
+        assert {path.name for path in folder.iterdir()} <= set(names)
+    assert seen == sorted(seen)
+    assert set(seen) == {True, False}
+    assert gaps > 0  # that is what the journal is for
+
+
+def test_an_export_that_was_never_completed_is_not_completed_over_a_later_one(tmp_path: Path):
+    paths = [tmp_path / "a", tmp_path / "b"]
+    left = tmp_path / ".normlift-dead"
+    left.mkdir()
+    (left / "b").write_text("older")
+    (left / "steps.journal").write_text('{"files": ["a", "b"], "remove": [], "overwrite": true}')
+    with new_files(*paths, overwrite=True) as drafts:
+        for draft in drafts:
+            draft.write_text("later")
+    clean(tmp_path)
+    assert [path.read_text() for path in paths] == ["later", "later"]
+    assert sorted(tmp_path.iterdir()) == paths
+
+
 def test_what_a_running_process_writes_is_left_alone(tmp_path: Path):
     begun = FORK.Event()
 
@@ -280,6 +316,12 @@ def test_a_journal_leads_nowhere_else(tmp_path: Path):
     (temporary / "x").mkdir(parents=True)
     (temporary / "a.journal").write_text('{"place": "../away", "new": "../../y", "old": "x"}')
     (temporary / "b.journal").write_text("[]")
+    other = tmp_path / "runs" / ".normlift-2"
+    other.mkdir()
+    (other / "y").write_text("")
+    (tmp_path / "kept").touch()
+    steps = '{"files": ["../../away", "../y"], "remove": ["../kept", "../../kept"], "overwrite": true}'
+    (other / "c.journal").write_text(steps)
     clean(tmp_path / "runs")
     assert not (tmp_path / "away").exists()
-    assert {p.name for p in tmp_path.iterdir()} == {"runs"}
+    assert {p.name for p in tmp_path.iterdir()} == {"runs", "kept"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from normlift_ns.asking import Question
 from normlift_ns.runs.question import load_question
 from normlift_ns.viewer.display import PARTS
 from normlift_ns.viewer.session import CLICKED, MOST_PROMPTS, Session, check_prompts, split_prompts
+from tests.processes import killed_at
 from tests.scenes import random_evidence, unit_rows
 
 N, D = 40, 6
@@ -88,8 +90,8 @@ def test_a_click_asks_for_what_is_similar(session: Session) -> None:
     assert message == "There is nothing with semantics where you clicked."
 
 
-def test_what_is_shown_is_exported_and_saved(session: Session, tmp_path: Path) -> None:
-    parameters = {
+def parameters_of(session: Session) -> dict[str, torch.Tensor]:
+    return {
         "means": session.means,
         "quats": torch.ones(N, 4),
         "scales": torch.zeros(N, 3),
@@ -97,6 +99,34 @@ def test_what_is_shown_is_exported_and_saved(session: Session, tmp_path: Path) -
         "features_dc": torch.zeros(N, 3),
         "features_rest": torch.zeros(N, 3, 3),
     }
+
+
+def test_a_killed_export_claims_no_name(session: Session, tmp_path: Path) -> None:
+    """At every access to the disk: no empty or lonely file is left once the next export has looked."""
+    parameters, asked, step = parameters_of(session), session.ask(BOTH).show(1, PARTS[0], "turbo"), 0
+    folder = tmp_path / "exports"
+
+    def export() -> str:
+        return asked.export(folder, parameters, spherical_harmonics=True, rasterize_mode="classic")
+
+    expected = None
+    while True:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        step += 1
+        if not killed_at(step, export, folder):
+            break
+        export()
+        found = {path.name: path.read_bytes() for path in folder.iterdir()}
+        expected = expected or found
+        numbers = [name[1:-4] for name in found if name.endswith(".ply")]
+        assert set(found) == {f"b{number}{end}" for number in numbers for end in (".ply", "_rows.npy")}
+        assert all(found[f"b{number}.ply"] == expected["b.ply"] for number in numbers)
+    assert step > 10
+
+
+def test_what_is_shown_is_exported_and_saved(session: Session, tmp_path: Path) -> None:
+    parameters = parameters_of(session)
     asked = session.ask(BOTH).show(1, PARTS[0], "turbo")
     for name in ("b", "b_2"):  # nothing is replaced
         message = asked.export(tmp_path, parameters, spherical_harmonics=True, rasterize_mode="antialiased")

@@ -36,15 +36,6 @@ class TensorFile(NamedTuple):
     """None: a file of version 0.1."""
 
 
-def text_digest(text: str) -> str:
-    """Digest of a text.
-
-    >>> text_digest("fox")
-    'xxh3_128:2acc0017ba959fe5c1cfee97854b92cf'
-    """
-    return f"xxh3_128:{xxh3_128(text.encode()).hexdigest()}"
-
-
 def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: str = "") -> str:
     """Digest of names, types, shapes and numbers of tensors, of the facts beside them, and of a key.
 
@@ -110,18 +101,19 @@ def load_tensors(
         FileNotFoundError: no such file.
         ValueError: another digest than the file names, or no safetensors file.
     """
+    if path.exists() and not path.is_file():  # a pipe would never end
+        raise InputError(f"{path} is no file; {remedy}")
     try:
         with safe_open(path, framework="pt") as file:
             facts = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is no mapping)
+        expected = facts.pop(_DIGEST, None)
+        digested = expected is not None or undigested is None or set(facts) != set(undigested)
+        found = tensor_digest(tensors, facts, key) if digested else None
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing; {remedy}") from None
     except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, UnicodeError) as error:
         raise InputError(f"{path} is damaged or no safetensors file ({error}); {remedy}") from error
-    if undigested is not None and set(facts) == set(undigested):
-        return TensorFile(tensors, facts, None)
-    expected = facts.pop(_DIGEST, None)
-    found = tensor_digest(tensors, facts, key)
     if found != expected:
         raise InputError(
             f"{path} is damaged: its content has digest {found}, expected {expected or 'one, but it names none'}; "

@@ -15,12 +15,12 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.disk.digests import file_digest
 from normlift_ns.encoders.batches import Batches
 from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
 from normlift_ns.encoders.clip.network import ClipNetwork, load_clip
 from normlift_ns.encoders.clip.weights import check_names, import_open_clip
 from normlift_ns.encoders.source import check_prompts
-from normlift_ns.encoders.weights import content_identity
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
 
@@ -124,7 +124,7 @@ class OpenClipEncoder:
     @cached_property
     def _weights_identity(self) -> str:
         path = Path(self.pretrained)
-        return content_identity(path) if path.is_file() else self.pretrained
+        return file_digest(path) if path.is_file() else self.pretrained
 
     @cached_property
     def network(self) -> ClipNetwork:

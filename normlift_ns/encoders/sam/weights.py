@@ -13,7 +13,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.weights import content_identity, first_line, probe
+from normlift_ns.core.disk.digests import file_digest
+from normlift_ns.encoders.weights import first_line, probe
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM
 
@@ -108,7 +109,7 @@ def sam_identity(checkpoint: str) -> str:
     path = Path(checkpoint)
     if not path.exists():
         return checkpoint
-    return content_identity(*(file for file in (path, path / "config.json", *_weights(path)) if file.is_file()))
+    return file_digest(*(file for file in (path, path / "config.json", *_weights(path)) if file.is_file()))
 
 
 def load_sam(checkpoint: str) -> Any:

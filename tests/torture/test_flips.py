@@ -1,0 +1,55 @@
+"""Flipped bits in all that is written for runs and their caches: noticed, or harmless."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.torture.conftest import Record, Server
+from tests.torture.test_kills import Place
+
+pytestmark = pytest.mark.slow
+
+FLIPS = 1000
+TRANSFORMS = "dataparser_transforms.json"
+KINDS = {
+    ".cache/evidence",
+    ".cache/features",
+    ".cache/regions",
+    ".cache/texts",
+    "config.yml",
+    "dataparser_transforms.json",
+    "nerfstudio_models/*.ckpt",
+    "normlift/field.safetensors",
+    "normlift/manifest.json",
+    "normlift/queries.safetensors",
+    "normlift/texts.npz",
+    "splat.json",
+    "transforms.json",
+}
+
+
+def test_flipped_bits_are_noticed_or_harmless(server: Server, tmp_path: Path, record: Record) -> None:
+    """Half of the runs came from a nerfstudio run, half from a PLY file, one has texts of its own."""
+    place = Place(server, tmp_path)
+    server.command(*place.lift("--timestamp", "one", "--queries", "red", "--k", 6))
+    splat = ("export", "--load-config", place.config, "--output-dir", place.folder / "out")
+    server.command(*splat)
+    cameras = ("--transforms", place.folder / "room", "--world-transform", place.trained.parent / TRANSFORMS)
+    common = ("--encoder", "colour", "--check", False, "--device", "cpu", "--k", 6, "--storage", "evidence")
+    output = ("--timestamp", "ply", "--output-dir", place.folder / "outputs")
+    server.command("lift", "--load-ply", place.folder / "out" / "splat.ply", *cameras, *common, *output)
+    result = tmp_path / "flips.json"
+    server.command("flips", place.folder, 0, FLIPS, result)
+    found: dict[str, dict[str, int]] = json.loads(result.read_text())
+    outcomes = sum((Counter(counts) for counts in found.values()), Counter())
+    assert outcomes.total() == FLIPS
+    assert set(outcomes) <= {"noticed", "harmless"}, found
+    assert set(found) >= KINDS
+    assert outcomes["noticed"] > 0.9 * FLIPS, found
+    for kind, counts in sorted(found.items()):
+        record(f"one flipped bit, `{kind}`", sum(counts.values()), f"{counts.get('noticed', 0)} noticed, "
+               f"{counts.get('harmless', 0)} harmless")  # fmt: skip
