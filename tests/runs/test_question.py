@@ -18,7 +18,7 @@ WHOLE = Question(
 @pytest.mark.parametrize("question", [WHOLE, Question(("a",), torch.eye(3)[:1])])
 def test_what_is_stored_is_loaded(question: Question, tmp_path: Path) -> None:
     assert load_question(tmp_path) is None
-    save_question(tmp_path, Question(("old",), torch.zeros(1, 3)))
+    save_question(tmp_path, Question(("old",), torch.ones(1, 3)))
     save_question(tmp_path, question)
     loaded = load_question(tmp_path)
     assert loaded is not None
