@@ -27,7 +27,6 @@ from normlift_ns.observing import BLOCK, block_evidence, observe_views, spread
 from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.stages import Report, Stages, cost
 
-
 _FEW = 0.01
 """Share of Gaussians with features below which something is wrong, or nearly nothing was labelled."""
 

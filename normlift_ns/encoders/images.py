@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
 
 
 def read_pixels(
-    path: Path, mode: str | None = None, *, what: str = "image", formats: Sequence[str] = _FORMATS
+    path: Path, mode: str | None = None, *, what: str = "image", formats: tuple[str, ...] = _FORMATS
 ) -> np.ndarray:
     """The decoded pixels of a picture file, [H, W] or [H, W, channels], in a Pillow mode or as stored; raises as
     `read_image`.
@@ -47,14 +47,14 @@ def read_pixels(
         return np.array(picture if mode is None else picture.convert(mode))
 
 
-def read_size(path: Path, *, what: str = "image", formats: Sequence[str] = _FORMATS) -> tuple[int, int]:
+def read_size(path: Path, *, what: str = "image", formats: tuple[str, ...] = _FORMATS) -> tuple[int, int]:
     """Width and height of a picture file, whose pixels are not decoded; arguments and errors as in `read_pixels`."""
     with _opened(path, what, formats) as picture:
         return picture.size
 
 
 @contextmanager
-def _opened(path: Path, what: str, formats: Sequence[str]) -> Iterator[Image.Image]:
+def _opened(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Image.Image]:
     """A picture file whose size is not absurd; what is done with it may raise as Pillow does."""
     if not os.path.isfile(path):
         if os.path.lexists(path):

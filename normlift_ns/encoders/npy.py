@@ -18,7 +18,7 @@ _MAGIC = b"\x93NUMPY"
 _LONGEST_HEADER = 4096
 """Bytes; those of arrays of numbers have 118."""
 _KINDS = "biuf"
-"""Booleans, integers and floats."""
+"""Booleans, integers and floats, of 64 bits at most."""
 
 
 class _Header(NamedTuple):
@@ -77,7 +77,7 @@ def read_header(file: IO[bytes]) -> _Header:
         raise
     except (ValueError, TypeError, KeyError, IndexError, SyntaxError, MemoryError, RecursionError) as error:
         raise InputError(f"its header cannot be read: {type(error).__name__}") from None
-    if dtype.kind not in _KINDS or dtype.names is not None or dtype.subdtype is not None:
+    if dtype.kind not in _KINDS or dtype.itemsize > 8:
         kind = "objects" if dtype.hasobject else str(dtype)
         raise InputError(f"it holds {kind}; expected an integer type or floats")
     if not all(type(length) is int and length >= 0 for length in shape) or len(shape) > 8:
@@ -98,4 +98,5 @@ def read_array(data: bytes) -> np.ndarray:
     file = io.BytesIO(data)
     header = read_header(file)
     check_size(header, len(data) - file.tell())
-    return np.frombuffer(data, header.dtype, offset=file.tell()).reshape(header.shape, order=header.order)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    values = np.frombuffer(data, header.dtype, offset=file.tell()).astype(header.dtype.newbyteorder("="))
+    return values.reshape(header.shape, order=header.order)  # pyright: ignore[reportArgumentType, reportCallIssue]

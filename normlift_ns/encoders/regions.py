@@ -201,6 +201,7 @@ class LabelFiles:
             )
         if found.ndim not in (2, 3) or found.size == 0:
             raise InputError(f"{self.what} {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
+        found = found.astype(np.uint8) if found.dtype == bool else found
         return found.reshape(-1, *found.shape[-2:])
 
 

@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 _PROBE_SECONDS = 10
 _BLOCK = 2**24
 _LONGEST = 300
-_CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin", "model.safetensors")
+_CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
 """Names that the hub's repositories give the weights of OpenCLIP models."""
 _SAM_FILES = ("model.safetensors", "pytorch_model.bin")
 FOREIGN_ERRORS = (
@@ -29,8 +29,8 @@ FOREIGN_ERRORS = (
     ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
     SafetensorError,
 )  # fmt: skip
-"""What torch, safetensors, open_clip, transformers and the hub's client raise where a file or a name does not suit them.
-Not among them: a full memory."""
+"""What torch, safetensors, open_clip and transformers raise where a file or a name is not what they
+expect. Not among them: a full memory."""
 
 
 def clip_weights_at_hand(model: str, pretrained: str) -> bool | None:
@@ -43,7 +43,7 @@ def clip_weights_at_hand(model: str, pretrained: str) -> bool | None:
     if os.path.isfile(pretrained):
         return True
     repository = _published(model, pretrained)
-    if repository is None:
+    if not repository:
         return None
     owner_and_name, _, file = repository.rpartition("/")
     return any(is_cached(owner_and_name, name) for name in ([file] if file else _CLIP_FILES))
@@ -69,9 +69,10 @@ def is_cached(repository: str, file: str) -> bool:
 def _published(model: str, tag: str) -> str | None:
     """Where the hub has weights, "OWNER/NAME/" or "OWNER/NAME/FILE", from the table in the source of open_clip, which
     takes seconds to import; None: nowhere, or the table looks different from what is expected."""
-    spec = find_spec("open_clip")  # does not import it
     try:
-        source = Path((spec and spec.submodule_search_locations or [""])[0], "pretrained.py").read_text("utf8")
+        spec = find_spec("open_clip")  # does not import it
+        assert spec is not None and spec.origin is not None
+        source = Path(spec.origin).with_name("pretrained.py").read_text("utf8")
         tables = {
             node.targets[0].id: node.value
             for node in ast.parse(source).body

@@ -11,8 +11,8 @@ import msgspec
 
 from normlift_ns.errors import InputError
 
-Name = Annotated[str, msgspec.Meta(pattern=r"\S")]
-"""A text that can be asked."""
+Name = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*\S")]
+"""A text that can be asked: not blank, and without halves of characters."""
 _LARGEST = 2**26
 """Bytes; label files have some thousands."""
 T = TypeVar("T")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import msgspec
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.documents import Name, read_document
-
 
 _Point = tuple[float, float]
 

@@ -94,6 +94,8 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
         for file, name in found.items():
             camera = cameras[name]
             frame = read_frame(file, camera.width, camera.height)
+            if len(frame.masks) == 0:
+                continue
             scores = _frame_scores(lifted, camera, frame, options)
             rows += [
                 {"scene": folder.name, **row, "frame": f"{folder.name}/{frame.stem}"}

@@ -63,9 +63,9 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
         )
     try:
         found = read_column(path, "label")
-        whole = found.astype(np.int64) if np.isfinite(found).all() and np.abs(found.astype(float)).max() < 2**31 else None
-        if whole is None or (whole != found).any():
-            raise InputError("its labels are no whole numbers")
+        whole = np.nan_to_num(found.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
+        if (whole != found).any():
+            raise InputError("its labels are no whole numbers of 32 bits")
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path} is damaged or no PLY file with vertices and their labels ({error}); the file "
@@ -73,12 +73,14 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
         ) from error
     known = np.isin(whole, list(NYU40))
     if not known.any():
-        raise InputError(f"{path}: no label is one of the NYU40 ids {', '.join(map(str, NYU40))}; nothing can be scored")
+        raise InputError(
+            f"{path}: no label is one of the NYU40 ids {', '.join(map(str, NYU40))}; nothing can be scored"
+        )
     strange = (whole > _LAST_ID) | (whole < -1)
     if strange.any():
         warnings.warn(
-            f"{path}: {int(strange.sum()):,} of {len(whole):,} labels are no NYU40 ids ({whole[strange][0]} among them); "
-            "they count as unlabelled",
+            f"{path}: {int(strange.sum()):,} of {len(whole):,} labels are no NYU40 ids ({whole[strange][0]} among "
+            "them); they count as unlabelled",
             stacklevel=2,
         )
     return torch.from_numpy(np.where(strange, 0, whole))

@@ -11,9 +11,9 @@ from normlift_ns.errors import InputError
 
 _LONGEST_HEADER = 2**16
 _TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4",
-    "float64": "f8",
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
@@ -37,9 +37,11 @@ def read_column(path: Path, name: str) -> np.ndarray:
             raise InputError(f"its vertices have no property {name} (found {', '.join(table.names or ['none'])})")
         size, least = os.fstat(file.fileno()).st_size - body, table.itemsize
         if encoding == "ascii":
-            least = 2 * len(table)  # a digit, and what parts it from the next one
+            least = 2 * len(table.names or ())  # a digit, and what parts it from the next one
         if not 0 < count <= (size + 1) // least:
-            raise InputError(f"its header names {count:,} vertices, for which its {size:,} bytes are too few or too many")
+            raise InputError(
+                f"its header names {count:,} vertices, for which its {size:,} bytes are too few or too many"
+            )
         file.seek(body)
         if encoding != "ascii":
             return np.fromfile(file, table, count)[name]

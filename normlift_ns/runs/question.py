@@ -98,13 +98,13 @@ def _question(stored: str, tensors: dict[str, Tensor]) -> Question:
         raise InputError(f"it holds {', '.join(sorted(tensors)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
     negative = tensors.get("negative_vectors")
     if (negative is None) != (len(facts.negatives) == 0):
-        raise InputError(f"{len(facts.negatives)} negatives, {'no' if negative is None else len(negative)} vectors")
+        raise InputError(f"{len(facts.negatives)} negatives, {'no' if negative is None else 'some'} vectors of them")
     if facts.form != "cosine" and negative is None:
         raise InputError(f"rule {facts.form!r} compares with negatives, and there are none")
     size = tensors["vectors"].shape[-1] if tensors["vectors"].ndim > 0 else 0
-    for name, vectors, texts in (("vectors", tensors["vectors"], facts.texts), (_VECTORS[1], negative, facts.negatives)):
-        if vectors is not None:
-            _check_vectors(name, vectors, texts, size)
+    _check_vectors("vectors", tensors["vectors"], facts.texts, size)
+    if negative is not None:
+        _check_vectors("negative_vectors", negative, facts.negatives, size)
     return Question(
         facts.texts, tensors["vectors"], facts.negatives, negative, facts.form, facts.threshold,
         facts.min_reliability, facts.refined,

@@ -436,7 +436,10 @@ def test_text_vectors_are_looked_up_and_normalised(tmp_path):
     ("write", "message"),
     [
         (lambda p: p.write_bytes(b"PK no archive"), "damaged or no NPZ file"),
-        (lambda p: np.savez(p, a=np.array([{}], dtype=object)), "damaged or no NPZ file .*of 'a' is none: it holds objects"),
+        (
+            lambda p: np.savez(p, a=np.array([{}], dtype=object)),
+            "damaged or no NPZ file .*of 'a' is none: it holds objects",
+        ),
         (lambda p: np.savez(p, a=np.ones(4), b=np.ones(5)), "the same D for every text"),
         (lambda p: np.savez(p, a=np.ones((2, 4))), r"array of 'a' is float64 \(2, 4\)"),
         (lambda p: np.savez(p, a=np.ones(4, int)), r"array of 'a' is int64 \(4,\)"),
