@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, View
 from normlift_ns.encoders import LangSplat, RegionFeatures
@@ -23,6 +24,8 @@ from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
 from normlift_ns.lifting import Export, lift_scene
+from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.viewer.pictures import picture_names, save_overlay, save_overlays, training_cameras
 from tests.scenes import generator
 
@@ -81,9 +84,7 @@ FULL = np.ones((HEIGHT, WIDTH), int)
 @pytest.mark.parametrize("value", [0, -1, -5])
 def test_nothing_labelled_is_refused(value: int, unlabeled: str, tmp_path: Path) -> None:
     source = files(tmp_path / "maps", value * FULL)
-    with pytest.raises(
-        InputError, match=r"nothing was labelled: .* 30 Gaussians .*files in .*maps.*regions-background"
-    ):
+    with pytest.raises(InputError, match=r"nothing was labelled: .* 30 Gaussians .*files in .*maps.*--regions-back"):
         lifted(source, tmp_path / "cache", unlabeled=unlabeled)
 
 
@@ -98,7 +99,7 @@ def test_a_scene_that_no_camera_sees_is_refused(tmp_path: Path) -> None:
     made.gaussians = GaussianScene(
         made.gaussians.means - 100, made.gaussians.quats, made.gaussians.scales, made.gaussians.opacities
     )
-    with pytest.raises(InputError, match="nothing was labelled: .*cameras do not see the scene"):
+    with pytest.raises(InputError, match=r"nothing was labelled: .*cameras do not see the scene"):
         lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
 
 
@@ -182,6 +183,15 @@ def test_maps_of_distorted_photographs_are_refused(
         lifted(source(False), tmp_path / "cache", scene(original=RAW))
     with pytest.warns(UserWarning, match=message + ".*it is stretched"):
         lifted(source(True), tmp_path / "cache", scene(original=RAW))
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.01])
+def test_photographs_say_whether_they_were_undistorted(k1: float, tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    intrinsics = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30, k1)
+    view = PhotographViews([Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], intrinsics)], torch.zeros(3))[0]
+    assert view.original == (None if k1 == 0 else (40, 30))
+    assert (view.camera.width, view.camera.height) == ((40, 30) if k1 == 0 else (39, 29))
 
 
 @pytest.mark.parametrize("kind", ["langsplat", "files"])

@@ -29,7 +29,7 @@ FOREIGN_ERRORS = (
     ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
     SafetensorError,
 )  # fmt: skip
-"""What torch, safetensors, open_clip and transformers raise where a file or a name is not what they
+"""What torch, safetensors and open_clip raise where a file or a name is not what they
 expect. Not among them: a full memory."""
 
 

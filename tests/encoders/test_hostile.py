@@ -105,7 +105,7 @@ def test_damaged_files_raise_our_errors_only(kind: str, examples: int, tmp_path:
 
 @pytest.mark.parametrize("kind", LOADERS)
 def test_what_is_no_file_raises_our_errors_only(kind: str, tmp_path: Path) -> None:
-    name, whole, loader, others = LOADERS[kind]
+    name, _, loader, others = LOADERS[kind]
     for other, content in others.items():
         (tmp_path / other).write_bytes(content)
     for what in no_files(tmp_path / name):

@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from normlift_ns.encoders.weights import FOREIGN_ERRORS, content_identity, first_line, probe
+from normlift_ns.encoders.weights import content_identity, first_line, probe
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM
 
@@ -130,7 +130,9 @@ def load_sam(checkpoint: str) -> Any:
         with torch.device("meta"):
             model = import_transformers().SamModel(config)
         model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
-    except FOREIGN_ERRORS as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # the configs of transformers raise types of their own for a wrong value
         raise InputError(f"SAM checkpoint {path} is damaged or not of SAM ({first_line(error)}); {REMEDY}") from None
     return model.eval().requires_grad_(False)
 
