@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,11 +20,15 @@ from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import refine, unsupported
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.encoders.cache import cached
-from normlift_ns.encoders.langsplat.source import write_langsplat
+from normlift_ns.encoders.langsplat.source import refuse_equal_stems, write_langsplat
 from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.errors import InputError
 from normlift_ns.observing import BLOCK, block_evidence, observe_views, spread
 from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.stages import Report, Stages, cost
+
+_FEW = 0.01
+"""Share of Gaussians with features below which something is wrong, or nearly nothing was labelled."""
 
 
 class Export(NamedTuple):
@@ -63,6 +68,7 @@ def lift_scene(
         report: told of the progress.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option that does not fit; the message names it.
+            Nothing that is labelled at all.
         MemoryError: the GPU's memory does not hold the lift.
     """
     stages = Stages(report)
@@ -70,9 +76,12 @@ def lift_scene(
     names = set(source.available(views.names))
     usable = [index for index, name in enumerate(views.names) if name in names]
     used = [usable[i] for i in spread(len(usable), options.max_views)]
+    if export is not None:
+        refuse_equal_stems([views.names[index] for index in used])
     evidence, features = _observe(scene, gaussians, used, source, options, cache, export, stages)
     with stages("lift") as step:
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+        _check_seen(evidence, lifted.scalars, source)
         step()
     counts = {"views": len(used), "left_out": len(views) - len(usable), "excluded": evidence.num_excluded}
     copied, shares = _vote(gaussians, lifted, options.vote, stages) if options.refine else (None, {})
@@ -89,6 +98,39 @@ def lift_scene(
         built = SemanticField.build(lifted, gaussians.means, copied, provenance=provenance, **rule)
         step()
     return LiftResult(built, stages.seconds)
+
+
+def _check_seen(evidence: Evidence, scalars: Scalars, source: FeatureSource) -> None:
+    """A lift that tells nothing is none.
+
+    Raises:
+        ValueError: no Gaussian has a direction.
+    """
+    found, total = int((scalars.norm > 0).sum()), scalars.norm.numel()
+    if found == 0 and evidence.rows.column.numel() == 0:
+        raise InputError(
+            f"nothing was labelled: no pixel that any of the {total:,} Gaussians is seen in belongs to a region (of "
+            f"{_named(source)}). Likely causes: every value in the label maps is the background (--regions-background)"
+            " or negative, the level has no regions (--level), masks leave nothing, or the cameras do not see the scene"
+        )
+    if found == 0:
+        raise InputError(
+            f"none of the {total:,} Gaussians got a direction, though regions were seen (of {_named(source)}): their "
+            "features cancel in every Gaussian, or unlabelled pixels outweigh them (--unlabeled dilute)"
+        )
+    if found < _FEW * total:
+        warnings.warn(
+            f"only {found:,} of {total:,} Gaussians ({found / total:.2%}) are seen in labelled pixels; the others have "
+            f"no features. If that is not meant, check the regions (of {_named(source)}) and the cameras",
+            stacklevel=2,
+        )
+
+
+def _named(source: FeatureSource) -> str:
+    """Where regions come from, for a message."""
+    regions = getattr(source, "regions", source)
+    kind, folder = regions.identity.get("kind", "your own source"), getattr(regions, "folder", None)
+    return str(kind) if folder is None else f"{kind} in {folder}"
 
 
 def _observe(

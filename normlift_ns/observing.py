@@ -18,6 +18,8 @@ from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.encoders.source import FeatureSource, each_view
+from normlift_ns.encoders.undistorted import check_undistorted
+from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.rasterize import rasterize_evidence, render_picture
 from normlift_ns.raster.settings import RasterSettings
@@ -65,6 +67,9 @@ def observe_views(
         rendered: look at the trained scene rendered from the cameras instead of at the photographs.
         divisor: of the size of images and cameras.
         done: called after every view, with the view as the source saw it.
+    Raises:
+        ValueError, FileNotFoundError: what `FeatureSource.view` and `check_undistorted` raise; an image, a mask or
+            labels of another size than the camera.
     """
     waiting: deque[View] = deque()
 
@@ -72,18 +77,35 @@ def observe_views(
         for index in indices:
             view = scene.train[index]
             view = view._replace(image=render_picture(scene, view.camera)) if rendered else view
+            _check_sizes(view)
             waiting.append(_smaller(view, divisor) if divisor > 1 else view)
+            check_undistorted(source, view, waiting[-1])
             yield waiting[-1].image, view.name
 
     block = Block([], [], [], [])
     for found in each_view(source, images()):
         view = waiting.popleft()
+        if found.labels.shape != view.image.shape[:2]:
+            raise InputError(
+                f"labels of {view.name} are {tuple(found.labels.shape)}, but the image is {tuple(view.image.shape[:2])}"
+                " (height x width); a source of features must label every pixel"
+            )
         block.cameras.append(view.camera)
         block.labels.append(found.labels if view.mask is None else found.labels.where(view.mask, MASKED))
         block.regions.append(found.region_of_cell)
         block.features.append(found.features)
         done(view)
     return block
+
+
+def _check_sizes(view: View) -> None:
+    expected = (view.camera.height, view.camera.width)
+    for what, found in (("image", view.image.shape[:2]), ("mask", expected if view.mask is None else view.mask.shape)):
+        if tuple(found) != expected:
+            raise InputError(
+                f"the {what} of {view.name} is {tuple(found)}, but its camera {expected} (height x width); both must "
+                "be undistorted alike"
+            )
 
 
 def block_evidence(

@@ -31,6 +31,8 @@ class View(NamedTuple):
     """True where the pixel counts; None: everywhere."""
     name: str
     """Image file relative to the dataset, with forward slashes."""
+    original: tuple[int, int] | None = None
+    """Width and height of the photograph before it was undistorted; None: it was not."""
 
 
 @runtime_checkable

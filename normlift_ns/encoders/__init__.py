@@ -1,25 +1,45 @@
-"""2D semantics of images and texts in one space: `FeatureSource` is the protocol, `make_source` builds one."""
+"""2D semantics of images and texts in one space: `FeatureSource` is the protocol, `make_source` builds one.
 
-from normlift_ns.encoders.build import SourceOptions, make_encoder, make_regions, make_source, make_texts
-from normlift_ns.encoders.cache import cached
-from normlift_ns.encoders.images import read_image
-from normlift_ns.encoders.langsplat.source import LangSplat, write_langsplat
-from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder, ViewFeatures
+Names are loaded on first use, so that `encoders.weights` can be asked without torch.
+"""
 
-__all__ = [
-    "Encoder",
-    "FeatureSource",
-    "LangSplat",
-    "RegionFeatures",
-    "Regions",
-    "SourceOptions",
-    "TextEncoder",
-    "ViewFeatures",
-    "cached",
-    "make_encoder",
-    "make_regions",
-    "make_source",
-    "make_texts",
-    "read_image",
-    "write_langsplat",
-]
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from normlift_ns.encoders.build import SourceOptions as SourceOptions
+    from normlift_ns.encoders.build import make_encoder as make_encoder
+    from normlift_ns.encoders.build import make_regions as make_regions
+    from normlift_ns.encoders.build import make_source as make_source
+    from normlift_ns.encoders.build import make_texts as make_texts
+    from normlift_ns.encoders.cache import cached as cached
+    from normlift_ns.encoders.images import read_image as read_image
+    from normlift_ns.encoders.langsplat.source import LangSplat as LangSplat
+    from normlift_ns.encoders.langsplat.source import write_langsplat as write_langsplat
+    from normlift_ns.encoders.source import Encoder as Encoder
+    from normlift_ns.encoders.source import FeatureSource as FeatureSource
+    from normlift_ns.encoders.source import RegionFeatures as RegionFeatures
+    from normlift_ns.encoders.source import Regions as Regions
+    from normlift_ns.encoders.source import TextEncoder as TextEncoder
+    from normlift_ns.encoders.source import ViewFeatures as ViewFeatures
+
+_HOMES = {
+    "build": ("SourceOptions", "make_encoder", "make_regions", "make_source", "make_texts"),
+    "cache": ("cached",),
+    "images": ("read_image",),
+    "langsplat.source": ("LangSplat", "write_langsplat"),
+    "source": ("Encoder", "FeatureSource", "RegionFeatures", "Regions", "TextEncoder", "ViewFeatures"),
+}
+"""Modules by the names that they define."""
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = list(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'normlift_ns.encoders' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"normlift_ns.encoders.{_HOME[name]}"), name)
+    return value

@@ -7,10 +7,12 @@ damaged, or stands under the name of another, is computed again. The folders may
 from __future__ import annotations
 
 import json
+import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,15 @@ from torch import Tensor
 from normlift_ns.core.disk.tensors import load_tensors, save_tensors
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
-from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, ViewFeatures, check_prompts
+from normlift_ns.encoders.source import (
+    UNIT_TOLERANCE,
+    Encoder,
+    FeatureSource,
+    RegionFeatures,
+    Regions,
+    ViewFeatures,
+    check_prompts,
+)
 
 _FORMAT = "normlift_ns.encoders/2"
 """Part of every key: to be raised when labels or features change for the same settings."""
@@ -69,7 +79,7 @@ class CachedRegions:
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
-        found = _read(path, "labels")
+        found = _read(path, "labels", lambda labels: _are_labels(labels, image))
         if found is None:
             found = self.regions.labels(image, name)
             _write(path, "labels", found.to(torch.int16) if int(found.max()) < 2**15 else found)
@@ -108,7 +118,8 @@ class CachedEncoder:
         def new() -> Iterator[tuple[Tensor, Tensor]]:
             for image, labels in views:
                 path = self.path(image, labels)
-                kept.append(_read(path, "features"))
+                count = int(labels.max()) + 1 if labels.numel() > 0 else 0
+                kept.append(_read(path, "features", partial(_are_units, count=count)))
                 if kept[-1] is None:
                     paths.append(path)
                     yield image, labels
@@ -148,11 +159,12 @@ class CachedPatches:
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         path = _path(self.folder, self.identity, *_parts(image))
-        found = _read(path, "features")
+        labels = self.source.labels(image)
+        found = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
         if found is None:
             found = self.source.features(image, name)
             _write(path, "features", found)
-        return ViewFeatures(self.source.labels(image), found)
+        return ViewFeatures(labels, found)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.source.text(prompts)
@@ -177,7 +189,7 @@ class CachedTexts:
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
         paths = {prompt: _path(self.folder, self.encoder.text_identity, prompt.encode()) for prompt in prompts}
-        rows = {prompt: _read(path, "text") for prompt, path in paths.items()}
+        rows = {prompt: _read(path, "text", _are_units) for prompt, path in paths.items()}
         new = [prompt for prompt, row in rows.items() if row is None]
         for prompt, row in zip(new, self.encoder.text(new) if len(new) > 0 else []):
             rows[prompt] = row
@@ -199,12 +211,26 @@ def _path(folder: Path, identity: dict[str, Any], *content: bytes) -> Path:
     return folder / f"{key}.safetensors"
 
 
-def _read(path: Path, name: str) -> Tensor | None:
-    """What was kept; None also where the file is damaged, or is that of another image."""
+def _read(path: Path, name: str, fits: Callable[[Tensor], bool]) -> Tensor | None:
+    """What was kept; None also where the file is damaged, is that of another image, or holds what does not fit."""
     try:
-        return load_tensors(path, key=path.stem).tensors[name]
+        found = load_tensors(path, key=path.stem).tensors[name] if os.path.isfile(path) else None
     except (FileNotFoundError, ValueError, KeyError):
         return None
+    return found if found is not None and fits(found) else None
+
+
+def _are_labels(found: Tensor, image: Tensor) -> bool:
+    fitting = found.dtype in (torch.int16, torch.int32) and found.ndim == 4 and found.shape[2:] == image.shape[:2]
+    return fitting and found.numel() > 0 and int(found.min()) >= -1
+
+
+def _are_units(found: Tensor, count: int | None = None) -> bool:
+    """Unit rows, `count` of them, or one vector."""
+    if found.dtype != torch.float32 or found.ndim != (1 if count is None else 2) or found.shape[-1] == 0:
+        return False
+    length = torch.linalg.vector_norm(found, dim=-1)
+    return (count is None or len(found) == count) and bool(((length - 1).abs() < UNIT_TOLERANCE).all())
 
 
 def _write(path: Path, name: str, tensor: Tensor) -> None:

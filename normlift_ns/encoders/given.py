@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from normlift_ns.encoders.source import ViewFeatures, check_prompts
+from normlift_ns.encoders.source import ViewFeatures, check_prompts, unit_rows
 from normlift_ns.encoders.text_vectors import look_up
 from normlift_ns.errors import InputError
 
@@ -79,7 +78,7 @@ class GivenFeatures:
                 f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
                 "width, undistorted, after lift_downscale); give labels of that size"
             )
-        return ViewFeatures(labels.int().cpu(), normalize(vectors.double().cpu(), dim=1).float())
+        return ViewFeatures(labels.int().cpu(), unit_rows(vectors.cpu()))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)

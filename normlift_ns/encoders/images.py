@@ -1,7 +1,12 @@
-"""Reading pictures and arrays that others wrote, with errors that name the file, without running what may be in it."""
+"""Reading pictures that others wrote, with errors that name the file, without running what may be in it."""
 
 from __future__ import annotations
 
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +16,11 @@ from PIL import Image
 from torch import Tensor
 
 from normlift_ns.errors import InputError
+
+_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
+"""Of photographs. Pillow would also hand some formats to other programs: PostScript to Ghostscript."""
+_MOST_PIXELS = 2**27
+"""16,384 x 8,192. Few bytes of a file can hold any number of equal pixels."""
 
 
 def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
@@ -23,33 +33,43 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
     return torch.from_numpy(read_pixels(path, "RGB"))
 
 
-def read_pixels(path: Path, mode: str | None = None) -> np.ndarray:
+def read_pixels(
+    path: Path, mode: str | None = None, *, what: str = "image", formats: tuple[str, ...] = _FORMATS
+) -> np.ndarray:
     """The decoded pixels of a picture file, [H, W] or [H, W, channels], in a Pillow mode or as stored; raises as
-    `read_image`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"image {path} does not exist; check the path, or where the dataset was moved to")
-    try:
-        with Image.open(path) as picture:
-            return np.array(picture if mode is None else picture.convert(mode))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"image {path} is damaged or no picture ({error}); expected a file that Pillow can decode, such as PNG "
-            "or JPEG: replace it"
-        ) from error
-
-
-def read_npy(path: Path, what: str) -> np.ndarray:
-    """The array of an NPY file, of any type but objects, mapped into memory and read-only.
+    `read_image`.
 
     Args:
         what: what the file is, for the message.
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file that is truncated, no NPY file or holds pickled objects.
+        formats: those that it may have, by Pillow's names.
     """
+    with _opened(path, what, formats) as picture:
+        return np.array(picture if mode is None else picture.convert(mode))
+
+
+def read_size(path: Path, *, what: str = "image", formats: tuple[str, ...] = _FORMATS) -> tuple[int, int]:
+    """Width and height of a picture file, whose pixels are not decoded; arguments and errors as in `read_pixels`."""
+    with _opened(path, what, formats) as picture:
+        return picture.size
+
+
+@contextmanager
+def _opened(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+    """A picture file whose size is not absurd; what is done with it may raise as Pillow does."""
+    if not os.path.isfile(path):
+        if os.path.lexists(path):
+            raise InputError(f"{what} {path} is no file; expected a picture")
+        raise FileNotFoundError(f"{what} {path} does not exist; check the path, or where the dataset was moved to")
     try:
-        return np.lib.format.open_memmap(path, mode="r")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{what} {path} does not exist; check the folder") from None
-    except Exception as error:  # whatever a foreign header makes NumPy's parser raise
-        raise InputError(f"{what} {path} is damaged or no NPY file ({error}); write it again with numpy.save") from None
+        with Image.open(path, formats=formats) as picture:
+            if picture.width * picture.height > _MOST_PIXELS:
+                raise InputError(f"{picture.width} x {picture.height} pixels are too many, at most {_MOST_PIXELS:,}")
+            yield picture
+    except (  # what Pillow's decoders raise
+        OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, OverflowError, struct.error, zlib.error,
+        Image.DecompressionBombError,
+    ) as error:  # fmt: skip
+        raise InputError(
+            f"{what} {path} is damaged or no picture ({error}); expected a file that Pillow can decode, such as "
+            f"{formats[0]}: replace it"
+        ) from error

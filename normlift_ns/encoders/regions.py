@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -13,10 +14,11 @@ from jaxtyping import Int32, UInt8
 from skimage.segmentation import slic
 from torch import Tensor
 
-from normlift_ns.encoders.images import read_npy, read_pixels
+from normlift_ns.encoders.images import read_pixels, read_size
+from normlift_ns.encoders.npy import read_npy
 from normlift_ns.errors import InputError
 
-_SUFFIXES = (".png", ".npy")
+_SUFFIXES, _FORMATS = (".png", ".npy"), ("PNG",)
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,15 @@ class LabelFiles:
     """Which map of an NPY file [levels, H, W] counts; None for files [H, W]."""
     resample: bool = False
     """Bring maps of another size to the image's by nearest neighbour, instead of refusing them."""
+    what: str = "label map"
+    """What messages call a file."""
+    flag: str = "--regions-dir"
+    """What messages call the option that gives the folder."""
 
     def __post_init__(self) -> None:
-        if not self.folder.is_dir():
+        if not os.path.isdir(self.folder):
             raise FileNotFoundError(
-                f"folder of label maps {self.folder} does not exist (--regions-dir); give the folder that holds one "
+                f"folder of {self.what}s {self.folder} does not exist ({self.flag}); give the folder that holds one "
                 "PNG or NPY file per image"
             )
 
@@ -135,13 +141,13 @@ class LabelFiles:
         parts = [part for part in relative.parts if part not in ("..", relative.anchor)]
         for first in range(len(parts)):
             base = self.folder.joinpath(*parts[first:])
-            found = [base.with_suffix(suffix) for suffix in _SUFFIXES if base.with_suffix(suffix).is_file()]
+            found = [path for suffix in _SUFFIXES if os.path.lexists(path := base.with_suffix(suffix))]
             if len(found) > 1:
-                raise InputError(f"image {name} has two label maps, {found[0]} and {found[1]}; keep one of them")
+                raise InputError(f"image {name} has two {self.what}s, {found[0]} and {found[1]}; keep one of them")
             if len(found) == 1:
                 return found[0]
         raise FileNotFoundError(
-            f"image {name} has no label map in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
+            f"image {name} has no {self.what} in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
         )
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels 1 h w"]:
@@ -152,32 +158,50 @@ class LabelFiles:
             ValueError: a map that cannot be read, has colour channels or fractional values, or has another size than
                 the image while `resample` is off.
         """
-        path = self.path(name)
-        found = self._read(path)
+        path, found = self.path(name), self.values(name)
         height, width = image.shape[:2]
         if found.shape[1:] != (height, width):
             if not self.resample:
                 raise InputError(
-                    f"label map {path} is {found.shape[2]}x{found.shape[1]} (width x height), its image {name} is "
-                    f"{width}x{height}; make label maps of the image's size (undistorting an image crops it), or "
+                    f"{self.what} {path} is {found.shape[2]}x{found.shape[1]} (width x height), its image {name} is "
+                    f"{width}x{height}; make {self.what}s of the image's size (undistorting an image crops it), or "
                     "resample them by nearest neighbour: --regions-resample True"
                 )
             found = resample_nearest(found, height, width)
         return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in found])[:, None]
 
-    def _read(self, path: Path) -> np.ndarray:
-        found = read_npy(path, "label map") if path.suffix == ".npy" else read_pixels(path)
+    def size(self, name: str) -> tuple[Path, int, int]:
+        """The map of an image, its width and its height; raises as `values`."""
+        path = self.path(name)
+        if path.suffix != ".npy":
+            return path, *read_size(path, what=self.what, formats=_FORMATS)
+        _, height, width = self.values(name).shape
+        return path, width, height
+
+    def values(self, name: str) -> np.ndarray:
+        """The maps of an image as they are stored, [levels, H, W], of an integer type or booleans.
+
+        Raises:
+            FileNotFoundError: no label map.
+            ValueError: a map that cannot be read, or has colour channels or fractional values.
+        """
+        path = self.path(name)
+        if path.suffix == ".npy":
+            found = read_npy(path, self.what)
+        else:
+            found = read_pixels(path, what=self.what, formats=_FORMATS)
         if found.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"label map {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "
+                f"{self.what} {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "
                 "grey, 16-bit grey or palette PNG, or as NPY"
             )
         if found.dtype.kind not in "iub":
             raise InputError(
-                f"label map {path} holds {found.dtype}; expected an integer type: save it with .astype(numpy.int32)"
+                f"{self.what} {path} holds {found.dtype}; expected an integer type: save it with .astype(numpy.int32)"
             )
         if found.ndim not in (2, 3) or found.size == 0:
-            raise InputError(f"label map {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
+            raise InputError(f"{self.what} {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
+        found = found.astype(np.uint8) if found.dtype == bool else found
         return found.reshape(-1, *found.shape[-2:])
 
 

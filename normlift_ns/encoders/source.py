@@ -10,6 +10,7 @@ common (`joint_partition`), and added up to the regions of the level that counts
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor
 
 from normlift_ns.errors import InputError
@@ -195,8 +196,8 @@ class RegionFeatures:
         return {"regions": self.regions.identity, **chosen, "encoder": self.encoder.identity}
 
     def available(self, names: Sequence[str]) -> list[str]:
-        for name in names:
-            self.regions.files(name)
+        files = ((name, file) for name in names for file in self.regions.files(name))
+        refuse_shared(files, "label map", "in folders that are named like those of the images")
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
@@ -252,6 +253,23 @@ def check_image(image: Tensor, name: str) -> None:
         )
 
 
+def refuse_shared(files: Iterable[tuple[str, Path]], what: str, how: str) -> None:
+    """Makes sure that every image has files of its own, wherever links lead.
+
+    Args:
+        files: names of images, with a file of each.
+        what: what the files are, for the message.
+        how: to tell them apart.
+    Raises:
+        ValueError: two images share one.
+    """
+    owner: dict[str, str] = {}
+    for name, file in files:
+        other = owner.setdefault(os.path.realpath(file), name)
+        if other != name:
+            raise InputError(f"images {other} and {name} would share the {what} {file}; give each its own, {how}")
+
+
 def check_prompts(prompts: Sequence[str]) -> None:
     """Raises ValueError unless `prompts` is a list of at least one text, none of them empty."""
     if isinstance(prompts, str):
@@ -264,6 +282,17 @@ def check_prompts(prompts: Sequence[str]) -> None:
             f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or say what to look "
             "for in words"
         )
+
+
+def unit_rows(vectors: Float[Tensor, "*n d"]) -> Float32[Tensor, "*n d"]:
+    """Vectors at unit length, however long or short they are; they must be finite and not zero.
+
+    >>> unit_rows(torch.tensor([3e-320, 4e-320], dtype=torch.float64)), unit_rows(torch.tensor([3e38, 3e38]))
+    (tensor([0.6000, 0.8000]), tensor([0.7071, 0.7071]))
+    """
+    rows = vectors.double()
+    rows = rows / rows.abs().amax(dim=-1, keepdim=True)
+    return (rows / torch.linalg.vector_norm(rows, dim=-1, keepdim=True)).float()
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import os
+import struct
 import zipfile
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
@@ -15,13 +18,15 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from normlift_ns.core.disk.tensors import tensor_digest
 from normlift_ns.core.files import new_file
-from normlift_ns.encoders.source import check_prompts
+from normlift_ns.encoders.npy import read_array
+from normlift_ns.encoders.source import check_prompts, unit_rows
 from normlift_ns.errors import InputError
 
+_LARGEST_VECTOR, _LARGEST_FILE = 2**20, 2**30
+"""Bytes; few bytes of an archive can hold any number of equal ones."""
 _SEAL = b"normlift_ns "
 """How the comment begins of an archive that we wrote; the digest follows. Those of NumPy have none."""
 
@@ -37,7 +42,9 @@ class TextVectors:
     file: Path
 
     def __post_init__(self) -> None:
-        if not self.file.is_file():
+        if not os.path.isfile(self.file):
+            if os.path.lexists(self.file):
+                raise InputError(f"{self.file} is no file of text vectors; give an NPZ file with --text-vectors")
             raise FileNotFoundError(
                 f"file of text vectors {self.file} does not exist; say where it is with --text-vectors, an NPZ file "
                 "with one vector per text"
@@ -69,12 +76,15 @@ class TextVectors:
     @cached_property
     def _vectors(self) -> dict[str, Tensor]:
         try:
-            with np.load(self.file, allow_pickle=False) as archive:
-                arrays, comment = {name: archive[name] for name in archive.files}, archive.zip.comment
+            with zipfile.ZipFile(self.file) as archive:
+                arrays, comment = dict(_entries(archive)), archive.comment
             expected = _seal({name: torch.from_numpy(array) for name, array in arrays.items()})
             if comment.startswith(_SEAL) and comment != expected:
-                raise InputError(f"its content has {expected.decode()!r}, expected {comment.decode()!r}")
-        except Exception as error:  # whatever a foreign file makes NumPy and zipfile raise
+                raise InputError(f"its content has {expected.decode()!r}, expected {comment.decode('latin1')!r}")
+        except (  # what zipfile and zlib raise
+            OSError, ValueError, LookupError, EOFError, RuntimeError, NotImplementedError, OverflowError,
+            zipfile.BadZipFile, zlib.error, struct.error,
+        ) as error:  # fmt: skip
             raise InputError(
                 f"file of text vectors {self.file} is damaged or no NPZ file ({error}); write it again with "
                 "numpy.savez(file, **{text: vector, ...})"
@@ -88,7 +98,30 @@ class TextVectors:
                 )
             if not np.isfinite(array).all() or not array.any():
                 raise InputError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the text again")
-        return {name: torch.tensor(array, dtype=torch.float64) for name, array in arrays.items()}
+        return {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
+
+
+def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
+    """Texts and vectors, unchecked. What an entry says of its size is held against bounds before it is read.
+
+    Raises:
+        ValueError: two entries of one name, entries that are too large or no arrays; and what zipfile raises.
+    """
+    entries = archive.infolist()
+    if sum(entry.file_size for entry in entries) > _LARGEST_FILE:
+        raise InputError(f"its vectors would take more than {_LARGEST_FILE:,} bytes")
+    seen: set[str] = set()
+    for entry in entries:
+        name = entry.filename.removesuffix(".npy")
+        if name in seen:
+            raise InputError(f"it has two vectors of {name!r}")
+        seen.add(name)
+        if entry.file_size > _LARGEST_VECTOR:
+            raise InputError(f"the vector of {name!r} takes {entry.file_size:,} bytes, at most {_LARGEST_VECTOR:,}")
+        try:
+            yield name, read_array(archive.read(entry))
+        except InputError as error:
+            raise InputError(f"the vector of {name!r} is none: {error}") from None
 
 
 def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -> Float32[Tensor, "q d"]:
@@ -106,7 +139,7 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -
                 f"which holds {len(vectors)}; near names: {', '.join(near)}" if len(vectors) > 0 else "which holds none"
             )
             raise InputError(f"text {prompt!r} has no vector in {where}, {hint}")
-    return torch.stack([normalize(vectors[prompt].double().cpu(), dim=0).float() for prompt in prompts])
+    return torch.stack([unit_rows(vectors[prompt].cpu()) for prompt in prompts])
 
 
 def write_text_vectors(file: Path, vectors: Mapping[str, Tensor]) -> None:
@@ -115,7 +148,7 @@ def write_text_vectors(file: Path, vectors: Mapping[str, Tensor]) -> None:
     Raises:
         FileExistsError, OSError: as `new_file`.
     """
-    units = {text: normalize(vector.double().cpu(), dim=0).float() for text, vector in vectors.items()}
+    units = {text: unit_rows(vector.cpu()) for text, vector in vectors.items()}
     with new_file(file) as draft, zipfile.ZipFile(draft, "w") as archive:
         for text, unit in units.items():  # numpy.savez takes no text that is called "file"
             with archive.open(f"{text}.npy", "w") as entry:

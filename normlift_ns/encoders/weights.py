@@ -1,12 +1,94 @@
-"""What weight files of all networks have in common: their servers, and errors of foreign libraries as one line."""
+"""What weight files of all networks have in common: where they are, and errors of foreign libraries as one line. Imports
+nothing heavy."""
 
 from __future__ import annotations
 
+import ast
+import importlib
+import os
+import pickle
+import struct
 import urllib.error
 import urllib.request
+import zipfile
+import zlib
+from importlib.util import find_spec
+from pathlib import Path
+
+from safetensors import SafetensorError
 
 _PROBE_SECONDS = 10
 _LONGEST = 300
+_CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
+"""Names that the hub's repositories give the weights of OpenCLIP models."""
+_SAM_FILES = ("model.safetensors", "pytorch_model.bin")
+FOREIGN_ERRORS = (
+    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError,
+    ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
+    SafetensorError,
+)  # fmt: skip
+"""What torch, safetensors and open_clip raise where a file or a name is not what they
+expect. Not among them: a full memory."""
+
+
+def clip_weights_at_hand(model: str, pretrained: str) -> bool | None:
+    """Whether the weights of an OpenCLIP model are on this machine; None: not to be told without importing open_clip,
+    as of weights that are not on the Hugging Face hub.
+
+    >>> clip_weights_at_hand("ViT-B-16", __file__)
+    True
+    """
+    if os.path.isfile(pretrained):
+        return True
+    repository = _published(model, pretrained)
+    if not repository:
+        return None
+    owner_and_name, _, file = repository.rpartition("/")
+    return any(is_cached(owner_and_name, name) for name in ([file] if file else _CLIP_FILES))
+
+
+def sam_weights_at_hand(checkpoint: str) -> bool:
+    """Whether a checkpoint of SAM, a path or a name on the hub, is on this machine."""
+    cached = is_cached(checkpoint, "config.json") and any(is_cached(checkpoint, name) for name in _SAM_FILES)
+    return os.path.exists(checkpoint) or cached
+
+
+def is_cached(repository: str, file: str) -> bool:
+    """Whether the cache of the Hugging Face hub holds a file, in its main revision. Needs no network."""
+    constants = importlib.import_module("huggingface_hub.constants")
+    folder = Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
+    try:
+        revision = (folder / "refs" / "main").read_text("utf8").strip()
+        return os.path.isfile(folder / "snapshots" / revision / file)
+    except (OSError, ValueError):
+        return False
+
+
+def _published(model: str, tag: str) -> str | None:
+    """Where the hub has weights, "OWNER/NAME/" or "OWNER/NAME/FILE", from the table in the source of open_clip, which
+    takes seconds to import; None: nowhere, or the table looks different from what is expected."""
+    try:
+        spec = find_spec("open_clip")  # does not import it
+        assert spec is not None and spec.origin is not None
+        source = Path(spec.origin).with_name("pretrained.py").read_text("utf8")
+        tables = {
+            node.targets[0].id: node.value
+            for node in ast.parse(source).body
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+        }
+        models = tables["_PRETRAINED"]
+        assert isinstance(models, ast.Dict)
+        names = [ast.literal_eval(key) for key in models.keys if key is not None]
+        entry = models.values[names.index(model.removesuffix("-quickgelu"))]
+        entry = tables[entry.id] if isinstance(entry, ast.Name) else entry
+        call = _argument(entry, tag.lower().replace("-", "_"))
+        return ast.literal_eval(_argument(call, "hf_hub"))
+    except (OSError, ValueError, LookupError, AttributeError, TypeError, AssertionError, SyntaxError, StopIteration):
+        return None
+
+
+def _argument(call: ast.AST, name: str) -> ast.expr:
+    return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
 
 
 def first_line(error: Exception) -> str:

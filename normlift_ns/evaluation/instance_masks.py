@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
@@ -14,10 +17,19 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, class_scores, confusion
-from normlift_ns.encoders.images import read_pixels
 from normlift_ns.encoders.regions import LabelFiles
 from normlift_ns.errors import InputError
+from normlift_ns.evaluation.documents import Name, read_document
 from normlift_ns.evaluation.results import Evaluation
+
+_VALUE = re.compile(r"0|-?[1-9][0-9]{0,9}")
+
+
+class _Named(msgspec.Struct):
+    """The file with names."""
+
+    labels: dict[str, Name]
+    background: int | None = None
 
 
 @dataclass(frozen=True)
@@ -37,36 +49,46 @@ def read_names(path: Path) -> Names:
         FileNotFoundError: no such file.
         ValueError: a file of another form.
     """
-    if not path.is_file():
+    expected = 'expected {"labels": {"1": "table", ...}}'
+    if not os.path.lexists(path):
         raise FileNotFoundError(f'names of the masks {path} do not exist; write {{"labels": {{"1": "table", ...}}}}')
     try:
-        document = json.loads(path.read_text("utf8"))
-        labels = document.get("labels", document)
-        of_value = {int(value): str(name) for value, name in labels.items()}
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError, ValueError) as error:
-        raise InputError(f'{path} names no masks ({error}); expected {{"labels": {{"1": "table", ...}}}}') from error
-    if len(of_value) == 0:
-        raise InputError(f'{path} names no masks; expected {{"labels": {{"1": "table", ...}}}}')
+        found = read_document(path, dict[str, Any])
+        named = msgspec.convert(found if "labels" in found else {"labels": found}, _Named)
+        of_value = _by_value(named.labels)
+        if named.background is not None and named.background in of_value:
+            raise InputError(f"value {named.background} is the background, but has a name")
+        if len(of_value) == 0:
+            raise InputError("there is no name in it")
+    except ValueError as error:
+        raise InputError(f"{path} names no masks ({error}); {expected}") from error
     classes = tuple(dict.fromkeys(of_value.values()))
     return Names(classes, {value: classes.index(name) for value, name in of_value.items()})
+
+
+def _by_value(labels: Mapping[str, str]) -> dict[int, str]:
+    wrong = [key for key in labels if _VALUE.fullmatch(key) is None]
+    if len(wrong) > 0:
+        raise InputError(f"{wrong[0]!r} is no value of a mask: a whole number such as 1")
+    return {int(value): name for value, name in labels.items()}
 
 
 def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width: int) -> Int64[Tensor, "h w"]:
     """Class of every pixel of an image, -1 where it does not count.
 
     Raises:
-        FileNotFoundError, ValueError: a mask that is missing, or of another size; the message names it.
+        FileNotFoundError, ValueError: a mask that is missing, damaged or of another size; the message names it.
     """
-    path = masks.path(name)
-    values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else read_pixels(path)
-    if values.shape != (height, width):
+    values = masks.values(name)
+    if values.shape != (1, height, width):
+        size = values.shape if len(values) > 1 else values.shape[1:]
         raise InputError(
-            f"mask {path} has shape {values.shape}, its image {name} is {height} x {width} (height x width); make "
+            f"mask {masks.path(name)} has shape {size}, its image {name} is {height} x {width} (height x width); make "
             "masks of the size of the (undistorted) image"
         )
-    found, inverse = np.unique(values, return_inverse=True)
+    found, inverse = np.unique(values[0], return_inverse=True)
     table = torch.tensor([names.class_of.get(int(value), NO_CLASS) for value in found])
-    return table[torch.from_numpy(inverse.reshape(values.shape))]
+    return table[torch.from_numpy(inverse.reshape(height, width))]
 
 
 def gaussian_truth(

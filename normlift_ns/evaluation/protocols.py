@@ -17,7 +17,8 @@ from normlift_ns.core.metrics import classify
 from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
 from normlift_ns.core.scene import Scene, Views
 from normlift_ns.encoders.regions import LabelFiles
-from normlift_ns.encoders.source import TextEncoder
+from normlift_ns.encoders.source import TextEncoder, refuse_shared
+from normlift_ns.errors import InputError
 from normlift_ns.evaluation.instance_masks import evaluate_masks, gaussian_truth, read_classes, read_names
 from normlift_ns.evaluation.lerf import FrameScores, frame_rows, summarize_lerf
 from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
@@ -50,9 +51,9 @@ class EvaluatedRun:
         return render(self.scene.gaussians, camera, values, rasterize_mode=self.scene.rasterize_mode)
 
     def cameras(self) -> dict[str, Camera]:
-        """Of all photographs, trained and held out, by the stem of the image."""
+        """Of all photographs, trained and held out, by the name of the image."""
         views = (self.scene.train, self.scene.held_out)
-        return {Path(name).stem: camera for some in views for name, camera in zip(some.names, some.cameras)}
+        return {name: camera for some in views for name, camera in zip(some.names, some.cameras)}
 
 
 def label_scene(lifted: EvaluatedRun, path: Path, nyu40: Int64[Tensor, " n"]) -> SceneLabels:
@@ -88,16 +89,20 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
     rows, missing = [], []
     for folder, given, lifted in zip(labels, files, runs):
         cameras = lifted.cameras()
-        found, absent = match_views(given, cameras)
+        found, absent = match_views(given, list(cameras))
         missing += [f"{folder.name}/{stem}" for stem in absent]
-        for file in found:
-            camera = cameras[file.stem]
+        for file, name in found.items():
+            camera = cameras[name]
             frame = read_frame(file, camera.width, camera.height)
+            if len(frame.masks) == 0:
+                continue
             scores = _frame_scores(lifted, camera, frame, options)
             rows += [
                 {"scene": folder.name, **row, "frame": f"{folder.name}/{frame.stem}"}
                 for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
             ]
+    if len(rows) == 0:
+        raise InputError(f"the label files in {', '.join(map(str, labels))} name no object; nothing can be scored")
     settings = {**asdict(options), "labels_without_image": missing}
     return summarize_lerf(rows, options.average, settings)
 
@@ -130,7 +135,10 @@ def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
     Raises:
         FileNotFoundError, ValueError: masks or names that are missing or damaged; the message names the file.
     """
-    names, masks = read_names(options.names or folder.parent / "labels.json"), LabelFiles(folder)
+    masks = LabelFiles(folder, what="instance mask", flag="--labels")
+    every = [*scene.train.names, *scene.held_out.names]
+    refuse_shared(((name, masks.path(name)) for name in every), masks.what, "in folders named like those of the images")
+    names = read_names(options.names or folder.parent / "labels.json")
 
     def classes(views: Views) -> Iterator[Tensor]:
         for name, camera in zip(views.names, views.cameras):
@@ -145,6 +153,11 @@ def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
         rasterize_mode=scene.rasterize_mode,
     )
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
+    if not bool((truth >= 0).any()):
+        raise InputError(
+            f"no Gaussian lies in a mask of {folder}: check that their values are those named in "
+            f"{options.names or folder.parent / 'labels.json'}, and --masks.purity and --masks.min-weight"
+        )
     settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
     return MaskTruth(names.classes, truth, list(classes(scene.held_out)), settings)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
-from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from normlift_ns.core.metrics import NO_CLASS, ClassScores, WithoutDirection, class_scores, classify, confusion
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.results import Evaluation, mean
+from normlift_ns.evaluation.vertices import read_column
 
 NYU40 = {
     1: "wall", 2: "floor", 3: "cabinet", 4: "bed", 5: "chair", 6: "sofa", 7: "table", 8: "door", 9: "window",
@@ -23,6 +25,7 @@ NYU40 = {
     33: "toilet", 34: "sink", 36: "bathtub",
 }  # fmt: skip
 """Names that are queried, bare and spelled so, by NYU40 id."""
+_LAST_ID = 40
 CLASS_SETS = {
     19: tuple(NYU40),
     15: tuple(i for i in NYU40 if i not in (11, 24, 28, 36)),
@@ -53,21 +56,34 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
         FileNotFoundError: no such file.
         ValueError: no PLY file, a damaged one, or one without labels.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise FileNotFoundError(
             f"labels {path} do not exist; ScanNet's *_vh_clean_2.labels.ply is wanted, which its licence lets you "
             "download after registration"
         )
     try:
-        vertices = PlyData.read(str(path))["vertex"]
-    except (PlyParseError, KeyError, ValueError, OSError) as error:
-        raise InputError(f"{path} is damaged or no PLY file with vertices ({error}); download it again") from error
-    names = [found.name for found in vertices.properties]
-    if "label" not in names:
+        found = read_column(path, "label")
+        whole = np.nan_to_num(found.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
+        if (whole != found).any():
+            raise InputError("its labels are no whole numbers of 32 bits")
+    except (OSError, ValueError) as error:
         raise InputError(
-            f"{path} has no vertex property label (found {', '.join(names)}); the file *_vh_clean_2.labels.ply has it"
+            f"{path} is damaged or no PLY file with vertices and their labels ({error}); the file "
+            "*_vh_clean_2.labels.ply is meant: download it again"
+        ) from error
+    known = np.isin(whole, list(NYU40))
+    if not known.any():
+        raise InputError(
+            f"{path}: no label is one of the NYU40 ids {', '.join(map(str, NYU40))}; nothing can be scored"
         )
-    return torch.from_numpy(np.asarray(vertices["label"]).astype(np.int64))
+    strange = (whole > _LAST_ID) | (whole < -1)
+    if strange.any():
+        warnings.warn(
+            f"{path}: {int(strange.sum()):,} of {len(whole):,} labels are no NYU40 ids ({whole[strange][0]} among "
+            "them); they count as unlabelled",
+            stacklevel=2,
+        )
+    return torch.from_numpy(np.where(strange, 0, whole))
 
 
 def check_identity(name: str, gaussians: int, labels: Int64[Tensor, " n"], path: Path) -> None:

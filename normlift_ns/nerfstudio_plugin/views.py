@@ -68,11 +68,13 @@ class DatasetViews:
             raise IndexError(f"view {index} of {len(self)}")
         index %= len(self)
         data = self._read(index)
+        taken = data["image"]
         image, _, mask = _undistorted(self._dataset.cameras, index, data)
+        original = None if image is taken else (taken.shape[1], taken.shape[0])
         if image.shape[2] == 4:
             alpha = image[:, :, 3:].float() / 255
             image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
-        return View(self.cameras[index], image, None if mask is None else mask[:, :, 0], self.names[index])
+        return View(self.cameras[index], image, None if mask is None else mask[:, :, 0], self.names[index], original)
 
     @property
     def cameras(self) -> list[Camera]:

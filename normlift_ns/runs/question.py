@@ -5,28 +5,59 @@ A run with a stored question is rendered by stock nerfstudio without a text enco
 
 from __future__ import annotations
 
-import json
+import math
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Annotated
+
+import msgspec
+import torch
+from torch import Tensor
 
 from normlift_ns.asking import Question
-from normlift_ns.core.disk.tensors import load_tensors, save_tensors
+from normlift_ns.core.disk.tensors import check_tensor, load_tensors, save_tensors
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
 
 QUERIES_FILE = "queries.safetensors"
 """In the folder of the field: vectors, and everything else as JSON in the file's metadata."""
-_KEY = "question"
+_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save True"
+
+Text = Annotated[str, msgspec.Meta(pattern=r"\S")]
+
+
+class _Facts(msgspec.Struct, forbid_unknown_fields=True):
+    """The JSON in the metadata."""
+
+    texts: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)]
+    negatives: tuple[Text, ...]
+    refined: bool
+    form: Rule
+    threshold: float
+    min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 def save_question(folder: Path, question: Question) -> Path:
-    """Writes queries.safetensors beside the field, in place of an earlier one; returns its path."""
-    rule = {"form": question.rule, "threshold": question.threshold, "min_reliability": question.min_reliability}
-    facts = {"texts": question.texts, "negatives": question.negatives, "refined": question.refined, **rule}
-    tensors = {"vectors": question.vectors, "negative_vectors": question.negative_vectors}
-    given = {name: value for name, value in tensors.items() if value is not None}
-    save_tensors(folder / QUERIES_FILE, given, {_KEY: json.dumps(facts)}, overwrite=True)
+    """Writes queries.safetensors beside the field, in place of an earlier one; returns its path.
+
+    Raises:
+        ValueError: what `load_question` would refuse.
+        OSError: the file cannot be written.
+    """
+    facts = _Facts(
+        question.texts, question.negatives, question.refined, question.rule, question.threshold,
+        question.min_reliability,
+    )  # fmt: skip
+    given = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
+    tensors = {name: value.detach().float().cpu() for name, value in given.items()}
+    try:
+        stored = _encoded(facts)
+        _question(stored, tensors)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"the question cannot be stored: {error}") from error
+    save_tensors(folder / QUERIES_FILE, tensors, {_KEY: stored}, overwrite=True)
     return folder / QUERIES_FILE
 
 
@@ -34,26 +65,54 @@ def load_question(folder: Path) -> Question | None:
     """The question stored in the folder of a field; None if there is none.
 
     Raises:
-        ValueError: a damaged file.
+        ValueError: a damaged file, or one that holds no question.
     """
     path = folder / QUERIES_FILE
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     try:
+        if not os.path.isfile(path):
+            raise InputError("it is no file")
         tensors, stored, _ = load_tensors(path, undigested=(_KEY,), remedy=_REMEDY)
-        facts = json.loads(stored[_KEY])
-        question = Question(
-            texts=tuple(map(str, facts["texts"])),
-            vectors=tensors["vectors"],
-            negatives=tuple(map(str, facts["negatives"])),
-            negative_vectors=tensors.get("negative_vectors"),
-            rule=facts["form"],
-            threshold=float(facts["threshold"]),
-            min_reliability=float(facts["min_reliability"]),
-            refined=bool(facts["refined"]),
-        )
-        if len(question.vectors) != len(question.texts) or question.rule not in get_args(Rule):
-            raise InputError(f"{len(question.vectors)} vectors of {len(question.texts)} texts, rule {question.rule!r}")
-    except (KeyError, TypeError, ValueError) as error:
+        if set(stored) != {_KEY}:
+            raise InputError(f"its metadata has {sorted(stored)}, expected {_KEY}")
+        return _question(stored[_KEY], tensors)
+    except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
-    return question
+
+
+def _encoded(facts: _Facts) -> str:
+    return msgspec.json.encode(facts).decode()
+
+
+def _question(stored: str, tensors: dict[str, Tensor]) -> Question:
+    """What the file says.
+
+    Raises:
+        ValueError: facts or vectors that are none, or that do not belong together.
+    """
+    facts = msgspec.json.decode(stored, type=_Facts)
+    if not math.isfinite(facts.threshold):
+        raise InputError(f"the threshold is {facts.threshold}, expected a finite number")
+    if not {"vectors"} <= set(tensors) <= set(_VECTORS):
+        raise InputError(f"it holds {', '.join(sorted(tensors)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
+    negative = tensors.get("negative_vectors")
+    if (negative is None) != (len(facts.negatives) == 0):
+        raise InputError(f"{len(facts.negatives)} negatives, {'no' if negative is None else 'some'} vectors of them")
+    if facts.form != "cosine" and negative is None:
+        raise InputError(f"rule {facts.form!r} compares with negatives, and there are none")
+    size = tensors["vectors"].shape[-1] if tensors["vectors"].ndim > 0 else 0
+    _check_vectors("vectors", tensors["vectors"], facts.texts, size)
+    if negative is not None:
+        _check_vectors("negative_vectors", negative, facts.negatives, size)
+    return Question(
+        facts.texts, tensors["vectors"], facts.negatives, negative, facts.form, facts.threshold,
+        facts.min_reliability, facts.refined,
+    )  # fmt: skip
+
+
+def _check_vectors(name: str, vectors: Tensor, texts: Sequence[str], size: int) -> None:
+    check_tensor(f"{name} of {len(texts)} texts", vectors, torch.float32, (len(texts), max(1, size)), -math.inf)
+    for text, row in zip(texts, vectors):
+        if not bool(row.isfinite().all()) or not bool(row.any()):
+            raise InputError(f"the vector of {text!r} is zero or not finite")

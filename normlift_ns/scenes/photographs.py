@@ -71,7 +71,8 @@ class PhotographViews:
         if image.shape[2] == 4:
             alpha = image[:, :, 3:].float() / 255
             image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
-        return View(self.cameras[index], image, _mask(frame), frame.name)
+        size = (frame.intrinsics.width, frame.intrinsics.height) if any(frame.intrinsics.distortion) else None
+        return View(self.cameras[index], image, _mask(frame), frame.name, size)
 
 
 def _camera(frame: Frame) -> Camera:

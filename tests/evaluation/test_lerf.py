@@ -56,9 +56,12 @@ def test_files_that_do_not_fit(tmp_path):
     bad = write_frame(tmp_path, "frame_2", [{"category": "egg", "segmentation": [[1, 2]]}])
     with pytest.raises(ValueError, match=r"frame_2\.json is no label file of LERF-OVS"):
         read_frame(bad, 40, 30)
-    assert match_views([good, bad], {"frame_1": None}) == ([good], ["frame_2"])
+    assert match_views([good, bad], ["images/frame_1.jpg"]) == ({good: "images/frame_1.jpg"}, ["frame_2"])
     with pytest.raises(ValueError, match="none of the 2 label files"):
-        match_views([good, bad], {"other": None})
+        match_views([good, bad], ["other.jpg"])
+    with pytest.raises(ValueError, match=r"frame_1\.json labels one image, but a/frame_1\.jpg and b/frame_1\.jpg"):
+        match_views([good], ["a/frame_1.jpg", "b/frame_1.jpg"])
+    assert match_views([good], ["a/frame_1.jpg", "a/frame_2.jpg", "b/frame_2.jpg"])[1] == []
 
 
 def frame_of(masks, boxes=None):

@@ -108,7 +108,7 @@ def test_labels_in_scannets_format(tmp_path):
     with pytest.raises(ValueError, match=r"has 5 Gaussians, .*labels\.ply 4 vertices"):
         check_identity("s", 5, read_labels(path), path)
     write_labels(path, [1], name="class")
-    with pytest.raises(ValueError, match=r"no vertex property label \(found x, y, z, red, class\)"):
+    with pytest.raises(ValueError, match=r"vertices have no property label \(found x, y, z, red, class\)"):
         read_labels(path)
     path.write_bytes(b"ply\nformat")
     with pytest.raises(ValueError, match="damaged or no PLY file"):

@@ -183,7 +183,7 @@ def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--protocol", "masks"), "folder of label maps"),
+        (("--protocol", "masks"), "folder of instance masks"),
         (("--protocol", "lerf"), "holds no label files"),
         (("--protocol", "scannet"), "do not exist"),
     ],

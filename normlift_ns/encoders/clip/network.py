@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.encoders.clip.weights import REMEDY, find_weights, import_open_clip
-from normlift_ns.encoders.weights import first_line
+from normlift_ns.encoders.weights import FOREIGN_ERRORS, first_line
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
@@ -47,21 +47,21 @@ def load_clip(model: str, pretrained: str, device: str) -> ClipNetwork:
             force_quick_gelu=training.get("quick_gelu", False),
             force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
         )
-    except Exception as error:  # whatever foreign packages raise
+    except FOREIGN_ERRORS as error:
         raise InputError(
             f"OpenCLIP model {model} cannot be built with the packages installed here ({first_line(error)}); take "
             f"another with --encoder-model, such as {DEFAULT_MODEL}"
         ) from None
     try:
         open_clip.load_checkpoint(network, str(path), weights_only=True)
-    except Exception as error:  # whatever a foreign file makes torch, safetensors and open_clip raise
+    except FOREIGN_ERRORS as error:
         raise InputError(
             f"weight file {path} is damaged or not of OpenCLIP model {model} ({first_line(error)}); name its "
             f"architecture with --encoder-model, or {REMEDY}"
         ) from None
     try:
         tokenizer = open_clip.get_tokenizer(model)
-    except Exception as error:  # whatever a download makes its libraries raise
+    except Exception as error:  # a download's client raises types of its own, which have nothing in common
         raise FileNotFoundError(
             f"the tokenizer of OpenCLIP model {model} cannot be had ({first_line(error)}); go online once, "
             f"use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that needs "

@@ -52,8 +52,10 @@ def check_names(model: str, pretrained: str) -> None:
             f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
         )
     path = Path(pretrained)
-    if path.is_file() or open_clip.is_pretrained_cfg(model, pretrained):
+    if os.path.isfile(path) or open_clip.is_pretrained_cfg(model, pretrained):
         return
+    if os.path.lexists(path):
+        raise InputError(f"{pretrained} is no weight file of an OpenCLIP model (--encoder-pretrained); {REMEDY}")
     if path.suffix in _SUFFIXES or len(path.parts) > 1:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {REMEDY}")
     tags = ", ".join(open_clip.list_pretrained_tags_by_model(model)) or "none"
@@ -72,14 +74,14 @@ def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
     """
     open_clip = import_open_clip()
     local = Path(pretrained)
-    if local.is_file():
+    if os.path.isfile(local):
         tags = open_clip.list_pretrained_tags_by_model(model)
         published = open_clip.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
         return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
     published = open_clip.get_pretrained_cfg(model, pretrained)
     try:
         return _cached(published) or _download(published), published
-    except Exception as error:  # whatever a download makes its libraries raise
+    except Exception as error:  # a download's client raises types of its own, which have nothing in common
         origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
         raise FileNotFoundError(
             f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are neither in the local cache nor can they "

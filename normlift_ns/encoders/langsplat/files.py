@@ -11,6 +11,7 @@ row of that table a pixel has, -1 for none. What is read besides:
 from __future__ import annotations
 
 import io
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
 from normlift_ns.core.files import new_file
-from normlift_ns.encoders.images import read_npy
+from normlift_ns.encoders.npy import read_npy
 from normlift_ns.encoders.source import UNIT_TOLERANCE
 from normlift_ns.errors import InputError
 
@@ -29,6 +30,8 @@ LEVELS = ("default", "s", "m", "l")
 """Channels of `_s`."""
 _LARGEST_HALF = 2048
 """From here on half precision cannot tell integers apart."""
+_LEAST_LENGTH = 1e-30
+"""Below, vectors are zero: their numbers have lost their digits."""
 _SMALLEST_DIMENSION = 16
 """LangSplat's autoencoder leaves 3 numbers; no CLIP has so few."""
 
@@ -103,7 +106,7 @@ def read_table(path: Path) -> tuple[Float32[Tensor, "t d"], Bool[Tensor, " t"]]:
     """
     found = torch.from_numpy(np.array(open_table(path), dtype=np.float64))
     length = torch.linalg.vector_norm(found, dim=1)
-    good = length.isfinite() & (length > 0)
+    good = length.isfinite() & (length > _LEAST_LENGTH)
     unit = torch.where(((length - 1).abs() < UNIT_TOLERANCE / 2)[:, None], found, found / length[:, None])
     return torch.where(good[:, None], unit, 0.0).float(), good
 
@@ -117,8 +120,8 @@ def write_npy(path: Path, array: np.ndarray, overwrite: bool) -> None:
     buffer = io.BytesIO()
     np.save(buffer, array)
     content = buffer.getvalue()
-    if path.exists():
-        if path.read_bytes() == content:
+    if os.path.lexists(path):
+        if os.path.isfile(path) and path.read_bytes() == content:
             return
         if not overwrite:
             raise FileExistsError(f"{path} exists with other content; export to another folder, or --overwrite True")

@@ -1,12 +1,13 @@
 """Features that LangSplat's preprocessing wrote as a source, and any source's features as such files.
 
-What other programs do to the files is in module langsplat_files; besides, images may have another size than their
-masks, as LangSplat halves large ones (nearest neighbour), may lack features, and the folder may be the dataset with its
+What other programs do to the files is in module files; besides, images may have another size than their masks, as
+LangSplat shrinks large ones (nearest neighbour), may lack features, and the folder may be the dataset with its
 language_features/, or that folder in itself, as one archive has it.
 """
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,14 +31,21 @@ from normlift_ns.encoders.langsplat.files import (
     write_npy,
 )
 from normlift_ns.encoders.regions import resample_nearest
-from normlift_ns.encoders.source import FeatureSource, RegionFeatures, TextEncoder, ViewFeatures, joint_partition
+from normlift_ns.encoders.source import (
+    FeatureSource,
+    RegionFeatures,
+    TextEncoder,
+    ViewFeatures,
+    joint_partition,
+    refuse_shared,
+)
 from normlift_ns.errors import InputError
 from normlift_ns.options import Missing
 
 Level = Literal["default", "s", "m", "l", "sum"]
 _NESTED = "language_features"
-_ASPECT = 0.02
-"""Relative difference of aspect ratios up to which a map is the same picture in another resolution."""
+_ALMOST = 0.02
+"""Sizes that differ by less than this share are no other resolution but another crop: that of an undistorted image."""
 _CANCELLED = 1e-6
 """Sums of unit vectors shorter than this have no direction."""
 
@@ -65,7 +73,7 @@ class LangSplat:
     missing: Missing = "error"
     """What to do about images without features: refuse, or leave them out with a warning."""
     resample: bool = False
-    """Take maps of another aspect ratio than the image too."""
+    """Take maps of any other size than the image's, not only the same picture in another resolution."""
 
     def __post_init__(self) -> None:
         for flag, value, known in (("--level", self.level, Level), ("--features-missing", self.missing, Missing)):
@@ -78,7 +86,7 @@ class LangSplat:
         """Where the files are."""
         places = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for place in places:
-            if next(place.glob("*_s.npy"), None) is not None:
+            if os.path.isdir(place) and next(place.glob("*_s.npy"), None) is not None:
                 return place
         raise FileNotFoundError(
             f"{self.root} holds no features of LangSplat (--features-dir): no *_s.npy in it, nor in {places[1]} or "
@@ -107,15 +115,10 @@ class LangSplat:
                     "--features-missing skip"
                 )
             warnings.warn(f"{what}; they are left out", stacklevel=2)
-        owner: dict[_Files, str] = {}
+        maps = ((name, files.segments) for name, files in found.items())
+        refuse_shared(maps, "features", "and name the images so that they differ before the first dot")
         dimensions: dict[int, Path] = {}
-        for name, files in found.items():
-            if files in owner:
-                raise InputError(
-                    f"images {owner[files]} and {name} would share the features {files.segments}; name the images so "
-                    "that they differ before the first dot"
-                )
-            owner[files] = name
+        for files in found.values():
             dimensions.setdefault(open_table(files.features).shape[1], files.features)
             open_segments(files.segments)
         if len(dimensions) > 1:
@@ -127,9 +130,7 @@ class LangSplat:
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         """As in `FeatureSource`; raises as `available`, and ValueError for ids that are no integers."""
-        files = self._files(name)
-        if files is None:
-            raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
+        files = self._found(name)
         table, good = read_table(files.features)
         good = torch.cat([good, good.new_zeros(1)])  # row -1
         maps = read_segments(files.segments, len(table))
@@ -157,22 +158,49 @@ class LangSplat:
         file = PurePosixPath(name)
         for stem in (file.stem, file.name.split(".")[0]):
             files = _Files(self.folder / f"{stem}_s.npy", self.folder / f"{stem}_f.npy")
-            if stem != "" and files.segments.is_file() and files.features.is_file():
+            if stem != "" and all(map(os.path.isfile, files)):
                 return files
         return None
+
+    def _found(self, name: str) -> _Files:
+        files = self._files(name)
+        if files is None:
+            raise FileNotFoundError(f"image {name} has no features in {self.folder}; expected <name>_s.npy and _f.npy")
+        return files
 
     def _fitted(self, maps: np.ndarray, image: Tensor, path: Path) -> np.ndarray:
         height, width = image.shape[:2]
         if maps.shape[1:] == (height, width):
             return maps
-        ratio = (width / height) / (maps.shape[2] / maps.shape[1])
-        if abs(ratio - 1) > _ASPECT and not self.resample:
+        if not self.resample and not same_picture(maps.shape[2], maps.shape[1], width, height):
             raise InputError(
                 f"{path} is {maps.shape[2]}x{maps.shape[1]} (width x height), its image {width}x{height}: another "
-                "aspect ratio, so another crop or orientation; preprocess the images that the run was trained with "
-                "(nerfstudio undistorts them), or stretch the maps: --regions-resample True"
+                "aspect ratio, or almost the same size, so another crop or orientation; preprocess the images that the "
+                "run was trained with (nerfstudio undistorts them, which crops them), or stretch the maps: "
+                "--regions-resample True"
             )
         return resample_nearest(maps, height, width)
+
+    def size(self, name: str) -> tuple[Path, int, int]:
+        """The map of an image, its width and its height; raises as `view`."""
+        files = self._found(name)
+        _, height, width = open_segments(files.segments).shape
+        return files.segments, width, height
+
+
+def same_picture(map_width: int, map_height: int, width: int, height: int) -> bool:
+    """Whether a map may be of the same picture in another resolution: the sizes have one factor between them, but for
+    the rounding of the smaller one to whole pixels.
+
+    >>> same_picture(606, 1080, 1079, 1921), same_picture(1080, 1920, 1079, 1919), same_picture(606, 1090, 1079, 1921)
+    (True, False, False)
+    """
+    across, down = width / map_width, height / map_height
+    if abs(across - 1) < _ALMOST and abs(down - 1) < _ALMOST:
+        return (map_width, map_height) == (width, height)
+    if across > 1:
+        across, down = 1 / across, 1 / down
+    return abs(across - down) <= 1 / max(width, map_width) + 1 / max(height, map_height)
 
 
 def _summed(cells: Tensor, rows: Tensor, table: Tensor) -> ViewFeatures:
@@ -182,6 +210,27 @@ def _summed(cells: Tensor, rows: Tensor, table: Tensor) -> ViewFeatures:
     kept = torch.linalg.vector_norm(sums, dim=1) > _CANCELLED
     regions = torch.where(kept, kept.cumsum(0) - 1, -1)
     return ViewFeatures(cells, normalize(sums[kept], dim=1).float(), regions.int()[None])
+
+
+def refuse_equal_stems(names: Sequence[str]) -> None:
+    """Makes sure that files written for some images would not replace each other.
+
+    Raises:
+        ValueError: two images whose files would have the same name.
+    """
+    owner: dict[str, str] = {}
+    for name in names:
+        other = owner.setdefault(_stem(name), name)
+        if other != name:
+            raise InputError(
+                f"images {other} and {name} would both be exported as {_stem(name)}_s.npy, as LangSplat names its "
+                "files; name the images so that they differ before the first dot, or lift without the export"
+            )
+
+
+def _stem(name: str) -> str:
+    """What LangSplat calls the files of an image."""
+    return PurePosixPath(name).name.split(".")[0]
 
 
 def write_langsplat(
@@ -210,7 +259,7 @@ def write_langsplat(
         levels = [(torch.cat([view.region_of_cell[0], nothing])[view.labels.long()], view.features)]
     first = torch.tensor([0, *(len(rows) for _, rows in levels)]).cumsum(0).tolist()
     segments = torch.stack([torch.where(labels >= 0, labels + start, -1) for (labels, _), start in zip(levels, first)])
-    stem = PurePosixPath(name).name.split(".")[0]
+    stem = _stem(name)
     for suffix, array in (
         ("s", segments.float().expand(len(LEVELS), -1, -1)),
         ("f", torch.cat([rows for _, rows in levels])),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,9 +82,11 @@ def check_sam(checkpoint: str) -> None:
         FileNotFoundError: what looks like a path does not exist.
     """
     import_transformers()
-    if Path(checkpoint).exists():
-        return
     path = Path(checkpoint)
+    if os.path.isfile(path) or os.path.isdir(path):
+        return
+    if os.path.lexists(path):
+        raise InputError(f"SAM checkpoint {checkpoint} is neither a file nor a folder; {REMEDY}")
     if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
         raise FileNotFoundError(f"SAM checkpoint {checkpoint} does not exist; check the path, or {REMEDY}")
     if len(path.parts) != 2:
@@ -94,7 +97,7 @@ def check_sam(checkpoint: str) -> None:
 
 def local_sam(checkpoint: str) -> Path | None:
     """Where a checkpoint lies on this machine, the cache of the hub included; None: nowhere."""
-    if Path(checkpoint).exists():
+    if os.path.exists(checkpoint):
         return Path(checkpoint).resolve()
     hub = importlib.import_module("huggingface_hub")
     for file in _FILES:
@@ -107,7 +110,7 @@ def local_sam(checkpoint: str) -> Path | None:
 def sam_identity(checkpoint: str) -> str:
     """Local files count by their content, a name of the hub as it is."""
     path = Path(checkpoint)
-    if not path.exists():
+    if not os.path.exists(path):
         return checkpoint
     return file_digest(*(file for file in (path, path / "config.json", *_weights(path)) if file.is_file()))
 
@@ -128,7 +131,9 @@ def load_sam(checkpoint: str) -> Any:
         with torch.device("meta"):
             model = import_transformers().SamModel(config)
         model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
-    except Exception as error:  # whatever a foreign file makes torch, safetensors and transformers raise
+    except MemoryError:
+        raise
+    except Exception as error:  # the configs of transformers raise types of their own for a wrong value
         raise InputError(f"SAM checkpoint {path} is damaged or not of SAM ({first_line(error)}); {REMEDY}") from None
     return model.eval().requires_grad_(False)
 
@@ -140,7 +145,7 @@ def _download(checkpoint: str) -> Path:
         folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
         wanted = ["config.json", _FILES[0]] if _model_type(folder) == "sam" else ["config.json"]
         return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
-    except Exception as error:  # whatever a download makes its libraries raise
+    except Exception as error:  # a download's client raises types of its own, which have nothing in common
         raise FileNotFoundError(
             f"SAM checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
             f"({first_line(error)}); go online once, or {REMEDY}"

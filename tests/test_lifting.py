@@ -1,0 +1,269 @@
+"""What a lift refuses or warns of, on a scene made by hand: nothing labelled, files shared by two images, label maps of
+photographs that were undistorted."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, View
+from normlift_ns.encoders import LangSplat, RegionFeatures
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.regions import LabelFiles
+from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.evaluation.options import LerfOptions, MaskOptions
+from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
+from normlift_ns.lifting import Export, lift_scene
+from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.photographs import PhotographViews
+from normlift_ns.viewer.pictures import picture_names, save_overlay, save_overlays, training_cameras
+from tests.scenes import generator
+
+WIDTH, HEIGHT, N = 24, 18, 30
+
+
+@dataclass
+class Photographs:
+    names: Sequence[str]
+    original: tuple[int, int] | None = None
+    mask: torch.Tensor | None = None
+
+    @property
+    def cameras(self) -> list[Camera]:
+        pose = torch.eye(4)
+        pose[2, 3] = 2
+        return [Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), pose, WIDTH, HEIGHT)] * len(self)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> View:
+        image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator(index), dtype=torch.uint8)
+        return View(self.cameras[index], image, self.mask, self.names[index], self.original)
+
+
+def scene(*names: str, count: int = N, held_out: Sequence[str] = (), **more: Any) -> Any:
+    g = generator(0)
+    means = torch.rand(count, 3, generator=g) - 0.5
+    gaussians = GaussianScene(
+        means, torch.randn(count, 4, generator=g), torch.full((count, 3), 0.05), torch.full((count,), 0.8)
+    )
+    return SimpleNamespace(
+        gaussians=gaussians, train=Photographs(names or ("images/a.png",), **more), held_out=Photographs(held_out),
+        rasterize_mode="classic", identity={}, name="made",
+    )  # fmt: skip
+
+
+def lifted(source: FeatureSource, cache: Path, made: Any = None, **options: Any) -> Any:
+    export = options.pop("export", None)
+    given = LiftOptions(refine=False, **options)
+    return lift_scene(scene() if made is None else made, source, given, cache, encoder={}, export=export)
+
+
+def files(folder: Path, array: np.ndarray, *stems: str, **options: Any) -> RegionFeatures:
+    for stem in stems or ("a",):
+        (folder / stem).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"{stem}.npy", array)
+    return RegionFeatures(LabelFiles(folder, **options), ColourEncoder())
+
+
+FULL = np.ones((HEIGHT, WIDTH), int)
+
+
+@pytest.mark.parametrize("unlabeled", ["ignore", "dilute"])
+@pytest.mark.parametrize("value", [0, -1, -5])
+def test_nothing_labelled_is_refused(value: int, unlabeled: str, tmp_path: Path) -> None:
+    source = files(tmp_path / "maps", value * FULL)
+    with pytest.raises(InputError, match=r"nothing was labelled: .* 30 Gaussians .*files in .*maps.*--regions-back"):
+        lifted(source, tmp_path / "cache", unlabeled=unlabeled)
+
+
+def test_nothing_that_the_mask_leaves_is_refused(tmp_path: Path) -> None:
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    with pytest.raises(InputError, match=r"nothing was labelled: .*masks leave nothing"):
+        lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", scene(mask=mask))
+
+
+def test_a_scene_that_no_camera_sees_is_refused(tmp_path: Path) -> None:
+    made = scene()
+    made.gaussians = GaussianScene(
+        made.gaussians.means - 100, made.gaussians.quats, made.gaussians.scales, made.gaussians.opacities
+    )
+    with pytest.raises(InputError, match=r"nothing was labelled: .*cameras do not see the scene"):
+        lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
+
+
+def test_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
+    made = scene(count=3000)
+    made.gaussians.means[5:, 2] -= 100  # behind the camera
+    with pytest.warns(UserWarning, match=r"only 5 of 3,000 Gaussians \(0\.17%\) are seen in labelled pixels"):
+        lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lifted(files(tmp_path / "maps", FULL), tmp_path / "cache")
+
+
+def test_images_that_share_a_label_map_are_refused(tmp_path: Path) -> None:
+    made = scene("a/0000.png", "b/0000.png")
+    source = files(tmp_path / "maps", FULL, "0000")
+    with pytest.raises(InputError, match=r"images a/0000\.png and b/0000\.png would share the label map .*0000\.npy"):
+        lifted(source, tmp_path / "cache", made)
+    lifted(files(tmp_path / "maps", FULL, "a/0000", "b/0000"), tmp_path / "cache", made)
+    (tmp_path / "maps" / "b" / "0000.npy").unlink()
+    (tmp_path / "maps" / "b" / "0000.npy").symlink_to(tmp_path / "maps" / "a" / "0000.npy")
+    with pytest.raises(InputError, match="would share the label map"):
+        lifted(source, tmp_path / "cache", made)
+
+
+def test_images_that_share_an_instance_mask_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "labels.json").write_text('{"1": "a"}')
+    np.save(tmp_path / "0000.npy", FULL)
+    made = scene("a/0000.png", held_out=("b/0000.png",))
+    with pytest.raises(InputError, match=r"a/0000\.png and b/0000\.png would share the instance mask .*0000\.npy"):
+        mask_truth(made, tmp_path, MaskOptions(names=tmp_path / "labels.json"))
+    (tmp_path / "labels.json").write_text('{"2": "a"}')
+    with pytest.raises(InputError, match=r"no Gaussian lies in a mask of .*labels\.json"):
+        mask_truth(scene("0000.png"), tmp_path, MaskOptions(names=tmp_path / "labels.json"))
+
+
+def test_frames_of_images_of_one_stem_are_refused(tmp_path: Path) -> None:
+    info = {"width": WIDTH, "height": HEIGHT}
+    egg = {"category": "egg", "segmentation": [[1, 1], [5, 1], [5, 5]]}
+    (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": [egg]}))
+    run = EvaluatedRun(scene("a/0000.png", held_out=("b/0000.png",)), None, None, True)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"0000\.json labels one image, but a/0000\.png and b/0000\.png"):
+        run_lerf([run], [tmp_path], LerfOptions())
+    (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))
+    run = EvaluatedRun(scene("a/0000.png"), None, ColourEncoder(), True)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="name no object"):
+        run_lerf([run], [tmp_path], LerfOptions())
+
+
+def langsplat(folder: Path, height: int, width: int, **options: Any) -> LangSplat:
+    folder.mkdir(exist_ok=True)
+    np.save(folder / "a_s.npy", np.zeros((4, height, width), np.float32))
+    np.save(folder / "a_f.npy", np.eye(20, dtype=np.float32)[:1])
+    return LangSplat(folder, ColourEncoder(), "l", **options)
+
+
+RAW = (WIDTH + 1, HEIGHT + 1)
+
+
+@pytest.mark.parametrize("kind", ["langsplat", "files"])
+@pytest.mark.parametrize(
+    ("height", "width", "what"),
+    [
+        (HEIGHT + 1, WIDTH + 1, "the size of the photograph as it was taken"),
+        (HEIGHT // 2, WIDTH // 2, "another size"),
+        (2 * HEIGHT + 2, 2 * WIDTH + 2, "another size"),
+    ],
+)
+def test_maps_of_distorted_photographs_are_refused(
+    kind: str, height: int, width: int, what: str, tmp_path: Path
+) -> None:
+    """Also where another size of the same picture is: half of 25 x 19 is half of 24 x 18, but for the distortion."""
+
+    def source(resample: bool) -> FeatureSource:
+        if kind == "langsplat":
+            return langsplat(tmp_path / "maps", height, width, resample=resample)
+        return files(tmp_path / "maps", np.ones((height, width), int), resample=resample)
+
+    message = rf"label map .*maps\S+ (of images/a\.png )?is {width}x{height} \(width x height\), {what}; .*undistorted"
+    with pytest.raises(InputError, match=message + r".*to 24x18\. Make .*--regions-resample True"):
+        lifted(source(False), tmp_path / "cache", scene(original=RAW))
+    with pytest.warns(UserWarning, match=message + ".*it is stretched"):
+        lifted(source(True), tmp_path / "cache", scene(original=RAW))
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.01])
+def test_photographs_say_whether_they_were_undistorted(k1: float, tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    intrinsics = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30, k1)
+    view = PhotographViews([Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], intrinsics)], torch.zeros(3))[0]
+    assert view.original == (None if k1 == 0 else (40, 30))
+    assert (view.camera.width, view.camera.height) == ((40, 30) if k1 == 0 else (39, 29))
+
+
+@pytest.mark.parametrize("kind", ["langsplat", "files"])
+def test_maps_of_undistorted_photographs_are_taken(kind: str, tmp_path: Path) -> None:
+    source = langsplat(tmp_path / "maps", HEIGHT, WIDTH) if kind == "langsplat" else files(tmp_path / "maps", FULL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lifted(source, tmp_path / "cache", scene(original=RAW))
+        if kind == "langsplat":
+            lifted(source, tmp_path / "cache", scene(original=RAW), lift_downscale=2)
+            lifted(langsplat(tmp_path / "maps", HEIGHT // 2, WIDTH // 2), tmp_path / "cache", scene())
+    source = langsplat(tmp_path / "maps", HEIGHT, WIDTH) if kind == "langsplat" else source
+    with pytest.warns(UserWarning, match="without changing its size: make sure that the label maps in .*maps"):
+        lifted(source, tmp_path / "cache", scene(original=(WIDTH, HEIGHT)))
+
+
+def test_exported_files_of_images_of_one_stem_are_refused(tmp_path: Path) -> None:
+    made = scene("a/0.left.png", "b/0.right.png")
+    source = files(tmp_path / "maps", FULL, "a/0.left", "b/0.right")
+    with pytest.raises(InputError, match=r"a/0\.left\.png and b/0\.right\.png would both be exported as 0_s\.npy"):
+        lifted(source, tmp_path / "cache", made, export=Export(tmp_path / "out", True))
+    assert not (tmp_path / "out").exists()
+
+
+def test_masks_and_images_of_another_size_are_named(tmp_path: Path) -> None:
+    mask = torch.ones(HEIGHT, WIDTH + 1, dtype=torch.bool)
+    with pytest.raises(InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera \(18, 24\)"):
+        lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", scene(mask=mask))
+
+
+# Pictures.
+
+
+@pytest.mark.parametrize(
+    ("images", "expected"),
+    [
+        (["images/0.png", "images/1.png"], ["0", "1"]),
+        (["a/0.png", "b/0.png", "b/1.png"], ["a_0", "b_0", "1"]),
+        (["0.png", "0.jpg"], ["0.png", "0.jpg"]),
+        (["a/b_0.png", "a_b/0.png", "c/0.png"], ["b_0", "a_b_0", "c_0"]),
+        (["a/b/0.png", "a_b/0.png"], ["a_b_0.png", "a_b_0_2.png"]),
+        (["a/X.png", "b/x.png"], ["a_X", "b_x"]),
+        (["/data/a/0.png", "../b/0.png"], ["_data_a_0", ".._b_0"]),
+    ],
+)
+def test_pictures_of_different_images_have_different_names(images: list[str], expected: list[str]) -> None:
+    assert picture_names(images) == expected
+
+
+def test_no_camera_is_lost_and_none_is_guessed() -> None:
+    made = scene("a/0000.png", "b/0000.png", "b/0001.png")
+    assert list(training_cameras(made)) == ["a_0000", "b_0000", "0001"]
+    for name in ("b_0000", "b/0000", "b/0000.png"):
+        assert list(training_cameras(made, [name])) == ["b_0000"]
+    assert list(training_cameras(made, ["0001", "a_0000"])) == ["0001", "a_0000"]
+    with pytest.raises(InputError, match="2 training images are called '0000'; say which one: a_0000, b_0000"):
+        training_cameras(made, ["0000"])
+    with pytest.raises(InputError, match="there is no training image 'c'; there are 3, from 'a_0000' to '0001'"):
+        training_cameras(made, ["c"])
+
+
+def test_pictures_that_would_replace_each_other_are_refused(tmp_path: Path) -> None:
+    made = scene("a.png", "a_0_x.png")
+    answer: Any = SimpleNamespace(texts=("x 1 y", "y"))
+    with pytest.raises(InputError, match=r"two pictures would be called .*a_0_x_1_y\.png"):
+        save_overlays(made, answer, training_cameras(made), tmp_path)
+
+
+@pytest.mark.parametrize("text", [r"$\frac{$", "$", "a\nb", "[/red]", "\ud800", "x\0y", "", "x" * 3000])
+@pytest.mark.filterwarnings("ignore:Glyph")
+def test_a_text_is_drawn_as_it_is(text: str, tmp_path: Path) -> None:
+    answer: Any = SimpleNamespace(question=SimpleNamespace(rule="cosine", threshold=0.5))
+    image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    save_overlay(tmp_path / "a.png", image, torch.zeros(HEIGHT, WIDTH), text, answer)
+    assert (tmp_path / "a.png").stat().st_size > 1000
