@@ -28,7 +28,7 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     model: dict[str, Tensor]
-    """State of the model on the CPU: gauss_params.* in float32, camera_optimizer.*, ...; neither optimizers nor LPIPS."""
+    """State of the model on the CPU: gauss_params.* in float32, camera_optimizer.*, …, without optimizers and LPIPS."""
 
 
 def find_checkpoint(folder: Path, step: int | None = None) -> Path:
@@ -210,7 +210,12 @@ def numpy_numbers() -> list[Any]:
     rebuild: Any = np.float64(0).__reduce__()[0]
     modules = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
     dtypes = {type(np.dtype(code)) for code in "?bBhHiIlLqQefd"}
-    return [np.dtype, *dtypes, _named(_latin1, "_codecs", "encode"), *(_named(rebuild, module, "scalar") for module in modules)]
+    return [
+        np.dtype,
+        *dtypes,
+        _named(_latin1, "_codecs", "encode"),
+        *(_named(rebuild, module, "scalar") for module in modules),
+    ]
 
 
 def _latin1(text: str, encoding: str) -> bytes:

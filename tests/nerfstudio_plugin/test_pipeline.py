@@ -111,7 +111,10 @@ def test_a_failing_lift_leaves_the_training_whole(
     monkeypatch.setattr(module, broken, fail)
     trained = train(broken, queries=("red",))
     shown = capsys.readouterr()
-    assert "out of luck" in shown.err
+    log = trained.trainer.base_dir / "normlift_error.txt"
+    assert f"RuntimeError: out of luck; the details are in {log}" in shown.out
+    assert "Traceback" in log.read_text()
+    assert "Traceback" not in shown.out + shown.err
     assert "The training is complete and saved" in shown.out
     assert f"ns-normlift --load-config {trained.trainer.base_dir / 'config.yml'}" in shown.out
     run = load_scene(trained.config)
