@@ -98,7 +98,8 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     values = loader.construct_mapping(node, deep=True)
     known = {field.name: field for field in fields(cls)}
     if "_target" in known and target is not None and values.setdefault("_target", _found(target)) is not _found(target):
-        raise _refusal(f"the _target of {name} is {values['_target']}, expected {target}", node)
+        found = getattr(values["_target"], "__qualname__", type(values["_target"]).__name__)
+        raise _refusal(f"the _target of {name} is {found}, expected {target}", node)
     if hasattr(config, "__setstate__"):
         config.__setstate__(values)  # renames what version 0.1 called otherwise
         values = dict(vars(config))
@@ -117,7 +118,7 @@ def _construct_call(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
         raise _refusal(f"{name} is no part of a configuration", node)
     parts = loader.construct_sequence(node, deep=True)
     if not all(isinstance(part, str) for part in parts):
-        raise _refusal(f"{name} is made of {parts}, expected text", node)
+        raise _refusal(f"{name} is made of other things than text", node)
     return Path(*parts) if name in _PATHS else _found(name)(*parts)  # also the paths of another operating system
 
 
@@ -127,7 +128,11 @@ def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     return _found(name)
 
 
+def _construct_tuple(loader: ConfigLoader, node: Any) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
 ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}:", _construct_object)
 ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}/apply:", _construct_call)
 ConfigLoader.add_multi_constructor(_NAME_TAG, _construct_name)
-ConfigLoader.add_constructor(_TUPLE_TAG, lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+ConfigLoader.add_constructor(_TUPLE_TAG, _construct_tuple)

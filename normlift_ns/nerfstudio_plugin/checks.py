@@ -41,11 +41,12 @@ def check_config(config: Any, path: Path) -> None:
     for name, value, expected in _wrong(config, TrainerConfig, "", 0):
         raise InputError(f"{path}: {name} is {_shown(value)}, expected {expected}. {_REMEDY}")
     _check_names(config, path)
-    for name, value, fits, expected in _ranges(config.pipeline.model, config.pipeline.datamanager):
+    pipeline: Any = config.pipeline
+    for name, value, fits, expected in _ranges(pipeline.model, pipeline.datamanager):
         if not fits:
             raise InputError(f"{path}: {name} is {_shown(value)}, expected {expected}. {_REMEDY}")
-    if hasattr(config.pipeline, "lift"):
-        check_options(config.pipeline.lift, f"{path}: pipeline.lift")
+    if hasattr(pipeline, "lift"):
+        check_options(pipeline.lift, f"{path}: pipeline.lift")
 
 
 def check_parts(config: TrainerConfig, path: Path) -> None:

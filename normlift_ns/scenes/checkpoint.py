@@ -37,7 +37,8 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     Raises:
         FileNotFoundError: no checkpoint there, or none of that step; the message lists the steps there are.
     """
-    found = {step: path for path in sorted(folder.glob("step-*.ckpt")) if (step := _step_of(path)) is not None}
+    steps = {path: _step_of(path) for path in sorted(folder.glob("step-*.ckpt"))}
+    found = {number: path for path, number in steps.items() if number is not None}
     if not found:
         raise FileNotFoundError(
             f"No checkpoint in {folder}. Expected step-000029999.ckpt or the like, which ns-train writes every "
