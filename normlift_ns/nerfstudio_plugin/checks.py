@@ -24,6 +24,8 @@ from normlift_ns.options import LiftOptions, RefineConfig
 
 DataParser = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
 """Those whose data sets are read."""
+_PASSED_OVER = ("_target", "vis")
+"""The loader compares the one; the other is for trainings alone, and programs set it to what the flag does not know."""
 _DEEPEST, _LARGEST_INT = 12, 2**53
 _REMEDY = "Restore the config.yml that ns-train wrote, or train the capture again with: ns-train splatfacto --data ..."
 
@@ -107,7 +109,7 @@ def _wrong(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, 
             return
         hints = get_type_hints(type(value))
         for item in fields(value):
-            if item.name != "_target":  # its loader has compared that
+            if item.name not in _PASSED_OVER:
                 below = f"{name}.{item.name}" if name else item.name
                 yield from _wrong(getattr(value, item.name), hints[item.name], below, depth + 1)
     elif origin is tuple:
