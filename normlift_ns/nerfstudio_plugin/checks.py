@@ -16,14 +16,19 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+from normlift_ns.nerfstudio_plugin.allowed import PAIRS
 from normlift_ns.options import LiftOptions, RefineConfig
 
 DataParser = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
 """Those whose data sets are read."""
+_PARTS = {
+    "pipeline": ("VanillaPipelineConfig", "NormLiftPipelineConfig"),
+    "pipeline.datamanager": ("FullImageDatamanagerConfig",),
+    "pipeline.datamanager.dataparser": tuple(cls.__name__ for cls in get_args(DataParser)),
+    "pipeline.model": ("SplatfactoModelConfig", "NormLiftModelConfig"),
+}
 _PASSED_OVER = ("_target", "vis")
 """The loader compares the one; the other is for trainings alone, and programs set it to what the flag does not know."""
 _DEEPEST, _LARGEST_INT = 12, 2**53
@@ -57,22 +62,15 @@ def check_parts(config: TrainerConfig, path: Path) -> None:
     Raises:
         ValueError: one of them is of another class; the message names both.
     """
-    from normlift_ns.nerfstudio_plugin.pipeline import NormLiftPipelineConfig  # noqa: PLC0415 (it imports this module)
-
-    accepted = {
-        "pipeline": (VanillaPipelineConfig, NormLiftPipelineConfig),
-        "pipeline.datamanager": (FullImageDatamanagerConfig,),
-        "pipeline.datamanager.dataparser": get_args(DataParser),
-        "pipeline.model": (SplatfactoModelConfig, NormLiftModelConfig),
-    }
-    for name, classes in accepted.items():
+    for name, classes in _PARTS.items():
         part: Any = config
         for step in name.split("."):
             part = getattr(part, step)
-        if type(part) not in classes:
+        found = type(part)
+        if found.__name__ not in classes or f"{found.__module__}.{found.__qualname__}" not in PAIRS:
             raise InputError(
-                f"{path} says method {str(config.method_name)!r}, but its {name} is a {type(part).__name__}, expected "
-                f"{' or '.join(cls.__name__ for cls in classes)}; only stock splatfacto runs can be lifted. "
+                f"{path} says method {str(config.method_name)!r}, but its {name} is a {found.__name__}, expected "
+                f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "
                 "Train the capture with: ns-train splatfacto --data ..."
             )
 
