@@ -179,6 +179,8 @@ def lift_run(
     if timestamp is not None:
         refuse_existing_run(run_dir, overwrite)
     say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
+    for remark in scene.remarks:
+        say(f"Warning: {remark}")
     if check:
         warning = judge(match_photographs(scene), own_cameras=not isinstance(scene, SplatScene))
         if warning is not None:

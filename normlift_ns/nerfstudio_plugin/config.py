@@ -4,60 +4,23 @@ from __future__ import annotations
 
 import os
 from copy import deepcopy
-from dataclasses import dataclass, is_dataclass
-from enum import Enum
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from normlift_ns.errors import InputError
+from normlift_ns.nerfstudio_plugin.allowed import OBJECT_TAG, ConfigLoader
+from normlift_ns.nerfstudio_plugin.checks import check_config
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
 from normlift_ns.runs.files import FIELD_FOLDER
 
 SUPPORTED_METHODS = ("splatfacto", "splatfacto-big", "normlift", "normlift-lerf-ovs", "normlift-scannet")
-_TRUSTED_PACKAGES = ("nerfstudio", "normlift_ns", "torch.optim")
-_OBJECT_TAG = "tag:yaml.org,2002:python/object"
-
-
-class _ConfigLoader(yaml.FullLoader):
-    """Constructs what nerfstudio's configs consist of, and refuses everything else.
-
-    nerfstudio reads config.yml with `yaml.Loader`, which imports any module and calls any function that the file names.
-    Here a name must be a class of nerfstudio, normlift_ns or torch.optim, and an object must be a dataclass, an enum or
-    a path; no other code runs.
-    """
-
-    def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> type:
-        if not _trusted(name):
-            raise yaml.constructor.ConstructorError(None, None, f"{name} is not a class of nerfstudio", mark)
-        found = super().find_python_name(name, mark, unsafe=True)
-        if not isinstance(found, type) or not _trusted(found.__module__):
-            raise yaml.constructor.ConstructorError(None, None, f"{name} is not a class of nerfstudio", mark)
-        return found
-
-    def make_python_instance(
-        self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False, unsafe: bool = False
-    ) -> Any:
-        if suffix.startswith("pathlib.") and suffix.endswith("Path"):
-            return Path(*(args or ()))  # also the paths of another operating system
-        cls = self.find_python_name(suffix, node.start_mark)
-        if is_dataclass(cls) and newobj:
-            return cls.__new__(cls)
-        if issubclass(cls, Enum) and not newobj:
-            return cls(*args)
-        raise yaml.constructor.ConstructorError(None, None, f"{suffix} is no part of a configuration", node.start_mark)
-
-
-_ConfigLoader.add_multi_constructor(f"{_OBJECT_TAG}:", _ConfigLoader.construct_python_object)
-_ConfigLoader.add_multi_constructor(f"{_OBJECT_TAG}/apply:", _ConfigLoader.construct_python_object_apply)
-
-
-def _trusted(name: str) -> bool:
-    return any(name == package or name.startswith(f"{package}.") for package in _TRUSTED_PACKAGES)
+_LARGEST = 2**18
+"""Bytes of a config.yml; nerfstudio's have 6,000."""
+_EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
 
 
 def read_config(path: Path) -> TrainerConfig:
@@ -65,8 +28,8 @@ def read_config(path: Path) -> TrainerConfig:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a config that nerfstudio wrote, a method that cannot be lifted, or a config that names anything
-            but nerfstudio's own configuration classes.
+        ValueError: not a config that nerfstudio wrote, a method or a data parser that is not supported, a config that
+            names anything but nerfstudio's own configuration classes, or values that these cannot have.
     """
     if not path.is_file():
         hint = f"; {path / 'config.yml'} exists, give that" if (path / "config.yml").is_file() else ""
@@ -74,36 +37,40 @@ def read_config(path: Path) -> TrainerConfig:
             f"No config at {path}{hint}. Expected the config.yml that ns-train wrote, "
             "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
         )
-    expected = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+    if path.stat().st_size > _LARGEST:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it has {path.stat().st_size:,} bytes, more than {_LARGEST:,}. "
+            f"{_EXPECTED}"
+        )
     try:
         text = path.read_text("utf8")
-        root = yaml.compose(text, Loader=_ConfigLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        method = _method_name(yaml.compose(text, Loader=ConfigLoader))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f"{path} is not a nerfstudio config: it is no valid YAML ({_brief(error)}). {expected}"
+            f"{path} is not a nerfstudio config: it is no valid YAML ({_brief(error)}). {_EXPECTED}"
         ) from error
-    method = _method_name(root)
     if method is None:
-        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {expected}")
+        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {_EXPECTED}")
     if method not in SUPPORTED_METHODS:
         raise InputError(
             f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
             "Train the capture with: ns-train splatfacto --data ..."
         )
     try:
-        config = yaml.load(text, Loader=_ConfigLoader)
-    except (yaml.YAMLError, TypeError, ValueError) as error:
+        config = yaml.load(text, Loader=ConfigLoader)
+    except Exception as error:  # PyYAML turns values into dates, numbers and sets, and lets all their errors through
         raise InputError(
-            f"{path} cannot be read: {_brief(error)}. Only the configuration classes of nerfstudio, normlift_ns and "
-            "torch.optim are read; runs that use a plugin's dataparser or datamanager are not supported."
+            f"{path} cannot be read: {_brief(error)}. Only the configuration classes of splatfacto and normlift_ns "
+            "are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
+            "blender-data; turn other data sets into one of those with ns-process-data, and train on that."
         ) from error
-    _check_types(config, path)
+    check_config(config, path)
     return config
 
 
 def _method_name(root: yaml.Node | None) -> str | None:
     """method_name of a config of any method, read without constructing anything."""
-    if not isinstance(root, yaml.MappingNode) or not root.tag.startswith(f"{_OBJECT_TAG}:"):
+    if not isinstance(root, yaml.MappingNode) or not root.tag.startswith(f"{OBJECT_TAG}:"):
         return None
     for key, value in root.value:
         if isinstance(key, yaml.ScalarNode) and key.value == "method_name" and isinstance(value, yaml.ScalarNode):
@@ -113,31 +80,12 @@ def _method_name(root: yaml.Node | None) -> str | None:
 
 def _brief(error: Exception) -> str:
     """One line of a YAML error: what and where."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
     if isinstance(error, yaml.MarkedYAMLError):
         line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
         return f"{error.problem}{line}"
     return " ".join(str(error).split())
-
-
-def _check_types(config: Any, path: Path) -> None:
-    parts = (
-        ("config", config, (TrainerConfig,)),
-        ("pipeline.datamanager", _get(config, "pipeline", "datamanager"), (FullImageDatamanagerConfig,)),
-        ("pipeline.model", _get(config, "pipeline", "model"), (SplatfactoModelConfig, NormLiftModelConfig)),
-    )
-    for name, part, accepted in parts:
-        if type(part) not in accepted:
-            raise InputError(
-                f"{path} says method {config.method_name!r}, but its {name} is a {type(part).__name__}, expected "
-                f"{' or '.join(cls.__name__ for cls in accepted)}; only stock splatfacto runs can be lifted. "
-                "Train the capture with: ns-train splatfacto --data ..."
-            )
-
-
-def _get(value: Any, *names: str) -> Any:
-    for name in names:
-        value = getattr(value, name, None)
-    return value
 
 
 @dataclass(frozen=True)
@@ -179,7 +127,7 @@ def locate(config: TrainerConfig, config_path: Path, data: Path | None = None) -
     """
     run_dir = _absolute(config_path).parent
     above = _without_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
-    output_dir = _absolute(config.output_dir) if above is None else above
+    output_dir = _here(config.output_dir) if above is None else above
     root = None if above is None else _without_tail(above, Path(os.path.normpath(config.output_dir)))
     if data is not None:
         if not data.exists():
@@ -211,6 +159,11 @@ def stored_data(config: TrainerConfig) -> Path:
     """The dataset as the config names it."""
     datamanager: Any = config.pipeline.datamanager
     return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
+
+
+def _here(output_dir: Path) -> Path:
+    """outputs/ of a run that was moved: below the current directory, wherever its config says that it was trained."""
+    return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
 
 
 def _absolute(path: Path) -> Path:

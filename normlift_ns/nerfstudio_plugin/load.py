@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,10 +21,12 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.appearance import LOADED_STEP, background, shading_degree
 from normlift_ns.nerfstudio_plugin.config import RunLocation, locate, read_config, rerooted, stored_data
+from normlift_ns.nerfstudio_plugin.datasets import check_dataset
 from normlift_ns.nerfstudio_plugin.views import DatasetViews
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
+from normlift_ns.scenes.similarity import read_dataparser_transforms
 
 _TRANSFORM_TOLERANCE = 1e-3
 
@@ -48,6 +49,8 @@ class NerfstudioScene:
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
     """From the poses in the dataset to the scene's world: scale * (transform @ point)."""
+    remarks: tuple[str, ...] = ()
+    """What a person should know of the photographs, in whole sentences."""
 
     renderer = None
     """normlift_ns draws as splatfacto does."""
@@ -126,11 +129,13 @@ def load_scene(load_config: Path, *, data: Path | None = None, load_step: int | 
     location = locate(stored, load_config, data)
     config = rerooted(stored, load_config, data)
     checkpoint = read_checkpoint(find_checkpoint(config.relative_model_dir, load_step))
+    model = cast(SplatfactoModelConfig, config.pipeline.model)
+    _check_degree(checkpoint, model, load_config)
+    gaussians = _scene(checkpoint)
     datamanager = _datamanager(config)
     outputs = datamanager.train_dataparser_outputs
     _check_images([*outputs.image_filenames, *(outputs.mask_filenames or ())], location)
-    _check_transform(outputs.dataparser_transform, outputs.dataparser_scale, location)
-    model = cast(SplatfactoModelConfig, config.pipeline.model)
+    remarks = _check_transform(outputs.dataparser_transform, float(outputs.dataparser_scale), location)
     train, held_out = (
         DatasetViews(dataset, location.folder, poses, background(model))
         for dataset, poses in (
@@ -138,22 +143,41 @@ def load_scene(load_config: Path, *, data: Path | None = None, load_step: int | 
             (datamanager.eval_dataset, datamanager.eval_dataset.cameras.camera_to_worlds),
         )
     )
+    remarks += train.check_files()
     transform, scale = outputs.dataparser_transform, float(outputs.dataparser_scale)
-    return NerfstudioScene(stored, location, checkpoint, _scene(checkpoint.model), train, held_out, transform, scale)
+    return NerfstudioScene(stored, location, checkpoint, gaussians, train, held_out, transform, scale, remarks)
 
 
-def _scene(state: Mapping[str, Tensor]) -> GaussianScene:
-    return GaussianScene(
+def _check_degree(checkpoint: Checkpoint, model: SplatfactoModelConfig, load_config: Path) -> None:
+    found = checkpoint.model["gauss_params.features_rest"].shape[1]
+    if found != (model.sh_degree + 1) ** 2 - 1:
+        raise InputError(
+            f"{checkpoint.path} has {found} spherical harmonics beyond the first, but {load_config} says sh_degree "
+            f"{model.sh_degree}, which needs {(model.sh_degree + 1) ** 2 - 1}. Expected the checkpoint and the config "
+            "of one training; copy both again."
+        )
+
+
+def _scene(checkpoint: Checkpoint) -> GaussianScene:
+    state = checkpoint.model
+    scene = GaussianScene(
         means=state["gauss_params.means"],
         quats=state["gauss_params.quats"],
         scales=state["gauss_params.scales"].exp(),
         opacities=state["gauss_params.opacities"].sigmoid().squeeze(-1),
     )
+    if not bool(scene.drawable.any()):
+        raise InputError(
+            f"{checkpoint.path}: none of its {len(scene):,} Gaussians can be drawn, because all have parameters that "
+            "are NaN, infinite or rotations of zeros. Give another checkpoint with --load-step, or train again."
+        )
+    return scene
 
 
 def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
     """nerfstudio's own, in test mode: "inference" would switch the downscaling of the images off."""
     data = stored_data(config)
+    check_dataset(cast(Any, config.pipeline.datamanager).dataparser)
     try:
         return config.pipeline.datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
     except FileNotFoundError as error:
@@ -161,7 +185,7 @@ def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
             f"{error.filename} is missing from the dataset {data}. Expected the dataset that the run was trained with; "
             "say where it is with --data."
         ) from error
-    except (AssertionError, LookupError, OSError, RuntimeError, ValueError) as error:
+    except (Exception, SystemExit) as error:  # whatever nerfstudio makes of a data set that it was not trained with
         raise InputError(
             f"nerfstudio cannot read the dataset {data} ({type(error).__name__}: {error}). Expected the dataset that "
             "the run was trained with; say where it is with --data."
@@ -170,7 +194,7 @@ def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
 
 def _check_images(files: Sequence[Path], location: RunLocation) -> None:
     """A lift takes minutes; a file that is missing should show before."""
-    missing = [file for file in files if not file.exists()]
+    missing = [file for file in files if not file.is_file()]
     if missing:
         raise FileNotFoundError(
             f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing, the first is "
@@ -178,20 +202,25 @@ def _check_images(files: Sequence[Path], location: RunLocation) -> None:
         )
 
 
-def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: RunLocation) -> None:
+def _check_transform(transform: Float[Tensor, "3 4"], scale: float, location: RunLocation) -> tuple[str, ...]:
     """The dataset must give the world that the Gaussians live in: nerfstudio derives it from all poses together."""
     file = location.run_dir / "dataparser_transforms.json"
     if not file.exists():
-        return
-    trained = json.loads(file.read_text("utf8"))
-    gap = _world(torch.tensor(trained["transform"]), trained["scale"]) - _world(transform, scale)
-    if float(gap.abs().max()) > _TRANSFORM_TOLERANCE or abs(scale / trained["scale"] - 1) > _TRANSFORM_TOLERANCE:
+        return (
+            f"{file} is missing, which ns-train writes: whether the cameras are still those of the training cannot be "
+            "told.",
+        )
+    trained = read_dataparser_transforms(file)
+    known = torch.from_numpy(trained.transform).to(transform)
+    gap = float((_world(known, trained.scale) - _world(transform, scale)).abs().max())
+    if not (gap <= _TRANSFORM_TOLERANCE and abs(scale / trained.scale - 1) <= _TRANSFORM_TOLERANCE):  # nor NaN
         raise InputError(
             f"The dataset {location.data} is not the one that {location.run_dir} was trained with: its poses give "
-            f"scale {scale:.6g}, the training had {trained['scale']:.6g}, and the world coordinates differ by up to "
-            f"{float(gap.abs().max()):.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json "
-            "or name the right dataset with --data."
+            f"scale {scale:.6g}, the training had {trained.scale:.6g}, and the world coordinates differ by up to "
+            f"{gap:.3g} ({file.name}). Frames were added, removed or moved; restore transforms.json or name the right "
+            "dataset with --data."
         )
+    return ()
 
 
 def _world(transform: Tensor, scale: float) -> Tensor:
@@ -204,11 +233,17 @@ def _training_poses(cameras: Cameras, model: SplatfactoModelConfig, checkpoint: 
     if model.camera_optimizer.mode == "off":
         return cameras.camera_to_worlds
     adjustment = checkpoint.model.get("camera_optimizer.pose_adjustment")
-    if adjustment is None or len(adjustment) != len(cameras):
+    found = 0 if adjustment is None or adjustment.ndim == 0 else len(adjustment)
+    if adjustment is None or found != len(cameras):
         raise InputError(
             f"The run optimised its camera poses (mode {model.camera_optimizer.mode}), but {checkpoint.path} has "
-            f"{0 if adjustment is None else len(adjustment)} of them for {len(cameras)} training images. Use the "
-            "checkpoint and the dataset of the run; say where the dataset is with --data."
+            f"{found} of them for {len(cameras)} training images. Use the checkpoint and the dataset of the run; say "
+            "where the dataset is with --data."
+        )
+    if adjustment.shape[1:] != (6,) or not bool(adjustment.isfinite().all()):
+        raise InputError(
+            f"{checkpoint.path}: its camera_optimizer.pose_adjustment is {adjustment.dtype} {tuple(adjustment.shape)}, "
+            f"or not finite. Expected finite numbers of shape ({len(cameras)}, 6); copy the checkpoint again."
         )
     optimizer = model.camera_optimizer.setup(num_cameras=len(adjustment), device="cpu")
     poses = []

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 import shutil
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -19,10 +22,11 @@ from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
+from normlift_ns.nerfstudio_plugin.checks import check_options, check_parts
 from normlift_ns.nerfstudio_plugin.config import stored_data
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
-from normlift_ns.nerfstudio_plugin.views import image_name
+from normlift_ns.nerfstudio_plugin.views import DatasetViews, image_name
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, digests_beside, sealed
 from normlift_ns.runs.question import save_question
@@ -66,6 +70,7 @@ class NormLiftPipeline(VanillaPipeline):
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
         model.detach()  # of a lifted checkpoint that is trained further
         if trainer is not None and trainer.local_rank == 0:
+            check_before(trainer)
             source = source_of(trainer.config)
             folder = dataset_folder(trainer.config)
             files = self.datamanager.train_dataset.image_filenames  # type: ignore[union-attr]
@@ -75,6 +80,32 @@ class NormLiftPipeline(VanillaPipeline):
             after = [TrainingCallbackLocation.AFTER_TRAIN]
             callbacks.append(TrainingCallback(after, _lift_at_the_end, args=[trainer]))
         return callbacks
+
+
+def check_before(trainer: Trainer) -> None:
+    """Refuses, before hours of training, what the lift at its end would refuse.
+
+    Raises:
+        ValueError, FileNotFoundError: a data parser or model that cannot be lifted, options out of range, photographs
+            that training reads into something else.
+        PermissionError: the folder of the lift's caches cannot be written.
+    """
+    config: Any = trainer.config
+    path = trainer.base_dir / "config.yml"
+    check_parts(config, path)
+    check_options(config.pipeline.lift, "--pipeline.lift")
+    datamanager: Any = trainer.pipeline.datamanager
+    dataset = datamanager.train_dataset
+    poses = dataset.cameras.camera_to_worlds
+    for remark in DatasetViews(dataset, dataset_folder(config), poses, torch.zeros(3)).check_files():
+        CONSOLE.print(f"Warning: {remark}", markup=False, soft_wrap=True)
+    cache = cache_folder(trainer.base_dir)
+    for folder in (cache if cache.exists() else cache.parent, trainer.base_dir):
+        if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(
+                f"{folder} cannot be written, so the lift at the end of the training would fail. Allow it, or choose "
+                "another folder with --output-dir."
+            )
 
 
 def dataset_folder(config: TrainerConfig) -> Path:
@@ -108,14 +139,21 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
     config = trainer.base_dir / "config.yml"
     try:
         lift_trained(trainer)
-    except Exception:  # whatever it is
+    except Exception as error:  # whatever it is
         if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
-        traceback.print_exc()
+        reason = str(error)
+        if not isinstance(error, ValueError | OSError | MemoryError):  # no mistake of the user's
+            log = trainer.base_dir / "normlift_error.txt"
+            with suppress(OSError):
+                write_text(log, traceback.format_exc(), overwrite=True)
+            reason = f"{type(error).__name__}: {error}; the details are in {log}"
         CONSOLE.rule("Error", style="red")
         CONSOLE.print(
-            f"The training is complete and saved, but lifting it at step {step} failed, see above. "
-            f"Lift it again with: ns-normlift --load-config {config}",
+            f"The training is complete and saved, but lifting it at step {step} failed: {reason}\n"
+            f"Lift it again with: ns-normlift --load-config {shlex.quote(str(config))}",
+            markup=False,
+            highlight=False,
             soft_wrap=True,
         )
 
@@ -148,5 +186,6 @@ def lift_trained(trainer: Trainer) -> Path:
     viewer: Any = trainer.viewer_state
     if hasattr(viewer, "_trigger_rerender"):
         viewer._trigger_rerender()
-    CONSOLE.print(f"Lifted: {folder}. Ask it with: ns-normlift-query --load-config {path} --text ...", soft_wrap=True)
+    again = f"ns-normlift-query --load-config {shlex.quote(str(path))} --text ..."
+    CONSOLE.print(f"Lifted: {folder}. Ask it with: {again}", markup=False, soft_wrap=True)
     return folder

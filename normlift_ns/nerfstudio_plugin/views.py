@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,11 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
 from normlift_ns.errors import InputError
+from normlift_ns.scenes.image_files import check_mask, read_head, remarks
 from normlift_ns.scenes.photographs import to_camera
 
+_READ_WELL = {"RGB", "RGBA", "L", "CMYK"}
+"""Kinds of pixels that nerfstudio can be trained on; CMYK in strange colours."""
 _DRAWN_AS_PINHOLE = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
 
 
@@ -86,6 +89,12 @@ class DatasetViews:
         return [self._camera(i) for i in range(len(self))]
 
     def _camera(self, index: int) -> Camera:
+        try:
+            return self._pinhole(index)
+        except InputError as error:
+            raise InputError(f"The camera of {self.files[index]} cannot be used: {error}") from error
+
+    def _pinhole(self, index: int) -> Camera:
         camera = self._dataset.cameras[index].reshape(())
         if int(camera.camera_type) not in _DRAWN_AS_PINHOLE:
             raise InputError(
@@ -96,6 +105,36 @@ class DatasetViews:
         image, intrinsics, _ = _undistorted(self._dataset.cameras, index, {"image": blank})
         return to_camera(self._poses[index], intrinsics, image.shape[1], image.shape[0])
 
+    def check_files(self) -> tuple[str, ...]:
+        """Looks at the heads of all photographs and masks; returns what a person should know, in whole sentences.
+
+        Raises:
+            FileNotFoundError, ValueError: a photograph or mask that is no image, that nerfstudio reads into something
+                else, or that has another size than its camera or image; the message names it.
+        """
+        heads = [read_head(file) for file in self.files]
+        masks, scale = self._dataset._dataparser_outputs.mask_filenames, self._dataset.scale_factor
+        cameras = self._dataset.cameras
+        sizes = torch.stack([cameras.width, cameras.height]).reshape(2, -1).T.tolist() if len(self) > 0 else []
+        for index, (file, head) in enumerate(zip(self.files, heads)):
+            if head.mode not in _READ_WELL:
+                raise InputError(
+                    f"{file} has pixels of kind {head.mode}, which nerfstudio takes for other values than they are. "
+                    "Expected 8-bit RGB, RGBA or grey; convert the photographs, and train again."
+                )
+            found = head.size if scale == 1 else tuple(int(side * scale) for side in head.size)
+            self._check_size(index, found, sizes[index])
+            if masks is not None:
+                check_mask(masks[index], file, head.size)
+        return remarks(self.files, heads)
+
+    def _check_size(self, index: int, found: Sequence[int], expected: Sequence[int]) -> None:
+        if tuple(found) != tuple(expected):
+            raise InputError(
+                f"{self.files[index]} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} "
+                "(width x height). Use the images that the run was trained with."
+            )
+
     def _read(self, index: int) -> dict[str, Any]:
         file, camera = self.files[index], self._dataset.cameras[index]
         try:
@@ -105,16 +144,11 @@ class DatasetViews:
                 f"{error.filename} is missing, which the dataset names. Put it back, or say where the dataset is "
                 "with --data."
             ) from error
-        except (OSError, SyntaxError, ValueError, AssertionError) as error:
+        except Exception as error:  # Pillow's readers and nerfstudio's checks raise whatever a file leads them to
             raise InputError(
                 f"{file} or its mask cannot be read ({error}). Expected an 8-bit image; copy it again from the capture."
             ) from error
-        found, expected = tuple(data["image"].shape[1::-1]), (int(camera.width), int(camera.height))
-        if found != expected:
-            raise InputError(
-                f"{file} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} (width x height). "
-                "Use the images that the run was trained with."
-            )
+        self._check_size(index, data["image"].shape[1::-1], (int(camera.width), int(camera.height)))
         return data
 
 
@@ -127,7 +161,12 @@ def _undistorted(
     if camera.distortion_params is None or bool((camera.distortion_params == 0).all()):
         return data["image"], intrinsics, data.get("mask")
     distortion = camera.distortion_params.numpy()
-    matrix, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics.numpy())
+    try:
+        matrix, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics.numpy())
+    except Exception as error:  # OpenCV's errors, and what nerfstudio makes of the numbers that it gets
+        raise InputError(f"its distortion {distortion.tolist()} cannot be undone ({error})") from error
+    if 0 in image.shape:
+        raise InputError(f"its distortion {distortion.tolist()} leaves no pixel of the image")
     pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
     return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
-from normlift_ns.scenes.colmap import model_folder, read_cameras, read_images
+from normlift_ns.scenes.colmap import intrinsics_of, model_folder, pose_of, read_model
 from normlift_ns.scenes.frames import Frame, World, check_frames, find_masks, find_photographs, sized
 from normlift_ns.scenes.similarity import read_world_transform
 from normlift_ns.scenes.transforms import read_transforms, relative_name
@@ -64,14 +64,9 @@ def _transforms(options: SplatOptions) -> Cameras:
 def _colmap(options: SplatOptions, folder: Path) -> Cameras:
     folder = folder.absolute()
     model = model_folder(folder)
-    cameras, registered = read_cameras(model), read_images(model)
-    lost = [image for image in registered if image.camera not in cameras]
-    if lost or len(registered) == 0:
-        what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
-        raise InputError(
-            f"{model} has {len(cameras)} cameras and {len(registered)} registered images: {what}. Expected a camera "
-            "for every image; copy the whole reconstruction again."
-        )
+    cameras, images = read_model(model)
+    registered = sorted(images, key=lambda image: image.name)  # as training tools sort them
+    intrinsics = {number: intrinsics_of(camera, model) for number, camera in cameras.items()}
     place = options.images or folder / "images"
     if not place.is_dir():
         raise FileNotFoundError(f"There is no folder {place} of photographs. Say where they are with --images.")
@@ -82,7 +77,7 @@ def _colmap(options: SplatOptions, folder: Path) -> Cameras:
     masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
     base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
     frames = [
-        Frame(file, relative_name(file, base), image.pose, cameras[image.camera], mask)
+        Frame(file, relative_name(file, base), pose_of(image), intrinsics[image.camera], mask)
         for image, file, mask in zip(registered, files, masks)
     ]
     to_splat = None if options.world_transform is None else read_world_transform(options.world_transform)

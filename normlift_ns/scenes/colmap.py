@@ -28,17 +28,9 @@ _NUMBERED = (
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )  # fmt: skip
 """Names and numbers of parameters by the numbers in binary files."""
+_LARGEST, _FARTHEST = 2**16, 1e30
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 _ADVICE = "Copy the reconstruction again, or write it anew with: colmap model_converter"
-
-
-class ColmapImage(NamedTuple):
-    """One registered image."""
-
-    name: str
-    pose: Float[np.ndarray, "3 4"]
-    """Camera to world in OpenGL convention."""
-    camera: int
 
 
 def model_folder(folder: Path) -> Path:
@@ -61,40 +53,86 @@ def model_folder(folder: Path) -> Path:
     )
 
 
-def read_cameras(model: Path) -> dict[int, Intrinsics]:
-    """Cameras by their numbers.
+class Camera(NamedTuple):
+    """One camera as it stands in the file."""
+
+    number: int
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+class Registered(NamedTuple):
+    """One registered image as it stands in the file: a world-to-camera pose in OpenCV convention."""
+
+    number: int
+    name: str
+    rotation: list[float]
+    """w, x, y, z."""
+    translation: list[float]
+    camera: int
+
+
+def read_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, Camera], list[Registered]]:
+    """Cameras by their numbers, and registered images in the order of the file.
+
+    Args:
+        text_first: where there are both, take the text files, as nerfstudio does; else the binary ones, as COLMAP does.
+    Raises:
+        FileNotFoundError, ValueError: no file, a damaged one, numbers twice, sizes that no photograph has, poses that
+            are not finite, no image at all, or an image whose camera is missing.
+    """
+    text = text_first and (model / "cameras.txt").exists()
+    cameras: dict[int, Camera] = {}
+    for camera in _read(model, "cameras", _cameras_text, _cameras_binary, text):
+        if camera.number in cameras or not (0 < camera.width <= _LARGEST and 0 < camera.height <= _LARGEST):
+            raise InputError(
+                f"{model}: camera {camera.number} of {camera.width:.6g} x {camera.height:.6g} pixels stands there "
+                f"twice, or has sides that are not 1 to {_LARGEST:,} pixels. {_ADVICE}"
+            )
+        if not (np.abs(camera.parameters) < _FARTHEST).all():
+            raise InputError(f"{model}: camera {camera.number} has parameters {camera.parameters}. {_ADVICE}")
+        cameras[camera.number] = camera
+    images = _read(model, "images", _images_text, _images_binary, text)
+    for image in images:
+        pose = np.array([*image.rotation, *image.translation])
+        if not (np.abs(pose) < _FARTHEST).all() or not np.any(pose[:4]):
+            raise InputError(
+                f"{model}: the pose of {image.name} is not finite or has no rotation: {image.rotation} "
+                f"{image.translation}. {_ADVICE}"
+            )
+    lost = [image for image in images if image.camera not in cameras]
+    if lost or len(images) == 0:
+        what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
+        raise InputError(
+            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {what}. Expected a camera for "
+            "every image; copy the whole reconstruction again."
+        )
+    if len({image.number for image in images}) < len(images):
+        raise InputError(f"{model} has two images of the same number. {_ADVICE}")
+    return cameras, images
+
+
+def intrinsics_of(camera: Camera, model: Path) -> Intrinsics:
+    """The projection of a camera.
 
     Raises:
-        FileNotFoundError, ValueError: no file, a damaged one, a camera model that cannot be undistorted here.
+        ValueError: a camera model that cannot be undistorted here.
     """
-    cameras = {}
-    for number, name, width, height, parameters in _read(model, "cameras", _cameras_text, _cameras_binary):
-        if name not in _MODELS:
-            raise InputError(
-                f"{model}: camera {number} has the model {name}; read are {', '.join(_MODELS)}. Undistort the images "
-                "with: colmap image_undistorter, train the scene on those, and give that folder."
-            )
-        fx, fy, cx, cy, distortion = _MODELS[name](*parameters)
-        cameras[number] = Intrinsics(fx, fy, cx, cy, width, height, **distortion)
-    return cameras
+    if camera.model not in _MODELS:
+        raise InputError(
+            f"{model}: camera {camera.number} has the model {camera.model}; read are {', '.join(_MODELS)}. Undistort "
+            "the images with: colmap image_undistorter, train the scene on those, and give that folder."
+        )
+    fx, fy, cx, cy, distortion = _MODELS[camera.model](*camera.parameters)
+    return Intrinsics(fx, fy, cx, cy, camera.width, camera.height, **distortion)
 
 
-def read_images(model: Path) -> list[ColmapImage]:
-    """Registered images in the order of their names, as training tools sort them.
-
-    Raises:
-        FileNotFoundError, ValueError: no file, a damaged one, rotations of length zero.
-    """
-    images = []
-    for name, rotation, translation, camera in _read(model, "images", _images_text, _images_binary):
-        if not np.isfinite([*rotation, *translation]).all() or not np.any(rotation):
-            raise InputError(
-                f"{model}: the pose of {name} is not finite or has no rotation: {rotation} {translation}. {_ADVICE}"
-            )
-        matrix = Rotation.from_quat(np.roll(rotation, -1)).as_matrix()  # SciPy has w last
-        pose = np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(translation)[:, None]], axis=1)
-        images.append(ColmapImage(name, pose, camera))
-    return sorted(images, key=lambda image: image.name)
+def pose_of(image: Registered) -> Float[np.ndarray, "3 4"]:
+    """Camera to world in OpenGL convention."""
+    matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
+    return np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(image.translation)[:, None]], axis=1)
 
 
 def read_points(model: Path) -> Float[np.ndarray, "n 3"]:
@@ -111,23 +149,28 @@ def read_points(model: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def _read(
-    model: Path, name: str, text: Callable[[list[str]], Iterator[Any]], binary: Callable[[_Bytes], Iterator[Any]]
+    model: Path,
+    name: str,
+    text: Callable[[list[str]], Iterator[Any]],
+    binary: Callable[[_Bytes], Iterator[Any]],
+    as_text: bool = False,
 ) -> list[Any]:
     path = model / f"{name}.bin"
+    if as_text or not path.is_file():
+        path = model / f"{name}.txt"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{model} has neither {name}.bin nor {name}.txt. Expected cameras, images and points3D, as COLMAP's mapper "
+            f"writes them. {_ADVICE}"
+        )
     try:
-        if path.is_file():
+        if path.suffix == ".bin":
             data = _Bytes(path.read_bytes())
             found = list(binary(data))
             data.end()
             return found
-        path = model / f"{name}.txt"
         lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
         return list(text([line for line in lines if not line.startswith("#")]))
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{model} has neither {name}.bin nor {name}.txt. Expected cameras, images and points3D, as COLMAP's mapper "
-            f"writes them. {_ADVICE}"
-        ) from None
     except (ValueError, IndexError, struct.error, KeyError, OverflowError) as error:
         raise InputError(f"{path} is damaged or no file of COLMAP ({error}). {_ADVICE}") from error
 
@@ -166,33 +209,33 @@ class _Bytes:
             raise InputError(f"{len(self.data) - self.at:,} bytes too many")
 
 
-def _cameras_binary(data: _Bytes) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+def _cameras_binary(data: _Bytes) -> Iterator[Camera]:
     for _ in range(data.count()):
         number, model, width, height = data.take("iiQQ")
         if not 0 <= model < len(_NUMBERED):
             raise InputError(f"camera {number} has the model number {model}, which is not known")
         name, count = _NUMBERED[model]
-        yield number, name, width, height, data.take(f"{count}d")
+        yield Camera(number, name, width, height, data.take(f"{count}d"))
 
 
-def _cameras_text(lines: list[str]) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+def _cameras_text(lines: list[str]) -> Iterator[Camera]:
     counts = dict(_NUMBERED)
     for line in filter(None, lines):
         number, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
             raise InputError(f"camera {number} has {len(parameters)} parameters, {name} needs {counts[name]}")
-        yield int(number), name, int(width), int(height), tuple(map(float, parameters))
+        yield Camera(int(number), name, int(width), int(height), tuple(map(float, parameters)))
 
 
-def _images_binary(data: _Bytes) -> Iterator[tuple[str, list[float], list[float], int]]:
+def _images_binary(data: _Bytes) -> Iterator[Registered]:
     for _ in range(data.count()):
-        _, *pose, camera = data.take("I7dI")
+        number, *pose, camera = data.take("I7dI")
         name = data.text()
         data.skip(24 * data.take("Q")[0])
-        yield name, pose[:4], pose[4:], camera
+        yield Registered(number, name, pose[:4], pose[4:], camera)
 
 
-def _images_text(lines: list[str]) -> Iterator[tuple[str, list[float], list[float], int]]:
+def _images_text(lines: list[str]) -> Iterator[Registered]:
     rest = iter(lines)
     for line in rest:
         if line == "":
@@ -200,8 +243,9 @@ def _images_text(lines: list[str]) -> Iterator[tuple[str, list[float], list[floa
         points = next(rest, "").split()  # of the image, in the line after it, which may be empty
         if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
             raise InputError(f"the line after that of {line.split()[-1]} holds no points, as x, y and their numbers")
-        _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
-        yield name, list(map(float, (qw, qx, qy, qz))), list(map(float, (tx, ty, tz))), int(camera)
+        number, *pose, camera, name = line.split(maxsplit=9)
+        values = list(map(float, pose))
+        yield Registered(int(number), name, values[:4], values[4:], int(camera))
 
 
 def _is_number(text: str) -> bool:

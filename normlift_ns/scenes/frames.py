@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 
 from normlift_ns.errors import InputError
+from normlift_ns.scenes.image_files import check_mask, read_head
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _RIGID = 1e-3
@@ -104,23 +104,6 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
         raise InputError(f"{source} names {twice[0]} more than once. Expected every photograph once.")
 
 
-def photograph_size(file: Path) -> tuple[int, int]:
-    """Width and height, from the head of the file.
-
-    Raises:
-        FileNotFoundError, ValueError: no such file, no image; the message names it.
-    """
-    try:
-        with Image.open(file) as image:
-            return image.size
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{file} is missing, which the cameras name. Say where the images are: --images."
-        ) from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{file} cannot be read as an image ({error}). Copy it again from the capture.") from error
-
-
 def find_photographs(names: Sequence[str], folder: Path, source: Path, advice: str, *, copies: bool) -> list[Path]:
     """The files of those names in a folder, absolute.
 
@@ -190,7 +173,7 @@ def sized(frame: Frame, source: Path) -> Frame:
     Raises:
         FileNotFoundError, ValueError: no such file, no image, one of another aspect than its camera.
     """
-    width, height = photograph_size(frame.file)
+    width, height = read_head(frame.file).size
     camera = frame.intrinsics
     if (width, height) != (camera.width, camera.height):
         scale = (width / camera.width + height / camera.height) / 2
@@ -201,11 +184,8 @@ def sized(frame: Frame, source: Path) -> Frame:
                 "of them at a fraction of the size, with --images."
             )
         camera = camera.resized(width, height)
-    if frame.mask is not None and (found := photograph_size(frame.mask)) != (width, height):
-        raise InputError(
-            f"The mask {frame.mask} is {found[0]} x {found[1]} pixels, its image {frame.file} {width} x {height}. "
-            "Expected masks of the size of the images; give a folder of such with --masks."
-        )
+    if frame.mask is not None:
+        check_mask(frame.mask, frame.file, (width, height))
     return replace(frame, intrinsics=camera)
 
 

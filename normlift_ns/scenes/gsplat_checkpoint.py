@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.checkpoint import read_tensors
+from normlift_ns.scenes.checkpoint import check_plain, checked_step, read_tensors
 from normlift_ns.scenes.splat import Splat, check_splat, from_parameters
 
 _RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")
@@ -49,14 +49,13 @@ def read_gsplat(path: Path) -> GsplatCheckpoint:
             f"{files[0].parent} has ranks of different steps: {', '.join(map(str, sorted(steps)))}. Expected the files "
             "of one training; keep those in a folder of their own."
         )
-    harmonics = {tensors["features_rest"].shape[1:] for _, tensors, _ in loaded}
-    if len(harmonics) > 1:
+    splats = [from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
+    if len({splat.degree for splat in splats}) > 1:
         raise InputError(
             f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training; keep "
             "those in a folder of their own."
         )
-    names = loaded[0][1]
-    splats = [from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
+    names = splats[0].parameters
     merged = Splat(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
     check_splat(merged, files[0])
     return GsplatCheckpoint(files, steps.pop(), merged, loaded[0][2])
@@ -73,13 +72,13 @@ def _rank_files(path: Path) -> tuple[Path, ...]:
         return (path,)
     ranks = {
         int(found[2]): file
-        for file in path.parent.glob(f"{match[1]}*{match[3]}")
-        if (found := _RANK.fullmatch(file.name)) is not None
+        for file in sorted(path.parent.iterdir())
+        if (found := _RANK.fullmatch(file.name)) is not None and found[1] == match[1] and file.is_file()
     }
-    missing = sorted(set(range(max(ranks) + 1)) - set(ranks))
-    if missing:
+    if max(ranks) >= len(ranks):
+        missing = next(rank for rank in range(len(ranks)) if rank not in ranks)
         raise FileNotFoundError(
-            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {', '.join(map(str, missing))}. Every "
+            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {missing}. Every "
             "rank holds a share of the Gaussians; copy all files of the training."
         )
     return tuple(ranks[rank] for rank in sorted(ranks))
@@ -106,6 +105,8 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
             f"{', '.join(sorted(map(str, splats)))}. Expected those of 3D Gaussians with spherical harmonics, as "
             "gsplat's simple_trainer writes them."
         )
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        check_plain(splats[name], name, path)
     if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
         raise InputError(
             f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
@@ -114,12 +115,7 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
     parameters = {name: splats[name] for name in ("means", "quats", "scales")}
     parameters["opacities"] = splats["opacities"][:, None]
     parameters["features_dc"], parameters["features_rest"] = splats["sh0"][:, 0], splats["shN"]
-    return _step(loaded), parameters, _pose_adjust(path, loaded)
-
-
-def _step(loaded: Mapping[str, Any]) -> int:
-    step = loaded.get("step")
-    return step if isinstance(step, int) else 0
+    return checked_step(loaded.get("step", 0), path), parameters, _pose_adjust(path, loaded)
 
 
 def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] | None:
@@ -127,6 +123,8 @@ def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] 
     if state is None:
         return None
     moved = state.get("embeds.weight") if isinstance(state, Mapping) else None
+    if isinstance(moved, Tensor):
+        check_plain(moved, "pose_adjust", path)
     if not isinstance(moved, Tensor) or moved.ndim != 2 or moved.shape[1] != 9 or not bool(moved.isfinite().all()):
         raise InputError(
             f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected finite numbers "

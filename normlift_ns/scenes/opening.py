@@ -49,6 +49,8 @@ class SplatScene:
     identity: Mapping[str, Any]
     rasterize_mode: RasterizeMode
     background_name: Background
+    remarks: tuple[str, ...] = ()
+    """What a person should know of the photographs, in whole sentences."""
 
     renderer = None
     """normlift_ns draws it."""
@@ -125,9 +127,10 @@ def open_splat(
         kept = [frame for frame in there if options.views == "all" or frame.name not in held_out]
         rest = [frame for frame in there if options.views == "train" and frame.name in held_out]
         step = 0 if checkpoint is None else checkpoint.step
+        train = PhotographViews(kept, background)
         return SplatScene(
             splat,
-            PhotographViews(kept, background),
+            train,
             PhotographViews(rest, background),
             cameras.folder.name or "splat",
             path,
@@ -137,6 +140,7 @@ def open_splat(
             {"source_splat": str(path), "source_cameras": str(cameras.source), "source_step": step},
             options.rasterize_mode or mode or "classic",
             options.background,
+            train.check_files(),
         )
 
     return _best(placed, worlds, say)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.image_files import read_head, remarks
 
 
 def to_camera(
@@ -57,6 +59,18 @@ class PhotographViews:
     def _cameras(self) -> list[Camera]:
         return [_camera(frame) for frame in self.frames]
 
+    def check_files(self) -> tuple[str, ...]:
+        """Looks at the heads of all photographs; returns what a person should know, in whole sentences.
+
+        Raises:
+            FileNotFoundError, ValueError: a photograph that is missing, no image, or of more than 8 bits.
+        """
+        files = [frame.file for frame in self.frames]
+        heads = [read_head(file) for file in files]
+        for file, head in zip(files, heads):
+            _check_mode(file, head.mode)
+        return remarks(files, heads)
+
     def __getitem__(self, index: int) -> View:
         """Reads one photograph.
 
@@ -76,6 +90,13 @@ class PhotographViews:
 
 
 def _camera(frame: Frame) -> Camera:
+    try:
+        return _pinhole(frame)
+    except (InputError, cv2.error) as error:
+        raise InputError(f"The camera of {frame.file} cannot be used: {error}") from error
+
+
+def _pinhole(frame: Frame) -> Camera:
     width, height = frame.intrinsics.width, frame.intrinsics.height
     blank = np.empty((height, width, 1), np.uint8) if any(frame.intrinsics.distortion) else None
     pixels, matrix = (None, _matrix(frame.intrinsics)) if blank is None else _undistorted(blank, frame.intrinsics)
@@ -101,6 +122,8 @@ def _undistorted(
     coefficients = np.array([k1, k2, p1, p2, k3, 0, 0, 0])
     matrix[:2, 2] -= 0.5  # OpenCV has pixel centres at whole numbers
     pinhole, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(matrix, coefficients, image.shape[1::-1], 0)
+    if w < 1 or h < 1:
+        raise InputError(f"its distortion {intrinsics.distortion} leaves no pixel of the image")
     pixels = cv2.undistort(image, matrix, coefficients, None, pinhole)[y : y + h, x : x + w]
     fx, fy = pinhole[0, 0], pinhole[1, 1]
     cropped = np.array([[fx, 0, pinhole[0, 2] - x + 0.5], [0, fy, pinhole[1, 2] - y + 0.5], [0, 0, 1]])
@@ -110,15 +133,16 @@ def _undistorted(
 def _read(frame: Frame) -> UInt8[np.ndarray, "h w c"]:
     try:
         with Image.open(frame.file) as image:
-            if image.mode[0] in "IF":
-                raise InputError(f"its pixels are of mode {image.mode}, expected 8 bits per channel")
+            _check_mode(frame.file, image.mode)
             mode = "RGBA" if image.mode in ("LA", "PA", "La") or "transparency" in image.info else "RGB"
             pixels = np.array(image if image.mode in (mode, "RGBA") else image.convert(mode), np.uint8)
     except FileNotFoundError:
         raise FileNotFoundError(
             f"{frame.file} is missing, which the cameras name. Put it back, or say where the images are."
         ) from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # Pillow's readers raise whatever a damaged file leads them to
         raise InputError(f"{frame.file} cannot be read ({error}). Copy it again from the capture.") from error
     found, expected = pixels.shape[1::-1], (frame.intrinsics.width, frame.intrinsics.height)
     if found != expected:
@@ -129,6 +153,14 @@ def _read(frame: Frame) -> UInt8[np.ndarray, "h w c"]:
     return pixels
 
 
+def _check_mode(file: Path, mode: str) -> None:
+    if mode[0] in "IF":
+        raise InputError(
+            f"{file} cannot be read: its pixels are of mode {mode}, expected 8 bits per channel. Convert the "
+            "photographs to those that the splat was trained with."
+        )
+
+
 def _mask(frame: Frame) -> Bool[Tensor, "h w"] | None:
     if frame.mask is None:
         return None
@@ -136,12 +168,12 @@ def _mask(frame: Frame) -> Bool[Tensor, "h w"] | None:
     try:
         with Image.open(frame.mask) as image:
             values = np.array(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # as above
         raise InputError(f"The mask {frame.mask} cannot be read ({error}). Copy it again from the capture.") from error
     if values.shape != size:
         raise InputError(
-            f"The mask {frame.mask} has shape {values.shape}, expected {size}: one channel, as large as its image. "
-            "Save it in grey."
+            f"The mask {frame.mask} of {frame.file} has shape {values.shape}, expected {size}: one channel, as large "
+            "as its image. Save it in grey."
         )
     kept = np.where(values != 0, np.uint8(255), np.uint8(0))[:, :, None]
     return torch.from_numpy(_undistorted(kept, frame.intrinsics)[0][:, :, 0]).bool()

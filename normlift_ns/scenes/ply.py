@@ -14,6 +14,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.scenes.splat import DEGREES, Splat, check_splat
 
+_LONGEST_HEADER = 2**20
 _ROWS = 2**18
 """Gaussians read at a time."""
 _NEEDED = (
@@ -48,6 +49,7 @@ def read_ply(path: Path) -> PlySplat:
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
+    _check_header(path)
     try:
         found = PlyData.read(str(path), mmap="c")
     except UnicodeDecodeError as error:
@@ -87,6 +89,33 @@ def read_ply(path: Path) -> PlySplat:
     splat = _read_columns(path, vertex.data, _rest_names(path, names))
     check_splat(splat, path)
     return PlySplat(splat, _mode([*found.comments, *vertex.comments]))
+
+
+def _check_header(path: Path) -> None:
+    """The rows that a header promises must fit into the file: they would be allocated before they are read."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER).partition(b"end_header")[0]
+    words = [line.split() for line in head.replace(b"\r", b"\n").split(b"\n")]
+    promised = 0
+    for i, line in enumerate(words):
+        if line[:1] != [b"element"]:
+            continue
+        rest = words[i + 1 :]
+        end = next((j for j, other in enumerate(rest) if other[:1] == [b"element"]), len(rest))
+        properties = sum(other[:1] == [b"property"] for other in rest[:end])
+        count = line[2] if len(line) == 3 else b""
+        if not count.isdigit() or len(count) > 18 or (properties == 0 and int(count) > 0):
+            raise InputError(
+                f"{path} is truncated or damaged: its header has the line {b' '.join(line)[:80]!r} with {properties} "
+                "properties. Expected a splat in the PLY format; copy it again."
+            )
+        promised += int(count) * properties  # a property takes at least one byte
+    if promised > size:
+        raise InputError(
+            f"{path} is truncated or damaged: its {size:,} bytes do not hold what its header says, {promised:,} "
+            "numbers. Copy it again."
+        )
 
 
 def _advice(missing: list[str]) -> str:

@@ -17,7 +17,8 @@ from normlift_ns.scenes.frames import check_frames
 from normlift_ns.scenes.opening import BACKGROUNDS, SplatScene
 from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.scenes.splat import from_parameters
-from normlift_ns.scenes.transforms import read_json, read_transforms, write_transforms
+from normlift_ns.scenes.transforms import read_transforms, write_transforms
+from normlift_ns.scenes.transforms_file import read_json
 
 SCENE_FILE, TRANSFORMS_FILE, CHECKPOINT_FOLDER = "splat.json", "transforms.json", "nerfstudio_models"
 _EXPECTED = "the file that ns-normlift wrote beside config.yml; copy the whole run again"
@@ -71,6 +72,8 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     path = run_dir / SCENE_FILE
     try:
         saved = msgspec.convert(read_json(path, _EXPECTED), _Saved)
+        if any(text.strip() == "" or "\0" in text for text in (saved.name, saved.photographs)):
+            raise msgspec.ValidationError("name or photographs is empty")
     except msgspec.ValidationError as error:
         raise InputError(f"{path} has another form than expected: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_FOLDER, load_step))
@@ -103,4 +106,5 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         saved.identity,
         saved.rasterize_mode,
         saved.background,
+        train.check_files(),
     )

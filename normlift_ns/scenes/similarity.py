@@ -5,16 +5,50 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Frame, World
-from normlift_ns.scenes.transforms import read_json
+from normlift_ns.scenes.transforms_file import read_json
 
 _TOLERANCE = 1e-3
 """How far a similarity may be from one: files round."""
+_FARTHEST, _MOST_BYTES = 1e30, 2**16
+_WRITTEN = "the dataparser_transforms.json that ns-train wrote; copy it again from the run"
 _EXPECTED = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
+
+
+class DataparserTransforms(msgspec.Struct):
+    """What nerfstudio's dataparser_transforms.json says: p -> scale * (transform @ p) leads to the scene's world."""
+
+    transform: list[list[float]]
+    scale: float
+
+
+def read_dataparser_transforms(path: Path) -> World:
+    """dataparser_transforms.json of a nerfstudio run.
+
+    Raises:
+        FileNotFoundError, ValueError: no such file, other content, or no finite transform and positive scale.
+    """
+    return _dataparser(read_json(path, _WRITTEN), path)
+
+
+def _dataparser(values: Any, path: Path) -> World:
+    try:
+        found = msgspec.convert(values, DataparserTransforms)
+    except (msgspec.ValidationError, RecursionError, OverflowError) as error:
+        raise InputError(f"{path} holds no transform ({error}). Expected {_WRITTEN}.") from error
+    rows = found.transform
+    finite = len(rows) in (3, 4) and all(len(row) == 4 for row in rows) and (np.abs(rows) < _FARTHEST).all()
+    if not finite or not 0 < found.scale < _FARTHEST:
+        raise InputError(
+            f"{path} holds no transform: {len(rows)} rows and scale {found.scale:g}. Expected 3 rows of 4 finite "
+            f"numbers and a positive scale: {_WRITTEN}."
+        )
+    return World(np.array(rows[:3]), found.scale)
 
 
 def read_world_transform(
@@ -29,29 +63,29 @@ def read_world_transform(
         FileNotFoundError, ValueError: no such file, other content, or no similarity.
     """
     try:
-        if path.suffix == ".npy" and path.is_file():
-            values: Any = np.load(path, allow_pickle=False).tolist()
-        elif path.suffix == ".txt" and path.is_file():
-            values = np.loadtxt(path).tolist()
-        else:
-            values = read_json(path, _EXPECTED)
+        values = _numbers(path)
         if not isinstance(values, dict):
             return similarity(np.array(values, dtype=float), str(path))
-        matrix = np.eye(4)
-        matrix[:3] = np.array(values["transform"], dtype=float)[:3]
-        if applied is not None:
-            matrix = matrix @ np.linalg.inv(applied)
-        scale = float(values["scale"]) / applied_scale
-    except (KeyError, TypeError, IndexError, EOFError, OverflowError, np.linalg.LinAlgError) as error:
-        raise InputError(
-            f"{path} holds no transform ({type(error).__name__}: {error}). Expected {_EXPECTED}."
-        ) from error
-    except ValueError as error:
-        if str(path) in str(error):
-            raise
+    except InputError:
+        raise
+    except (TypeError, ValueError, EOFError, OverflowError, MemoryError, OSError) as error:
         raise InputError(f"{path} holds no transform ({error}). Expected {_EXPECTED}.") from error
+    found = _dataparser(values, path)
+    matrix = np.eye(4)
+    matrix[:3] = found.transform
+    if applied is not None:
+        matrix = matrix @ np.linalg.inv(applied)
+    scale = found.scale / applied_scale
     similarity(matrix * scale + np.diag([0, 0, 0, 1 - scale]), str(path))
     return World(matrix[:3], scale, single=True)
+
+
+def _numbers(path: Path) -> Any:
+    if path.suffix not in (".npy", ".txt") or not path.is_file():
+        return read_json(path, _EXPECTED)
+    if path.stat().st_size > _MOST_BYTES:
+        raise InputError(f"{path} has {path.stat().st_size:,} bytes, too many for 4 x 4 numbers. Expected {_EXPECTED}.")
+    return (np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path)).tolist()
 
 
 def similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World:
@@ -60,12 +94,12 @@ def similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World:
     Raises:
         ValueError: it is no rotation, scale and translation.
     """
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+    if matrix.shape != (4, 4) or not (np.abs(matrix) < _FARTHEST).all():
         raise InputError(f"{source} holds numbers of shape {matrix.shape} or not finite. Expected {_EXPECTED}.")
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     last = np.abs(matrix[3] - [0, 0, 0, 1]).max()
-    if scale <= 0 or last > _TOLERANCE or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > _TOLERANCE:
+    if not (scale > 0 and last <= _TOLERANCE and np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() <= _TOLERANCE):
         raise InputError(
             f"{source} holds no similarity: {matrix.tolist()}. Expected one rotation without mirror, one scale for all "
             "axes and a translation, with 0 0 0 1 in the last row."

@@ -14,11 +14,12 @@ from torch import Tensor
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.errors import InputError
 
-DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
+DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 """Degree of the spherical harmonics by their number beyond the constant one."""
 _WIDE = 0.02
 """A median Gaussian wider than this share of the scene, in a file without negative logarithms: they are none."""
 
+_PRECISIONS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _SAMPLE, _BLOCK = 2**20, 2**18
 _MANY = 100
 """Gaussians from which logits that all lie in 0..1 are no chance."""
@@ -38,7 +39,7 @@ class Splat:
     features_dc: Float[Tensor, "n 3"]
     """The constant spherical harmonic of the colours."""
     features_rest: Float[Tensor, "n k 3"]
-    """The others: K = 0, 3, 8 or 15."""
+    """The others: K = 0, 3, 8, 15 or 24."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -111,21 +112,31 @@ def from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat:
     """A splat from a trainer's tensors by splatfacto's names, as float32; checks types and shapes.
 
     Raises:
-        ValueError: a tensor that is missing, of another type or of a shape that does not fit.
+        ValueError: no Gaussian, a tensor of another type than half, bfloat16, float32 or float64, or of a shape that
+            does not fit.
     """
     n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0
+    if parameters["means"].ndim == 2 and n == 0:
+        raise InputError(f"{file} holds no Gaussians at all. Give the file of a training that kept some.")
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (1,), "features_dc": (3,)}
     for name, shape in shapes.items():
         value = parameters[name]
-        if tuple(value.shape) != (n, *shape) or not value.dtype.is_floating_point:
+        if tuple(value.shape) != (n, *shape) or value.dtype not in _PRECISIONS:
             raise InputError(
                 f"{file}: {name} is {value.dtype} {tuple(value.shape)}, expected floating-point numbers of shape "
-                f"{(n, *shape)}, one row per Gaussian."
+                f"{(n, *shape)}, one row per Gaussian. Copy the file again, or give that of another training."
             )
     rest = parameters["features_rest"]
-    if rest.ndim != 3 or len(rest) != n or rest.shape[2] != 3 or rest.shape[1] not in DEGREES:
+    if (
+        rest.ndim != 3
+        or len(rest) != n
+        or rest.shape[2] != 3
+        or rest.shape[1] not in DEGREES
+        or rest.dtype not in _PRECISIONS
+    ):
         raise InputError(
-            f"{file}: its spherical harmonics have shape {tuple(rest.shape)}, expected ({n}, K, 3) with K = "
-            f"{', '.join(map(str, DEGREES))} for degrees {', '.join(map(str, DEGREES.values()))}."
+            f"{file}: its spherical harmonics have shape {tuple(rest.shape)} and type {rest.dtype}, expected "
+            f"floating-point numbers of shape ({n}, K, 3) with K = {', '.join(map(str, DEGREES))} for degrees "
+            f"{', '.join(map(str, DEGREES.values()))}. Copy the file again, or give that of another training."
         )
     return Splat(**{name: parameters[name].detach().float() for name in (*shapes, "features_rest")})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import json
 import math
 from collections.abc import Sequence
@@ -10,56 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from normlift_ns.core.files import write_text
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.frames import Frame, Intrinsics, find_masks, find_photographs, photograph_size
+from normlift_ns.scenes.frames import Frame, Intrinsics, find_masks, find_photographs
+from normlift_ns.scenes.image_files import read_head
+from normlift_ns.scenes.transforms_file import Entries, FrameEntry, read_entries
 
-_LARGEST = 2**16
-"""Pixels along one side of a photograph."""
 _SINGULAR = 1e-6
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-
-
-class _Camera(msgspec.Struct):
-    """What may stand in the file for all frames, or in a frame."""
-
-    fl_x: float | None = None
-    fl_y: float | None = None
-    cx: float | None = None
-    cy: float | None = None
-    w: float | None = None
-    h: float | None = None
-    k1: float | None = None
-    k2: float | None = None
-    k3: float | None = None
-    k4: float | None = None
-    p1: float | None = None
-    p2: float | None = None
-    distortion_params: list[float] | None = None
-    camera_angle_x: float | None = None
-    camera_angle_y: float | None = None
-    camera_model: str | None = None
-    is_fisheye: bool | None = None
-
-
-class _Frame(_Camera, kw_only=True):
-    file_path: str
-    transform_matrix: list[list[float]]
-    mask_path: str | None = None
-
-
-class _File(_Camera, kw_only=True):
-    frames: list[_Frame]
-    applied_transform: list[list[float]] | None = None
-    applied_scale: float = 1.0
-    train_filenames: list[str] | None = None
-    val_filenames: list[str] | None = None
-    test_filenames: list[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -73,23 +34,6 @@ class TransformsFile:
     applied: Float[np.ndarray, "4 4"]
     """From the world of the capture to that of the file, as ns-process-data turned it."""
     applied_scale: float
-
-
-def read_json(path: Path, expected: str) -> Any:
-    """The values of a JSON file.
-
-    Raises:
-        FileNotFoundError, ValueError: no file, no JSON, or values nested too deeply; the message names it.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no file {path}. Expected {expected}.")
-    text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-    try:
-        return msgspec.json.decode(text)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        found = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
-        reason = str(error) if found is None else f"it contains {found}"
-        raise InputError(f"{path} is no valid JSON ({reason}). Expected {expected}.") from error
 
 
 def read_transforms(
@@ -112,12 +56,7 @@ def read_transforms(
         ValueError: no JSON, another schema, a camera model that cannot be undistorted here.
     """
     path = path / "transforms.json" if path.is_dir() else path
-    expected = "a transforms.json as nerfstudio, instant-ngp or Blender's synthetic scenes have it"
-    values = read_json(path, expected)
-    try:
-        found = msgspec.convert(values, _File)
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise InputError(f"{path} has another form than expected: {error}. Expected {expected}.") from error
+    found = read_entries(path)
     place = path.parent if base is None else base
     listed = [relative_name(Path(frame.file_path), place) for frame in found.frames]
     files = find_photographs(listed, images or place, path, advice, copies=images is not None)
@@ -125,7 +64,7 @@ def read_transforms(
     if base is None:
         names = [relative_name(file, (place if images is None else images.parent).absolute()) for file in files]
     frames = [
-        Frame(file, name, _pose(entry, path), _intrinsics(found, entry, file, path), mask)
+        Frame(file, name, np.array(entry.transform_matrix[:3]), _intrinsics(found, entry, file, path), mask)
         for entry, file, name, mask in zip(found.frames, files, names, _masks(found, place, images, masks, path))
     ]
     held_out = _held_out(found, place, path)
@@ -137,7 +76,7 @@ def read_transforms(
     )
 
 
-def _held_out(found: _File, place: Path, path: Path) -> list[bool]:
+def _held_out(found: Entries, place: Path, path: Path) -> list[bool]:
     """Which frames the file keeps from the training; like nerfstudio it refuses lists that name other files."""
     lists = {"train": found.train_filenames, "val": found.val_filenames, "test": found.test_filenames}
     known = [place / frame.file_path for frame in found.frames]
@@ -161,7 +100,7 @@ def relative_name(file: Path, folder: Path) -> str:
 
 
 def _masks(
-    found: _File, place: Path, images: Path | None, masks: Path | None, path: Path
+    found: Entries, place: Path, images: Path | None, masks: Path | None, path: Path
 ) -> Sequence[Path] | Sequence[None]:
     named = [frame.mask_path for frame in found.frames]
     if masks is not None:
@@ -190,16 +129,7 @@ def _mask(name: str, place: Path, images: Path | None) -> Path | None:
     return next((file for file in (own, *moved) if file.is_file()), None)
 
 
-def _pose(frame: _Frame, path: Path) -> Float[np.ndarray, "3 4"]:
-    rows = frame.transform_matrix
-    if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows):
-        raise InputError(
-            f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4. Expected a camera-to-world matrix."
-        )
-    return np.array(rows[:3])
-
-
-def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrinsics:
+def _intrinsics(common: Entries, frame: FrameEntry, file: Path, path: Path) -> Intrinsics:
     """As nerfstudio takes them: what stands in the file counts for all frames, what is missing there stands in them."""
 
     def value(name: str) -> Any:
@@ -214,11 +144,7 @@ def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrins
             "scene on those, and give their cameras."
         )
     size = (value("w"), value("h"))
-    width, height = photograph_size(file) if None in size else size
-    if not all(float(side).is_integer() and 0 < side <= _LARGEST for side in (width, height)):
-        raise InputError(
-            f"{path}: w and h of {frame.file_path} are {width} and {height}, expected whole numbers of pixels."
-        )
+    width, height = read_head(file).size if None in size else size
     fx, fy = value("fl_x"), value("fl_y")
     for angle in (value("camera_angle_x"), value("camera_angle_y")):
         if angle is not None and not 0 < angle < math.pi:
@@ -241,7 +167,7 @@ def _intrinsics(common: _File, frame: _Frame, file: Path, path: Path) -> Intrins
     )
 
 
-def _distortion(common: _File, frame: _Frame, path: Path) -> tuple[float, ...]:
+def _distortion(common: Entries, frame: FrameEntry, path: Path) -> tuple[float, ...]:
     """k1, k2, k3, p1, p2: of the file if any stands there, else of the frame."""
     names = ("k1", "k2", "k3", "k4", "p1", "p2")
     holder = common if any(getattr(common, name) is not None for name in (*names, "distortion_params")) else frame
@@ -257,7 +183,7 @@ def _distortion(common: _File, frame: _Frame, path: Path) -> tuple[float, ...]:
     return k1, k2, k3, p1, p2
 
 
-def _applied(found: _File, path: Path) -> Float[np.ndarray, "4 4"]:
+def _applied(found: Entries, path: Path) -> Float[np.ndarray, "4 4"]:
     """nerfstudio's own rule: folders of an old ns-process-data do not say what was applied."""
     rows = found.applied_transform
     if rows is None and (path.parent / "colmap/sparse/0").exists():

@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
 
 from normlift_ns.asking import answer, encoder_of, make_question
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
+from normlift_ns.errors import InputError
 from normlift_ns.lifting import LiftOptions
 from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
@@ -111,7 +114,11 @@ def test_a_failing_lift_leaves_the_training_whole(
     monkeypatch.setattr(module, broken, fail)
     trained = train(broken, queries=("red",))
     shown = capsys.readouterr()
-    assert "out of luck" in shown.err
+    log = trained.config.parent / "normlift_error.txt"
+    named = trained.trainer.base_dir / log.name
+    assert f"RuntimeError: out of luck; the details are in {named}" in shown.out
+    assert "Traceback" in log.read_text()
+    assert "Traceback" not in shown.out + shown.err
     assert "The training is complete and saved" in shown.out
     assert f"ns-normlift --load-config {trained.trainer.base_dir / 'config.yml'}" in shown.out
     run = load_scene(trained.config)
@@ -130,6 +137,34 @@ def test_mistakes_show_before_the_training(train: Callable[..., StockRun]) -> No
         train("weights", source=SourceOptions(encoder_pretrained="missing.pt"))
     with pytest.raises(ValueError, match="regions-dir"):
         train("regions", source=SourceOptions(encoder="colour", regions="files"))
+    lift = LiftOptions()
+    vars(lift)["max_views"] = 0  # as --load-config brings it, past the constructor
+    with pytest.raises(InputError, match=r"--pipeline\.lift: max_views must be at least 1"):
+        train("range", lift=lift)
+
+
+def test_data_that_cannot_be_lifted_show_before_the_training(
+    train: Callable[..., StockRun], workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Other(NerfstudioDataParserConfig):
+        """As of a plugin."""
+
+    with monkeypatch.context() as patched:
+        patched.setattr(normlift_method.config.pipeline.datamanager, "dataparser", Other(load_3D_points=True))
+        with pytest.raises(InputError, match=r"dataparser is a Other, expected NerfstudioDataParserConfig or Colmap"):
+            train("parser")
+    with monkeypatch.context() as patched:
+        patched.setattr(module.os, "access", lambda path, mode: False)
+        with pytest.raises(PermissionError, match=r"cannot be written, so the lift at the end of the training would"):
+            train("locked")
+    photograph = workspace / "scene" / "images" / "003.jpg"
+    whole = photograph.read_bytes()
+    try:
+        Image.new("P", (WIDTH, HEIGHT)).save(photograph, "PNG")
+        with pytest.raises(InputError, match=r"003\.jpg has pixels of kind P"):
+            train("palette")
+    finally:
+        photograph.write_bytes(whole)
 
 
 @pytest.fixture

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from normlift_ns.scenes.colmap import model_folder, read_cameras, read_images, read_points
+from normlift_ns.errors import InputError
+from normlift_ns.scenes.colmap import intrinsics_of, model_folder, pose_of, read_model, read_points
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from tests.scenes.made import write_colmap
 
@@ -17,6 +20,14 @@ KEPT = {
     "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"),
 }  # fmt: skip
+
+
+def read_cameras(folder: Path) -> dict[int, Intrinsics]:
+    return {number: intrinsics_of(camera, folder) for number, camera in read_model(folder)[0].items()}
+
+
+def read_images(folder: Path) -> list:
+    return sorted(read_model(folder)[1], key=lambda image: image.name)
 
 
 def frames(count: int = 5) -> list[Frame]:
@@ -36,7 +47,7 @@ def test_projects_are_read(tmp_path: Path, model: str, binary: bool) -> None:
     cameras, images = read_cameras(folder), read_images(folder)
     assert [image.name for image in images] == [f"photo {i}.jpg" for i in range(5)]
     for image, frame in zip(images, frames()):
-        assert np.allclose(image.pose, frame.pose, atol=1e-12)
+        assert np.allclose(pose_of(image), frame.pose, atol=1e-12)
         lost = {name: 0.0 for name in ("k1", "k2", "p1", "p2") if name not in KEPT[model]}
         assert cameras[image.camera] == DISTORTED._replace(**lost)
     assert np.array_equal(read_points(folder), points)
@@ -68,6 +79,8 @@ def test_unknown_numbers_and_missing_files_are_named(tmp_path: Path) -> None:
     (folder / "cameras.bin").write_bytes(data)
     with pytest.raises(ValueError, match=r"cameras\.bin is damaged .*model number 77"):
         read_cameras(folder)
+    data[12] = 4
+    (folder / "cameras.bin").write_bytes(data)
     (folder / "images.bin").unlink()
     with pytest.raises(FileNotFoundError, match=r"neither images.bin nor images.txt"):
         read_images(folder)
@@ -93,6 +106,41 @@ def test_lines_that_make_no_sense_are_refused(tmp_path: Path, name: str, line: s
         read(folder)
 
 
+def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
+    folder = model_folder(write_colmap(tmp_path, frames(), "PINHOLE", binary=False))
+    cameras, images = (folder / "cameras.txt").read_text(), (folder / "images.txt").read_text()
+    for changed, message in (
+        (cameras + cameras.splitlines()[-1], "stands there twice"),
+        (cameras.replace("640", "1000000000"), "sides that are not 1 to 65,536 pixels"),
+        (cameras.replace("500.5", "inf"), "has parameters .*inf"),
+        ("# nothing", "was taken with camera 5, which is missing"),
+    ):
+        (folder / "cameras.txt").write_text(changed)
+        with pytest.raises(InputError, match=message):
+            read_model(folder)
+    (folder / "cameras.txt").write_text(cameras)
+    (folder / "images.txt").write_text(images + "\n".join(images.splitlines()[-2:]))
+    with pytest.raises(InputError, match="two images of the same number"):
+        read_model(folder)
+    (folder / "images.txt").write_text("# none")
+    with pytest.raises(InputError, match="0 registered images: no image"):
+        read_model(folder)
+
+
+def test_counts_beyond_the_file_and_pipes_are_refused_at_once(tmp_path: Path) -> None:
+    folder = model_folder(write_colmap(tmp_path, frames()))
+    for name in ("cameras", "images"):
+        whole = (folder / f"{name}.bin").read_bytes()
+        (folder / f"{name}.bin").write_bytes(struct.pack("<Q", 10**12) + whole[8:])
+        with pytest.raises(InputError, match=r"1,000,000,000,000 entries"):
+            read_model(folder)
+        (folder / f"{name}.bin").write_bytes(whole)
+    (folder / "images.bin").unlink()
+    os.mkfifo(folder / "images.txt")
+    with pytest.raises(FileNotFoundError, match=r"neither images\.bin nor images\.txt"):
+        read_model(folder)
+
+
 def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> None:
     folder = model_folder(write_colmap(tmp_path, frames(), binary=False))
     expected = read_images(folder)
@@ -105,24 +153,36 @@ def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> No
         read_images(folder)
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    name=st.sampled_from(["cameras", "images", "points3D"]),
-    place=st.integers(0, 600),
-    value=st.binary(min_size=1, max_size=8),
-    cut=st.none() | st.integers(0, 600),
-    binary=st.booleans(),
-)
-def test_no_damage_gets_through_as_another_error(
-    tmp_path_factory: pytest.TempPathFactory, name: str, place: int, value: bytes, cut: int | None, binary: bool
-) -> None:
-    folder = model_folder(write_colmap(tmp_path_factory.mktemp("c"), frames(), binary=binary, points=np.eye(3)))
-    path = folder / f"{name}.{'bin' if binary else 'txt'}"
+def _no_other_error(folder: Path, name: str, place: int, value: bytes, cut: int | None, binary: bool) -> None:
+    write_colmap(folder, frames(), binary=binary, points=np.eye(3))
+    model = model_folder(folder)
+    path = model / f"{name}.{'bin' if binary else 'txt'}"
     data = bytearray(path.read_bytes())
     data[place : place + len(value)] = value
     path.write_bytes(data[:cut])
-    read = {"cameras": read_cameras, "images": read_images, "points3D": read_points}[name]
     try:
-        assert read(folder) is not None
-    except ValueError as error:
+        read_points(model) if name == "points3D" else (read_cameras(model), [pose_of(i) for i in read_images(model)])
+    except (InputError, FileNotFoundError) as error:
         assert str(folder) in str(error)
+
+
+DAMAGE = {
+    "name": st.sampled_from(["cameras", "images", "points3D"]),
+    "place": st.integers(0, 600),
+    "value": st.binary(min_size=1, max_size=8),
+    "cut": st.none() | st.integers(0, 600),
+    "binary": st.booleans(),
+}
+
+
+@settings(max_examples=25, deadline=None)
+@given(**DAMAGE)
+def test_no_damage_gets_through_as_another_error(tmp_path_factory: pytest.TempPathFactory, **damage) -> None:
+    _no_other_error(tmp_path_factory.mktemp("c"), **damage)
+
+
+@pytest.mark.slow
+@settings(max_examples=400, deadline=None)
+@given(**DAMAGE)
+def test_no_damage_gets_through_as_another_error_ever(tmp_path_factory: pytest.TempPathFactory, **damage) -> None:
+    _no_other_error(tmp_path_factory.mktemp("c"), **damage)

@@ -51,9 +51,9 @@ def test_dataparser_transforms_start_from_the_capture(tmp_path: Path) -> None:
         ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
         ([[1, 2], [3]], "holds no transform"),
         ("eye", "holds no transform"),
-        ({"transform": [[1, 0, 0, 0]] * 3}, "holds no transform .KeyError: 'scale'"),
+        ({"transform": [[1, 0, 0, 0]] * 3}, "holds no transform .Object missing required field `scale`"),
         ({"transform": [[1, 0, 0, 0]] * 3, "scale": 1}, "no similarity"),
-        ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "no similarity"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "3 rows and scale -1. Expected"),
         ({"transform": np.eye(4)[:3].tolist(), "scale": "big"}, "holds no transform"),
     ],
 )
