@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.lift import Lifted, Scalars, lift
 from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.refine import refine, unsupported
+from normlift_ns.core.refine import possible, refine, unsupported
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.langsplat.source import write_langsplat
@@ -67,6 +67,7 @@ def lift_scene(
     """
     stages = Stages(report)
     gaussians, views = scene.gaussians.to(device), scene.train
+    options = replace(options, vote=possible(options.vote, len(gaussians))) if options.refine else options
     names = set(source.available(views.names))
     usable = [index for index, name in enumerate(views.names) if name in names]
     used = [usable[i] for i in spread(len(usable), options.max_views)]

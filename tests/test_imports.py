@@ -13,6 +13,7 @@ import normlift_ns
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
     ("errors",),
+    ("ranges",),
     ("options",),
     ("kernels",),
     ("core",),
@@ -32,6 +33,7 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 FOREIGN = {
     "errors": set(),
+    "ranges": set(),
     "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
     "core": BASE | {"xxhash"},
