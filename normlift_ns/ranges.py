@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 from normlift_ns.errors import InputError
 
@@ -130,12 +130,12 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
     whole = kind is int
     if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
         raise _mistake(name, f"a {'whole ' if whole else ''}number", value)
-    bounds = RANGES[name]
-    if not bounds.low <= value <= bounds.high:  # nan is in no range
-        beyond = value > bounds.high and not bounds.words.startswith("in ")
-        most = "finite" if value == math.inf else f"at most {bounds.high:g}"
+    bounds, number = RANGES[name], cast(Any, value)
+    if not bounds.low <= number <= bounds.high:  # nan is in no range
+        beyond = number > bounds.high and not bounds.words.startswith("in ")
+        most = "finite" if number == math.inf else f"at most {bounds.high:g}"
         raise _mistake(name, most if beyond else bounds.words, value)
-    return kind(value)
+    return kind(number)
 
 
 def check_device(device: Any) -> str:

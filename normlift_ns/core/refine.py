@@ -11,13 +11,15 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.gpu import in_parts, kernels_apply
-from normlift_ns.core.neighbors import MOST_NEIGHBORS, Neighbors, nearest_neighbors
+from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = 2**24
 _BLOCK = (2**14, 2**17)
 """Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
+MOST_VOTERS = 256
+"""Largest K of a vote: it compares every two of them, and more than some 30 change hardly anything."""
 _MOST_IN_KERNEL = 63
 """Neighbours, of `kernels.vote`."""
 
@@ -97,17 +99,17 @@ def refine(
 
 
 def possible(config: RefineConfig, n: int) -> RefineConfig:
-    """The same vote with no more neighbours than there are, and than `MOST_NEIGHBORS`; a warning says what changed.
+    """The same vote with no more neighbours than there are, and than `MOST_VOTERS`; a warning says what changed.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as told:
     ...     possible(RefineConfig(k=100), 5).k, str(told[0].message)
     (4, 'k is 100, but a Gaussian has only 4 others; the vote is among 4 neighbours')
     """
-    k = min(config.k, max(1, n - 1), MOST_NEIGHBORS)
+    k = min(config.k, max(1, n - 1), MOST_VOTERS)
     if k == config.k:
         return config
-    reason = f"a Gaussian has only {n - 1:,} others" if k < MOST_NEIGHBORS else f"at most {MOST_NEIGHBORS:,} can vote"
+    reason = f"a Gaussian has only {n - 1:,} others" if k < MOST_VOTERS else f"at most {MOST_VOTERS:,} can vote"
     warnings.warn(f"k is {config.k:,}, but {reason}; the vote is among {k:,} neighbours", stacklevel=2)
     return replace(config, k=k)
 

@@ -130,9 +130,10 @@ def check_config(config: Path, data: Path | None, step: int | None = None) -> No
             "where it is with --data."
         )
     checkpoints = run_dir / "nerfstudio_models"
-    if step is not None and checkpoints.is_dir() and not (checkpoints / f"step-{step:09d}.ckpt").is_file():
-        steps = sorted(path.stem for path in checkpoints.glob("step-*.ckpt"))
-        raise FileNotFoundError(f"{checkpoints} has no checkpoint of --load-step {step}; there are {', '.join(steps)}")
+    wanted = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
+    if checkpoints.is_dir() and not any(checkpoints.glob(wanted)):
+        there = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
+        raise FileNotFoundError(f"No checkpoint {wanted} in {checkpoints}; there is {there}. Copy it there again.")
 
 
 def check_lifted(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
@@ -211,8 +212,8 @@ def check_source(source: SourceOptions, queries: Iterable[str], data: Path | Non
     readable_folder(source.features_dir, "--features-dir")
     readable_file(source.text_vectors, "--text-vectors")
     regions = source.regions
-    if regions == "auto" and source.regions_dir is None and source.sam_model is not None:
-        regions = "sam"
+    if regions == "auto" and (source.regions_dir is not None or source.sam_model is not None):
+        regions = "sam" if source.regions_dir is None else "files"
     if source.features == "none" and regions == "files" and source.regions_dir is None:
         raise InputError(
             'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
@@ -232,8 +233,16 @@ def check_source(source: SourceOptions, queries: Iterable[str], data: Path | Non
 
 
 def _check_level(level: str | None, kind: str) -> None:
-    known = _LEVELS.get(kind)
-    if level is not None and known is not None and level not in known:
+    if level is None or kind == "auto":
+        return
+    if kind == "files":
+        if not (level.isascii() and level.isdigit()):
+            raise InputError(f"--level of --regions files is the number of a map, 0, 1, ...; got {shown(level)}")
+        return
+    known = _LEVELS.get(kind, ())
+    if len(known) == 0:
+        raise InputError(f'--level {shown(level)} is for --regions files or sam, not for "{kind}"; leave it out')
+    if level not in known:
         raise InputError(f"--level must be one of {', '.join(known)} for {kind}, got {shown(level)}")
 
 

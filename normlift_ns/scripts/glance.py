@@ -51,8 +51,11 @@ def glance(config: Path) -> Glance:
     outputs = _path(_at(root, "output_dir"))
     if data is None or outputs is None:
         return Glance(experiment, above, ())
-    parents = [] if above is None else [above, *above.parents]
-    roots = [*parents, *Path(os.path.abspath(outputs)).parents, Path.cwd()]
+    tail = Path(os.path.normpath(outputs)).parts
+    if above is not None and above.parts[-len(tail) :] == tail:  # so the directory of the training is known
+        roots = [Path(*above.parts[: -len(tail)]), Path.cwd()]
+    else:
+        roots = [*(above or Path(os.path.abspath(outputs))).parents, Path.cwd()]
     return Glance(experiment, above, tuple(dict.fromkeys(Path(os.path.abspath(base / data)) for base in roots)))
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol, TextIO, get_type_hints
+from typing import Annotated, Any, Protocol, TextIO, cast, get_type_hints
 
 import docstring_parser
 import tyro
@@ -29,6 +29,7 @@ CONSOLE = Console(**_PLAIN)
 """Results, on standard output. Nothing in a text is markup."""
 ERRORS = Console(**_PLAIN, stderr=True)
 _TERMINATED = ("Terminated", signal.SIGTERM)
+_CANNOT = "The output of the command cannot be written: {}. Send it to another place."
 _PACKAGE = str(Path(normlift_ns.__file__).parent)
 
 
@@ -50,12 +51,13 @@ def run_command(command: type[Command]) -> None:
     Exit code 1: a mistake in flags or files, a full disk or memory. 70: a mistake of ours. 130 and 143: Ctrl-C and
     SIGTERM, after everything half-written is removed.
     """
-    for stream in (sys.stdout, sys.stderr):
+    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
+    for stream in streams:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a code page without the character
     code = _ended(command)
-    for stream in (sys.stdout, sys.stderr):
-        code = _flushed(stream) or code
+    for stream in streams:
+        code = _flushed(stream, tell=code == 0) or code
     if code != 0:
         sys.exit(code)
 
@@ -63,7 +65,7 @@ def run_command(command: type[Command]) -> None:
 def _ended(command: type[Command]) -> int:
     """Runs the command; the exit code."""
     try:
-        with _terminable(), _plain_warnings(), named_as_flags():
+        with _terminable(), _plain_warnings(), _named_output(), named_as_flags():
             _run(command)
     except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read; rich's, where nobody reads the output
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
@@ -79,8 +81,8 @@ def _ended(command: type[Command]) -> int:
 
 def _explained(error: Exception) -> int:
     """Tells of an error; the exit code."""
-    if isinstance(error, BrokenPipeError) or _flush_error(sys.stdout) is not None:
-        return USER  # of the output itself, as `_flushed` says
+    if isinstance(error, BrokenPipeError):  # nobody reads any more
+        return USER
     message, code = explain(error)
     with suppress(OSError):
         ERRORS.rule("Error", style="red")
@@ -112,29 +114,59 @@ def _say_error(text: str) -> None:
         ERRORS.print(Text("\n".join(visible(line) for line in text.split("\n"))), soft_wrap=True)
 
 
-def _flush_error(stream: TextIO | None) -> OSError | None:
+def _flushed(stream: TextIO | None, tell: bool) -> int:
+    """Exit code 1 if what was printed cannot be written, with a message unless the reader has closed a pipe."""
     try:
-        if stream is not None:
+        if stream is not None and not stream.closed:
             stream.flush()
-    except OSError as error:
-        return error
-    except ValueError:  # closed
-        pass
-    return None
-
-
-def _flushed(stream: TextIO | None) -> int:
-    """Exit code 1 and a message if what was printed cannot be written; nobody needs a message about a closed pipe."""
-    error = _flush_error(stream)
-    if error is None or stream is None:
         return 0
-    with suppress(OSError):  # so that Python does not try again at its end
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
-    if not isinstance(error, BrokenPipeError):
-        _say_error(f"The output of the command cannot be written: {error.strerror}. Send it to another place.")
-    return USER
+    except OSError as error:
+        with suppress(OSError):  # so that Python does not try again at its end
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, cast(TextIO, stream).fileno())
+            os.close(nowhere)
+        if tell and not isinstance(error, BrokenPipeError):
+            _say_error(_CANNOT.format(error.strerror))
+        return USER
+
+
+class _Output:
+    """Standard output, whose errors say that they are of it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _of_the_output():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with _of_the_output():
+            self._stream.flush()
+
+
+@contextmanager
+def _of_the_output() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(_CANNOT.format(error.strerror)) from error
+
+
+@contextmanager
+def _named_output() -> Iterator[None]:
+    stream = sys.stdout
+    if stream is not None:
+        sys.stdout = cast(TextIO, _Output(stream))
+    try:
+        yield
+    finally:
+        sys.stdout = stream
 
 
 @contextmanager
