@@ -139,7 +139,7 @@ def test_texts_that_cannot_be_asked(texts, message):
 
 
 def test_texts_that_can_be_asked():
-    check_texts("text", ["[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "‮right to left", "中文"])
+    check_texts("text", ["[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left", "中文"])
 
 
 def test_devices():

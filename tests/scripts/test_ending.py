@@ -9,6 +9,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,9 +34,7 @@ run_command(Command)
 """
 
 
-def start(
-    body: str, *flags: str, state: Path, stdout: object = subprocess.PIPE, **more: str
-) -> subprocess.Popen[bytes]:
+def start(body: str, *flags: str, state: Path, stdout: Any = subprocess.PIPE, **more: str) -> subprocess.Popen[bytes]:
     program = PROGRAM.format(body=textwrap.indent(textwrap.dedent(body), " " * 8))
     environment = os.environ | {"XDG_STATE_HOME": str(state), "PYTHONUNBUFFERED": ""} | more
     return subprocess.Popen(

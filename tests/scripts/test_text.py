@@ -102,7 +102,7 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     """From the flag to the table, the files and their names; the colour is what the encoder reads."""
     from tests.scripts.conftest import run_entry  # noqa: PLC0415
 
-    texts = ("red [/red]", ":smile: yellow", "blue $\\frac{$", "[bold]green", "\x1b[31morange")
+    texts = ("red [/red]", ":smile: yellow", "[bold]green", "\x1b[31m orange")
     folder = tmp_path / "[x] :smile: [/red]"
     flags = ("--load-config", lifted, "--json", folder / "a.json", "--render-dir", folder, "--render-views", "0003")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", *texts) == 0
@@ -111,6 +111,7 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
         assert visible(text) in shown
     assert f"{folder}/a.json" in shown
     assert len(list(folder.glob("*.png"))) == len(texts)
+    texts = (*texts, "blue $\\frac{$")
     exported = ("--load-config", lifted, "--output-dir", folder / "ply", "--text", *texts)
     assert run_entry(monkeypatch, export.entrypoint, *exported) == 0
     shown = capsys.readouterr().out
