@@ -54,7 +54,7 @@ FOREIGN = {
     "plugin": set(),
     "evaluation": BASE | {"cv2", "plyfile", "skimage", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser"},
+    "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser", "yaml"},
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/run.py")

@@ -12,8 +12,7 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 
-from normlift_ns.core.words import visible
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, visible
 
 USER, OURS = 1, 70
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h."""

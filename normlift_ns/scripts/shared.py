@@ -21,7 +21,7 @@ from rich.text import Text
 
 import normlift_ns
 from normlift_ns.core.crash import USER, explain
-from normlift_ns.core.words import visible
+from normlift_ns.errors import visible
 from normlift_ns.ranges import named_as_flags
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
@@ -111,7 +111,7 @@ def say(text: str) -> None:
 
 def _say_error(text: str) -> None:
     with suppress(OSError):  # nobody can be told
-        ERRORS.print(Text("\n".join(visible(line) for line in text.split("\n"))), soft_wrap=True)
+        ERRORS.print(Text(visible(text, keep="\n")), soft_wrap=True)
 
 
 def _flushed(stream: TextIO | None, tell: bool) -> int:

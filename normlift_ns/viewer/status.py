@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from normlift_ns.asking import Answer
-from normlift_ns.core.words import visible
+from normlift_ns.errors import visible
 from normlift_ns.viewer.display import color_scale, palette, selection
 
 
@@ -20,7 +20,7 @@ def as_text(text: str) -> str:
     >>> as_text("a {b}")
     'a &#123;b&#125;'
     """
-    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in visible(text))
+    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in visible(text, keep="\n"))
 
 
 def report(answer: Answer | None, shown: int | None) -> str:

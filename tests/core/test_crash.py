@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from normlift_ns.core.crash import explain, log_traceback
-from normlift_ns.core.words import visible
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, visible
 
 
 def raised(error: Exception) -> Exception:

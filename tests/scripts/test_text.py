@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from normlift_ns.core.words import visible
+from normlift_ns.errors import visible
 from normlift_ns.scripts import evaluate, export, lift, query, shared
 
 HOSTILE = [

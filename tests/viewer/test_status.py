@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from normlift_ns.core.words import visible
+from normlift_ns.errors import visible
 from normlift_ns.viewer.status import as_text, clipped
 
 HOSTILE = [
@@ -29,7 +29,7 @@ HOSTILE = [
 def test_markup_is_text(text):
     shown = as_text(text)
     assert re.fullmatch(r"(?:\w| |&#\d+;)*", shown)
-    assert html.unescape(shown) == visible(text)
+    assert html.unescape(shown) == visible(text, keep="\n")
 
 
 @pytest.mark.parametrize("text", HOSTILE)
