@@ -289,7 +289,8 @@ def _options(field: SemanticField) -> SourceOptions:
             "this run was lifted from features of your own, without texts; name a file of texts and their vectors "
             "(--text-vectors), or lift again and give texts"
         )
-    return SourceOptions(**{**stored, "text_vectors": None if vectors is None else Path(vectors)})
+    encoder = "open_clip" if stored["encoder"] == GIVEN else stored["encoder"]  # which the texts do without
+    return SourceOptions(**{**stored, "encoder": encoder})
 
 
 def default_negatives(field: SemanticField) -> tuple[str, ...]:

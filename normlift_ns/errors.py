@@ -1,4 +1,5 @@
-"""The error that every loader and every check raises, so that a mistake of the user's can be told from ours."""
+"""The error that every loader and every check raises, so that a mistake of the user's can be told from ours; and how
+text from outside is shown."""
 
 from __future__ import annotations
 
@@ -16,3 +17,18 @@ class InputError(ValueError):
     ...     print(error)
     max_views must be at least 1, got 0
     """
+
+
+def visible(text: str, keep: str = "") -> str:
+    r"""The text with escapes in place of characters that are not printed themselves, so that nothing in it moves the
+    cursor, hides or turns around.
+
+    Args:
+        keep: such characters that stay, for example a line break.
+
+    >>> print(visible("red\x1b[31m mug\n"))
+    red\x1b[31m mug\n
+    """
+    return "".join(
+        c if c.isprintable() or c in keep else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )

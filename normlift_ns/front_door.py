@@ -23,6 +23,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.lifting import Export, lift_scene
 from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.ranges import check_texts
 from normlift_ns.runs.files import (
     FIELD_FOLDER,
     TEXTS_FILE,
@@ -160,6 +161,7 @@ def lift_run(
         raise InputError("features of your own take the place of source; give one of the two")
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step are for a config; give them to open_scene")
+    check_texts("queries", queries)
     device, options = choose_device(device), source or SourceOptions()
     made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
     if made is not None and len(queries) > 0:

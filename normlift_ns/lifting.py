@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.lift import Lifted, Scalars, lift
 from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.refine import refine, unsupported
+from normlift_ns.core.refine import possible, refine, unsupported
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.langsplat.source import refuse_equal_stems, write_langsplat
@@ -73,6 +73,7 @@ def lift_scene(
     """
     stages = Stages(report)
     gaussians, views = scene.gaussians.to(device), scene.train
+    options = replace(options, vote=possible(options.vote, len(gaussians))) if options.refine else options
     names = set(source.available(views.names))
     usable = [index for index, name in enumerate(views.names) if name in names]
     used = [usable[i] for i in spread(len(usable), options.max_views)]

@@ -15,6 +15,7 @@ from torch import Tensor
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.options import MIN_SIZE, REACH
+from normlift_ns.ranges import check_number
 
 _NEIGHBORS = 8
 
@@ -60,7 +61,10 @@ def find_objects(
     Args:
         reach: as in `connected_components`.
         min_size: Gaussians of smaller components are only counted.
+    Raises:
+        ValueError: as `connected_components`; `min_size` < 1.
     """
+    check_number("min_size", min_size, int)
     labels = connected_components(means, selected, reach=reach)
     sizes = torch.bincount(labels[labels >= 0].long())
     count = int((sizes >= min_size).sum())  # the largest come first
@@ -94,7 +98,10 @@ def connected_components(
 
     Args:
         reach: > 0, in units of that median.
+    Raises:
+        ValueError: a reach that is not positive and finite.
     """
+    check_number("reach", reach)
     labels = torch.full((len(means),), -1, dtype=torch.int32)
     rows = (selected.cpu() & means.cpu().isfinite().all(dim=1)).nonzero().squeeze(1)
     if len(rows) == 0:

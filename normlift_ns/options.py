@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from normlift_ns.errors import InputError
+from normlift_ns.ranges import check_options, check_texts
 
 RasterizeMode = Literal["classic", "antialiased"]
 """How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
@@ -42,6 +42,9 @@ REACH, MIN_SIZE = 4.0, 20
 @dataclass(frozen=True)
 class SourceOptions:
     """What the images show: an encoder, and the regions that it looks at.
+
+    Raises:
+        ValueError: a value of another type or out of its range.
 
     >>> from normlift_ns import LiftOptions, SourceOptions, lift_run
     >>> source = SourceOptions(encoder="colour", regions="grid", region_count=192)
@@ -92,13 +95,16 @@ class SourceOptions:
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look texts up in instead of encoding them. For imported features."""
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
 
 @dataclass(frozen=True)
 class SplatOptions:
     """Cameras and photographs of a splat that no nerfstudio run holds.
 
     Raises:
-        ValueError: no file of cameras, or two.
+        ValueError: a value of another type or out of its range.
 
     >>> from normlift_ns import SplatOptions
     >>> SplatOptions(transforms="capture/transforms.json").views
@@ -135,20 +141,9 @@ class SplatOptions:
     """What is behind the splat, and behind photographs with an alpha channel."""
 
     def __post_init__(self) -> None:
-        for name in ("colmap", "transforms", "images", "masks", "world_transform"):
-            value = getattr(self, name)
-            object.__setattr__(self, name, None if value is None else Path(value))
         if isinstance(self.holdout, str | float):
             object.__setattr__(self, "holdout", (str(self.holdout),))
-        if self.test_every is not None and not isinstance(self.test_every, int):
-            raise InputError(f"test_every must be a whole number, got {self.test_every!r}")
-        for name, known in (
-            ("views", ("train", "all")),
-            ("rasterize_mode", (None, *get_args(RasterizeMode))),
-            ("background", get_args(Background)),
-        ):
-            if getattr(self, name) not in known:
-                raise InputError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
+        check_options(self)
 
 
 @dataclass(frozen=True)
@@ -179,15 +174,7 @@ class RefineConfig:
     """Margin Delta by which the best neighbour must win the vote, >= 0."""
 
     def __post_init__(self) -> None:
-        for name, valid, expected in (
-            ("k", self.k >= 1, "at least 1"),
-            ("sigma_d", self.sigma_d > 0, "positive"),
-            ("tau", -1 <= self.tau <= 1, "in -1..1"),
-            ("gamma", self.gamma > 0, "positive"),
-            ("delta", self.delta >= 0, "not negative"),
-        ):
-            if not valid:
-                raise InputError(f"RefineConfig.{name} must be {expected}, got {getattr(self, name)}")
+        check_options(self)
 
 
 @dataclass(frozen=True)
@@ -195,7 +182,7 @@ class LiftOptions:
     """What to lift and how.
 
     Raises:
-        ValueError: a number out of range.
+        ValueError: a value of another type or out of its range.
 
     >>> from normlift_ns import LiftOptions
     >>> LiftOptions(max_views=8).storage
@@ -228,18 +215,7 @@ class LiftOptions:
     """Reuse cached 2D features and evidence of earlier lifts where they fit."""
 
     def __post_init__(self) -> None:
-        for name, value in (("max_views", self.max_views), ("lift_downscale", self.lift_downscale)):
-            if value is not None and value < 1:
-                raise InputError(f"{name} must be at least 1, got {value}")
-        for name, known in (
-            ("image_source", ("photos", "render")),
-            ("unlabeled", get_args(Unlabeled)),
-            ("weight_power", (1, 2)),
-            ("storage", ("auto", *get_args(Storage))),
-            ("precision", ("standard", "double")),
-        ):
-            if getattr(self, name) not in known:
-                raise InputError(f"{name} must be one of {', '.join(map(str, known))}; got {getattr(self, name)!r}")
+        check_options(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Configs of version 0.1 call `storage` `form`."""
@@ -248,7 +224,11 @@ class LiftOptions:
 
 @dataclass(frozen=True)
 class AskOptions:
-    """How texts are compared with the scene, and what counts as found."""
+    """How texts are compared with the scene, and what counts as found.
+
+    Raises:
+        ValueError: a value of another type or out of its range, an empty text.
+    """
 
     negatives: tuple[str, ...] | None = None
     """Texts to compare with. By default LERF's (object, things, stuff, texture) for open_clip, none for colour."""
@@ -266,6 +246,10 @@ class AskOptions:
     text_template: str | None = None
     """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
     seven templates. By default as the run was lifted."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        check_texts("negatives", self.negatives or ())
 
     def rules(self) -> dict[str, Any]:
         """As `LiftedRun.ask` takes them: all but what says who reads the texts."""

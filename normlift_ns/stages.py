@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 import torch
 
@@ -48,9 +48,14 @@ class Stages:
 
 
 def cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
-    """Seconds of the stages so far and in all, and the most memory of this process and of the GPU, GiB."""
-    unit = 2**30 if sys.platform == "darwin" else 2**20
-    memory = {"memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
+    """Seconds of the stages so far and in all, and the most memory of this process, where the system tells that, and
+    of the GPU, GiB."""
+    memory = {}
+    if find_spec("resource") is not None:
+        import resource  # noqa: PLC0415 (Windows has none)
+
+        unit = 2**30 if sys.platform == "darwin" else 2**20
+        memory["memory_gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     if torch.device(device).type == "cuda":
         memory["gpu_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
     return {**{f"{stage}_s": value for stage, value in seconds.items()}, "total_s": sum(seconds.values()), **memory}

@@ -13,6 +13,7 @@ import normlift_ns
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
     ("errors",),
+    ("ranges",),
     ("options",),
     ("kernels",),
     ("core",),
@@ -32,6 +33,7 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 FOREIGN = {
     "errors": set(),
+    "ranges": set(),
     "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
     "core": BASE | {"xxhash", "msgspec"},
@@ -52,7 +54,7 @@ FOREIGN = {
     "plugin": set(),
     "evaluation": BASE | {"cv2", "msgspec", "skimage", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser"},
+    "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser", "yaml"},
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/run.py")

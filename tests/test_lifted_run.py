@@ -14,7 +14,7 @@ import normlift_ns as nl
 from normlift_ns.asking import Question
 from normlift_ns.demo import DemoRoom
 from normlift_ns.scripts import query
-from tests.scripts.conftest import run_entry
+from tests.scripts.conftest import run_entry, said
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def test_features_of_ones_own(trained: Path, room: DemoRoom, tmp_path: Path, mon
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     assert json.loads((tmp_path / "a.json").read_text())["queries"][0]["peak"] == pytest.approx(1, abs=1e-3)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:2], "--text", "rde") == 1
-    assert "near names: red" in " ".join(capsys.readouterr().out.split())
+    assert "near names: red" in said(capsys)
 
 
 def nl_mask(trained: Path, name: str) -> torch.Tensor:

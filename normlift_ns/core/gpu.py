@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from normlift_ns.errors import InputError
+from normlift_ns.ranges import check_device
 
 Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
 Result = TypeVar("Result")
@@ -49,11 +50,13 @@ def choose_device(device: str) -> str:
     Raises:
         ValueError: an unknown device, or one that this machine lacks.
     """
-    device = str(device)
-    if device not in ("auto", "cpu") and not device.startswith("cuda"):
-        raise InputError(f"--device must be auto, cpu or cuda, got {device!r}")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"--device {device}: this machine has no CUDA device; use --device cpu")
+    device = check_device(device)
+    if device.startswith("cuda"):
+        count = torch.cuda.device_count()
+        if count == 0:
+            raise InputError(f"--device {device}: this machine has no CUDA device; use --device cpu")
+        if int(device[5:] or 0) >= count:
+            raise InputError(f"--device {device}: this machine has {count}, of which the last is cuda:{count - 1}")
     if device != "auto":
         return device
     return "cuda" if torch.cuda.is_available() else "cpu"

@@ -12,7 +12,10 @@ from torch import Tensor
 
 from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.errors import InputError
+from normlift_ns.ranges import check_number
 
+MOST_NEIGHBORS = 1024
+"""Memory grows with their number times that of the Gaussians, and a vote compares every two of them."""
 _MOST_UNSURE = 1000
 """Gaussians whose neighbours a GPU finds by looking at all others; with more of them the CPU's tree is faster."""
 
@@ -46,7 +49,7 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     A Gaussian whose mean is not finite has no neighbours and is nobody's neighbour.
 
     Raises:
-        ValueError: k < 1.
+        ValueError: k < 1, or more than `MOST_NEIGHBORS`.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors
@@ -54,8 +57,8 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     >>> found.index.tolist(), found.distance.tolist()
     ([[1], [0], [1]], [[1.0], [1.0], [2.0]])
     """
-    if k < 1:
-        raise InputError(f"k must be at least 1, got {k}")
+    if check_number("k", k, int) > MOST_NEIGHBORS:
+        raise InputError(f"k must be at most {MOST_NEIGHBORS:,}, got {k:,}: all neighbours are held in memory at once")
     found = _on_gpu(means.detach(), k) if kernels_apply(means) else None
     return _on_cpu(means, k) if found is None else found
 

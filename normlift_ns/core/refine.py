@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
@@ -16,8 +18,10 @@ from normlift_ns.options import RefineConfig
 _CHUNK_ELEMENTS = 2**24
 _BLOCK = (2**14, 2**17)
 """Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
-_MOST_NEIGHBORS = 63
-"""Of `kernels.vote`."""
+MOST_VOTERS = 256
+"""Largest K of a vote: it compares every two of them, and more than some 30 change hardly anything."""
+_MOST_IN_KERNEL = 63
+"""Neighbours, of `kernels.vote`."""
 
 
 def refine(
@@ -44,7 +48,8 @@ def refine(
         directions: u, unit rows or 0, of any floating-point type, read in float32 (float64 if given); or a function
             that gives those of some Gaussians, `Lifted.directions`: then only a block of them is held at a time.
         reliability: R in 0..1.
-        neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes.
+        neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes; by default those of
+            `possible(config, n)`.
     Raises:
         ValueError: shapes that disagree, neighbours of another K.
 
@@ -56,8 +61,8 @@ def refine(
     >>> source.tolist(), directions[source.long()].tolist()
     ([0, 0, 2], [[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
     """
-    config = config or RefineConfig()
-    n = means.shape[0]
+    n, config = means.shape[0], config or RefineConfig()
+    config = config if neighbors is not None else possible(config, n)
     given = directions if isinstance(directions, Tensor) else None
     shape = (n, 0) if given is None else tuple(given.shape)
     if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
@@ -83,7 +88,7 @@ def refine(
             gaussians = read.nonzero().squeeze(1)
             rows = directions(gaussians)
             row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=means.device)
-        if kernels_apply(means) and rows.dtype != torch.float64 and config.k <= _MOST_NEIGHBORS:
+        if kernels_apply(means) and rows.dtype != torch.float64 and config.k <= _MOST_IN_KERNEL:
             _vote_on_gpu(voters, neighbors, rows, row_of, reliability, source, config, float(width))
         else:
             _vote(voters, neighbors, rows, row_of, reliability, source, config, width)
@@ -91,6 +96,22 @@ def refine(
     for voters in order.split(_BLOCK[means.device.type == "cuda"] if given is None else max(1, n)):
         in_parts(vote, voters, "refine on the CPU")
     return source
+
+
+def possible(config: RefineConfig, n: int) -> RefineConfig:
+    """The same vote with no more neighbours than there are, and than `MOST_VOTERS`; a warning says what changed.
+
+    >>> import warnings
+    >>> with warnings.catch_warnings(record=True) as told:
+    ...     possible(RefineConfig(k=100), 5).k, str(told[0].message)
+    (4, 'k is 100, but a Gaussian has only 4 others; the vote is among 4 neighbours')
+    """
+    k = min(config.k, max(1, n - 1), MOST_VOTERS)
+    if k == config.k:
+        return config
+    reason = f"a Gaussian has only {n - 1:,} others" if k < MOST_VOTERS else f"at most {MOST_VOTERS:,} can vote"
+    warnings.warn(f"k is {config.k:,}, but {reason}; the vote is among {k:,} neighbours", stacklevel=2)
+    return replace(config, k=k)
 
 
 def _vote(

@@ -1,5 +1,7 @@
-"""What weight files of all networks have in common: where they are, and errors of foreign libraries as one line. Imports
-nothing heavy."""
+"""What weight files of all networks have in common: where they are, and errors of foreign libraries as one line.
+
+Imports nothing heavy.
+"""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from normlift_ns.options import WithoutDirection
+from normlift_ns.ranges import check_options
 
 Masking = Literal["background", "auto", "langsplat"]
 Average = Literal["frames", "pairs", "categories"]
@@ -23,6 +24,9 @@ class ScannetOptions:
     without_direction: WithoutDirection = "first"
     """Class of Gaussians without a direction: wall (first, as in published scripts) or no class (none). The result of
     the other choice is reported beside it."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,9 @@ class LerfOptions:
     scale: Literal["unit", "norm"] = "unit"
     """What is composited. unit: cosines. norm: cosines times ||f||, as in SFS, whose features are not normalised."""
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
 
 @dataclass(frozen=True)
 class MaskOptions:
@@ -53,3 +60,6 @@ class MaskOptions:
     """A Gaussian is scored if at least this share of its weight lies in the masks of one class."""
     min_weight: float = 1.0
     """A Gaussian is scored if it has at least this weight, in pixels over all training views."""
+
+    def __post_init__(self) -> None:
+        check_options(self)

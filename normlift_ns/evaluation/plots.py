@@ -27,9 +27,9 @@ def plot_sweeps(
     for one, parameter in zip(axes, parameters):
         points = sorted((row["value"], row[metric]) for row in rows if row["parameter"] == parameter)
         one.plot([f"{x:g}" for x, _ in points], [y for _, y in points], marker="o", markersize=4)
-        one.set_xlabel(parameter)
+        one.set_xlabel(parameter, parse_math=False)
         one.grid(alpha=0.3)
-    axes[0].set_ylabel(label)
+    axes[0].set_ylabel(label, parse_math=False)
     _save(figure, path, overwrite)
 
 

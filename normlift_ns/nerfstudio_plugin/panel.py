@@ -29,6 +29,7 @@ from nerfstudio.viewer.viewer_elements import (
 from torch import Tensor
 
 from normlift_ns.asking import Answer, Question, default_negatives, encoder_of, make_question
+from normlift_ns.core.crash import explain
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.errors import InputError
@@ -62,14 +63,14 @@ class Host(Protocol):
 
 
 def _reported(action: Callable[[Panel], None]) -> Callable[[Panel, Any], None]:
-    """A hook that shows mistakes of the user, and of files, in the panel."""
+    """A hook that shows what went wrong in the panel."""
 
     @wraps(action)
     def hook(panel: Panel, _: Any = None) -> None:
         try:
             action(panel)
-        except (ValueError, OSError) as error:
-            panel.note(str(error))
+        except Exception as error:  # whatever it is: nothing may stop the viewer
+            panel.note(explain(error)[0])
 
     return hook
 
@@ -168,8 +169,8 @@ class Panel(torch.nn.Module):
         question, message = None, ""
         try:
             question = self._read_question()
-        except (ValueError, OSError, MemoryError, RuntimeError) as error:
-            message = str(error)
+        except Exception as error:  # whatever an encoder makes its libraries raise: nothing may stop the viewer
+            message = explain(error)[0]
         viewer = self.control.viewer
         assert viewer.train_lock is not None
         with viewer.train_lock:
@@ -206,8 +207,8 @@ class Panel(torch.nn.Module):
             question = replace(question, min_reliability=sure, refined=refined)
             try:
                 found = session.ask_next(question, self.show_2_threshold.value)
-            except ValueError as error:
-                message = str(error)
+            except Exception as error:  # likewise
+                message = explain(error)[0]
         self._replace(found)
         if message:
             self.note(message)

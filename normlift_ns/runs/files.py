@@ -8,15 +8,18 @@ from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-
-from jaxtyping import Float
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from normlift_ns.core.disk.digests import file_digest, text_digest
 from normlift_ns.core.disk.manifest import BESIDE, MANIFEST, check_files
-from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean, refuse_existing
 from normlift_ns.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from normlift_ns.core.field import SemanticField
 
 FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
@@ -53,6 +56,21 @@ def texts_cache(run_dir: Path) -> Path:
     return cache_folder(run_dir) / "texts"
 
 
+def field_folder(run_dir: Path) -> Path:
+    """The folder of the semantic field of a lifted run.
+
+    Raises:
+        FileNotFoundError: the run has none.
+    """
+    folder = run_dir / FIELD_FOLDER
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{run_dir} is a run without semantics (no {FIELD_FOLDER}/ in it). Lift it with ns-normlift --load-config, "
+            "then give the config.yml that ns-normlift names at its end."
+        )
+    return folder
+
+
 def load_field(
     run_dir: Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
 ) -> SemanticField:
@@ -64,12 +82,9 @@ def load_field(
         FileNotFoundError: the run has none.
         ValueError: a damaged field, or one of other Gaussians than the means.
     """
-    folder = run_dir / FIELD_FOLDER
-    if not folder.exists():
-        raise FileNotFoundError(
-            f"{run_dir} is a run without semantics (no {FIELD_FOLDER}/ in it). Lift it with ns-normlift --load-config, "
-            "then give the config.yml that ns-normlift names at its end."
-        )
+    from normlift_ns.core.field import SemanticField  # noqa: PLC0415 (the commands look at places before torch loads)
+
+    folder = field_folder(run_dir)
     return with_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
 
 

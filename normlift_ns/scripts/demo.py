@@ -12,9 +12,10 @@ from rich.table import Table
 
 from normlift_ns.core.files import new_file, write_text
 from normlift_ns.options import SourceOptions
+from normlift_ns.ranges import check_options
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
-from normlift_ns.scripts.shared import CONSOLE, run_command
+from normlift_ns.scripts.shared import CONSOLE, run_command, say
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -33,6 +34,9 @@ class Demo:
     """Size of the room."""
     views: int = 24
     """Number of training views."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def main(self) -> dict[str, float]:
         """Runs the demo; returns mIoU before and after refinement."""
@@ -74,7 +78,7 @@ class Demo:
         CONSOLE.print(table)
         write_text(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
         viewer = f"ns-viewer --load-config {run.config} --viewer.websocket-host 127.0.0.1"
-        CONSOLE.print(f"Pictures are in {pictures}. See it in the viewer: {viewer}", soft_wrap=True)
+        say(f"Pictures are in {pictures}. See it in the viewer: {viewer}")
         return means
 
 
@@ -103,7 +107,7 @@ def iou_per_class(found: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: i
 
 
 def _show(*words: object) -> None:
-    CONSOLE.print("$ " + shlex.join(map(str, words)), style="bold", markup=False, highlight=False)
+    CONSOLE.print("$ " + shlex.join(map(str, words)), style="bold")
 
 
 if __name__ == "__main__":

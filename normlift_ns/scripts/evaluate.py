@@ -8,12 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from normlift_ns.core.files import refuse_existing
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
-from normlift_ns.scripts.shared import CONSOLE, run_command
+from normlift_ns.ranges import check_device, check_options
+from normlift_ns.scripts.early import check_lifted, readable_file, readable_folder, writable_file
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
 
 if TYPE_CHECKING:
     from normlift_ns.evaluation.protocols import EvaluatedRun
@@ -56,17 +58,12 @@ class NormLiftEval:
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
     def main(self) -> Evaluation:
-        """Evaluates, prints and writes."""
-        if len(self.load_config) == 0 or len(self.load_config) != len(self.labels):
-            raise InputError(
-                f"{len(self.load_config)} runs and {len(self.labels)} --labels were given; give one for each run, in "
-                "the same order"
-            )
-        if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
-            raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
-        figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
-        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
+        """Evaluates, writes and prints."""
+        self._check()
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
@@ -106,8 +103,28 @@ class NormLiftEval:
         CONSOLE.print(results_table(evaluation))
         for name, rows in studies.items():
             CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
-        CONSOLE.print(f"Written: {', '.join(map(str, written))}", highlight=False)
+        say(f"Written: {', '.join(map(str, written))}")
         return evaluation
+
+    def _check(self) -> None:
+        """Raises what can be told before anything is loaded."""
+        check_device(self.device)
+        if len(self.load_config) == 0 or len(self.load_config) != len(self.labels):
+            raise InputError(
+                f"{len(self.load_config)} runs and {len(self.labels)} --labels were given; give one for each run, in "
+                "the same order"
+            )
+        if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
+            raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
+        readable_file(self.text_vectors, "--text-vectors")
+        for config, labels in zip(self.load_config, self.labels):
+            check_lifted(config, self.data)
+            (readable_file if self.protocol == "scannet" else readable_folder)(labels, "--labels")
+        readable_file(self.masks.names, "--names")
+        figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
+        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
+        for path in (self.output_path, *figures):
+            writable_file(path, "--output-path")
 
     def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
         """How to score runs, and how to measure the signals of R."""
@@ -153,15 +170,15 @@ def results_table(evaluation: Evaluation) -> Table:
 
 def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
     """One row per class, with scene or frame where there are several; or per vote."""
-    table = Table(*(rows[0] if len(rows) > 0 else ()), title=title)
+    table = Table(*(Column(plain(name)) for name in (rows[0] if len(rows) > 0 else ())), title=title)
     for row in rows:
-        table.add_row(*(f"{x:.3f}" if isinstance(x, float) else str(x) for x in row.values()))
+        table.add_row(*(f"{x:.3f}" if isinstance(x, float) else plain(x) for x in row.values()))
     return table
 
 
 def signals_table(rows: Sequence[Row]) -> Table:
     """One column per scene."""
-    table = Table("signal", *(str(row.get("scene", "value")) for row in rows), title="signals")
+    table = Table("signal", *(Column(plain(row.get("scene", "value"))) for row in rows), title="signals")
     for name in (key for key in rows[0] if key != "scene"):
         table.add_row(name, *(f"{row[name]:.3f}" for row in rows))
     return table

@@ -11,7 +11,9 @@ from rich.table import Table
 from normlift_ns.core.files import refuse_existing
 from normlift_ns.errors import InputError
 from normlift_ns.options import MIN_SIZE, REACH, AskOptions
-from normlift_ns.scripts.shared import CONSOLE, run_command
+from normlift_ns.ranges import check_device, check_options, check_texts
+from normlift_ns.scripts.early import check_lifted, has_question, writable_file
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
 
 
 @dataclass
@@ -41,14 +43,24 @@ class NormLiftExport:
     device: str = "auto"
     """Where the text encoder runs: auto, cpu or cuda."""
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
     def main(self) -> Path:
         """Writes the files; returns the path of the PLY file."""
+        check_device(self.device)
+        check_texts("text", self.text)
+        check_lifted(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
+        if self.part != "scene" and len(self.text) == 0 and not has_question(self.load_config):
+            raise InputError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
         name = Path(self.output_filename).name
         if name == "":
             raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
         target = self.output_dir / name
         files = (target, *(target.with_name(f"{target.stem}_{name}") for name in ("rows.npy", "objects.json")))
         refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
+        for file in files:
+            writable_file(file, "--output-dir")
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.objects import find_objects  # noqa: PLC0415
 
@@ -60,8 +72,6 @@ class NormLiftExport:
             text_template=self.ask.text_template,
         )
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
-        if answer is None and self.part != "scene":
-            raise InputError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
         part = None if answer is None or self.part == "scene" else answer.mask
         part = ~part if part is not None and self.part == "rest" else part
         objects: dict[str, Any] | None = None
@@ -78,7 +88,7 @@ class NormLiftExport:
                 "min_reliability": question.min_reliability,
             }
         rows = run.export(target, part, answer=answer, objects=objects, overwrite=self.overwrite)
-        CONSOLE.print(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}", highlight=False)
+        say(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}")
         if objects is not None:
             CONSOLE.print(_table(objects["queries"]))
         return target
@@ -94,9 +104,9 @@ def _table(tables: list[dict[str, Any]]) -> Table:
             sides = (high - low for low, high in zip(box["min"], box["max"]))
             vectors = (" ".join(f"{x:.2f}" for x in row) for row in (found["centroid"], sides))
             numbers = (f"{found['size']:,}", *vectors, f"{found['mean_reliability']:.3f}")
-            table.add_row(entry["text"] if i == 0 else "", str(i), *numbers)
+            table.add_row(plain(entry["text"] if i == 0 else ""), str(i), *numbers)
         table.add_row(
-            "" if entry["objects"] else entry["text"], "smaller", f"{entry['in_smaller_parts']:,}", "", "", ""
+            plain("" if entry["objects"] else entry["text"]), "smaller", f"{entry['in_smaller_parts']:,}", "", "", ""
         )
     return table
 

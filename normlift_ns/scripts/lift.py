@@ -17,7 +17,9 @@ from rich.text import Text
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
-from normlift_ns.scripts.shared import CONSOLE, run_command
+from normlift_ns.ranges import check_device, check_options
+from normlift_ns.scripts.early import check_config, check_new_run, check_source, check_splat, writable_folder
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
@@ -59,10 +61,13 @@ class NormLift:
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
     def main(self) -> LiftedRun:
         """Lifts, and returns the new run."""
         start = time.perf_counter()
-        self._check_source()
+        self._check()
         from normlift_ns.front_door import lift_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.lifting import Export  # noqa: PLC0415
 
@@ -81,12 +86,24 @@ class NormLift:
                 device=self.device,
                 export=None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite),
                 report=report,
-                say=_say,
+                say=say,
             )
         CONSOLE.print(summary(run, time.perf_counter() - start, self.queries))
         return run
 
-    def _check_source(self) -> None:
+    def _check(self) -> None:
+        """Raises what can be told before anything is loaded."""
+        check_device(self.device)
+        self._check_splat()
+        if self.load_config is None:
+            check_splat(self.load_ply, self.load_gsplat, self.splat)
+        else:
+            check_config(self.load_config, self.data, self.load_step)
+        check_source(self.source, self.queries)
+        check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
+        writable_folder(self.export_langsplat, "--export-langsplat")
+
+    def _check_splat(self) -> None:
         """Raises a ValueError unless one trained splat is given, and only options that fit it."""
         given = [path for path in (self.load_config, self.load_ply, self.load_gsplat) if path is not None]
         if len(given) != 1:
@@ -110,11 +127,7 @@ class NormLift:
             return cast(Path, self.load_config)
         from normlift_ns.scenes.opening import open_splat  # noqa: PLC0415
 
-        return open_splat(splat, self.splat, say=_say)
-
-
-def _say(text: str) -> None:
-    CONSOLE.print(text, markup=False, highlight=False)
+        return open_splat(splat, self.splat, say=say)
 
 
 @contextmanager
@@ -126,7 +139,12 @@ def progress_bars() -> Iterator[Report]:
         "neighbors": "neighbours",
         "store": "choosing storage",
     }
-    columns = (TextColumn("{task.description:>17}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description:>17}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=CONSOLE) as progress:
         tasks: dict[str, TaskID] = {}
 
@@ -159,16 +177,17 @@ def summary(run: LiftedRun, total: float, queries: tuple[str, ...]) -> Panel:
     table.add_row("seconds", "  ".join(f"{name} {t:.1f}" for name, t in run.seconds.items()) + f"  total {total:.1f}")
     cost = facts["cost"]
     gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""
-    table.add_row("peak memory", f"{cost['memory_gib']:.2f} GiB{gpu}")
+    if "memory_gib" in cost:
+        table.add_row("peak memory", f"{cost['memory_gib']:.2f} GiB{gpu}")
     table.add_row("stored as", f"{facts['form']}, {chosen['bytes'] / 1e6:.1f} MB, cosines within {chosen['bound']:.1e}")
     others = (f"{name} {way['bytes'] / 1e6:.1f} MB" for name, way in facts["forms"].items() if name != facts["form"])
     table.add_row("", "instead of " + ", ".join(others))
-    table.add_row("run", Text(str(run.folder)))
+    table.add_row("run", plain(run.folder))
     text = queries[0] if len(queries) > 0 else "…"
     table.add_row(
-        "next", Text(f"ns-normlift-query --load-config {shlex.quote(str(run.config))} --text {shlex.quote(text)}")
+        "next", plain(f"ns-normlift-query --load-config {shlex.quote(str(run.config))} --text {shlex.quote(text)}")
     )
-    return Panel(table, title="[bold][green]:tada: Lifted :tada:", expand=False)
+    return Panel(table, title=Text("Lifted", style="bold green"), expand=False)
 
 
 def entrypoint() -> None:

@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 from normlift_ns.core.files import file_name, new_file, refuse_existing, write_text
+from normlift_ns.errors import InputError
 from normlift_ns.options import AskOptions
-from normlift_ns.scripts.shared import CONSOLE, run_command
+from normlift_ns.ranges import check_device, check_options, check_texts
+from normlift_ns.scripts.early import check_lifted, different, writable_file, writable_folder
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
 
 if TYPE_CHECKING:
     from normlift_ns.lifted_run import Answer
@@ -44,12 +47,12 @@ class NormLiftQuery:
     device: str = "auto"
     """Where the text encoder runs: auto, cpu or cuda."""
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
     def main(self) -> list[dict[str, Any]]:
-        """Asks, prints and writes; returns the rows of the table."""
-        for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
-            if path is not None:
-                refuse_existing(path, overwrite=self.overwrite, instead=flag)
-        refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
+        """Asks, writes and prints; returns the rows of the table."""
+        self._check()
         from normlift_ns.asking import summarize  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.front_door import open_run  # noqa: PLC0415
         from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
@@ -64,7 +67,6 @@ class NormLiftQuery:
         cameras = training_cameras(run.scene, self.render_views)
         answer = run.ask(*self.text, **self.ask.rules())
         rows, question = summarize(answer), answer.question
-        CONSOLE.print(_table(rows, f"{question.rule} > {question.threshold:g}"))
         if self.json is not None:
             _write_json(self.json, rows, answer, self.overwrite)
         if self.output_path is not None:
@@ -73,9 +75,25 @@ class NormLiftQuery:
             save_overlays(run.scene, answer, cameras, self.render_dir, overwrite=self.overwrite)
         stored = run.save(question) if self.save else None
         written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
+        CONSOLE.print(_table(rows, f"{question.rule} > {question.threshold:g}"))
         if len(written) > 0:
-            CONSOLE.print("Written: " + ", ".join(map(str, written)), highlight=False)
+            say("Written: " + ", ".join(map(str, written)))
         return rows
+
+    def _check(self) -> None:
+        """Raises what can be told before anything is loaded."""
+        check_device(self.device)
+        if len(self.text) == 0:
+            raise InputError('no text given; name at least one thing to look for, such as --text "orange"')
+        check_texts("text", self.text)
+        check_lifted(self.load_config, self.data, self.ask)
+        different(json=self.json, output_path=self.output_path)
+        for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
+            if path is not None:
+                refuse_existing(path, overwrite=self.overwrite, instead=flag)
+                writable_file(path, flag)
+        writable_folder(self.render_dir, "--render-dir")
+        refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
 
     def _pictures(self) -> list[Path]:
         """Pictures that new ones would replace: of the same texts, and of the same views where some are named."""
@@ -110,7 +128,7 @@ def _table(rows: list[dict[str, Any]], rule: str) -> Table:
     for row in rows:
         vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
         numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
-        table.add_row(row["text"], f"{row['fraction']:.2%}", *vectors, *numbers)
+        table.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers)
     return table
 
 

@@ -1,18 +1,36 @@
-"""What the commands have in common: flags with their help, and errors that users can act on."""
+"""What the commands have in common: flags with their help, text that is shown as it is, and how they end."""
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, Protocol, get_type_hints
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, Protocol, TextIO, cast, get_type_hints
 
 import docstring_parser
 import tyro
 from rich.console import Console
+from rich.text import Text
 
 import normlift_ns
+from normlift_ns.core.crash import USER, explain
+from normlift_ns.errors import visible
+from normlift_ns.ranges import named_as_flags
 
-CONSOLE = Console(width=120)
+_PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
+CONSOLE = Console(**_PLAIN)
+"""Results, on standard output. Nothing in a text is markup."""
+ERRORS = Console(**_PLAIN, stderr=True)
+_TERMINATED = ("Terminated", signal.SIGTERM)
+_CANNOT = "The output of the command cannot be written: {}. Send it to another place."
+_PACKAGE = str(Path(normlift_ns.__file__).parent)
 
 
 class Command(Protocol):
@@ -23,27 +41,166 @@ class Command(Protocol):
         ...
 
 
-def run_command(command: type[Command]) -> None:
-    """Reads the flags in the form of nerfstudio's commands (--flag True) and runs the command.
+class Terminated(BaseException):
+    """The system wants the process to end: SIGTERM, as before a pre-emption."""
 
-    Errors of flags, input, files, disks and memory become a message and exit code 1, Ctrl-C exit code 130.
+
+def run_command(command: type[Command]) -> None:
+    """Reads the flags in the form of nerfstudio's commands (--flag True), runs the command and ends the process.
+
+    Exit code 1: a mistake in flags or files, a full disk or memory. 70: a mistake of ours. 130 and 143: Ctrl-C and
+    SIGTERM, after everything half-written is removed.
     """
+    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
+    for stream in streams:
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a code page without the character
+    code = _ended(command)
+    for stream in streams:
+        code = _flushed(stream, tell=code == 0) or code
+    if code != 0:
+        sys.exit(code)
+
+
+def _ended(command: type[Command]) -> int:
+    """Runs the command; the exit code."""
+    try:
+        with _terminable(), _plain_warnings(), _named_output(), named_as_flags():
+            _run(command)
+    except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read; rich's, where nobody reads the output
+        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
+        return USER if code == 2 else code
+    except (KeyboardInterrupt, Terminated) as stop:
+        word, number = ("Interrupted", signal.SIGINT) if isinstance(stop, KeyboardInterrupt) else _TERMINATED
+        _say_error(f"{word}. No partial files remain; rerun the command to resume.")
+        return 128 + number
+    except Exception as error:  # whatever it is: a traceback helps no user
+        return _explained(error)
+    return 0
+
+
+def _explained(error: Exception) -> int:
+    """Tells of an error; the exit code."""
+    if isinstance(error, BrokenPipeError):  # nobody reads any more
+        return USER
+    message, code = explain(error)
+    with suppress(OSError):
+        ERRORS.rule("Error", style="red")
+    _say_error(message)
+    return code
+
+
+def _run(command: type[Command]) -> None:
     if "--version" in sys.argv[1:]:
-        print(f"normlift_ns {normlift_ns.__version__}")
+        say(f"normlift_ns {normlift_ns.__version__}")
         return
     tyro.extras.set_accent_color("bright_yellow")
+    flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
+    tyro.cli(flags, description=summary(command)).main()
+
+
+def plain(value: object) -> Text:
+    """A text, a path or a name for a table, shown as it is."""
+    return Text(visible(str(value)))
+
+
+def say(text: str) -> None:
+    """One line on standard output, as long as it is."""
+    CONSOLE.print(plain(text), soft_wrap=True)
+
+
+def _say_error(text: str) -> None:
+    with suppress(OSError):  # nobody can be told
+        ERRORS.print(Text(visible(text, keep="\n")), soft_wrap=True)
+
+
+def _flushed(stream: TextIO | None, tell: bool) -> int:
+    """Exit code 1 if what was printed cannot be written, with a message unless the reader has closed a pipe."""
     try:
-        flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
-        tyro.cli(flags, description=summary(command)).main()
-    except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read
-        sys.exit(1 if stop.code == 2 else stop.code)
-    except (ValueError, OSError, MemoryError) as error:
-        CONSOLE.rule("Error", style="red")
-        CONSOLE.print(str(error), justify="center", markup=False, highlight=False)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        CONSOLE.print("Interrupted. No partial files remain; rerun the command to resume.")
-        sys.exit(130)
+        if stream is not None and not stream.closed:
+            stream.flush()
+        return 0
+    except OSError as error:
+        with suppress(OSError):  # so that Python does not try again at its end
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, cast(TextIO, stream).fileno())
+            os.close(nowhere)
+        if tell and not isinstance(error, BrokenPipeError):
+            _say_error(_CANNOT.format(error.strerror))
+        return USER
+
+
+class _Output:
+    """Standard output, whose errors say that they are of it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _of_the_output():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with _of_the_output():
+            self._stream.flush()
+
+
+@contextmanager
+def _of_the_output() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OSError(_CANNOT.format(error.strerror)) from error
+
+
+@contextmanager
+def _named_output() -> Iterator[None]:
+    stream = sys.stdout
+    if stream is not None:
+        sys.stdout = cast(TextIO, _Output(stream))
+    try:
+        yield
+    finally:
+        sys.stdout = stream
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends what runs within as Ctrl-C does."""
+
+    def terminate(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # what is half-written is being removed
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings of ours are one line; those of other packages stay as they are."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], filename: str, *rest: Any, **more: Any) -> None:
+            if filename.startswith(_PACKAGE):
+                _say_error(f"Warning: {message}")
+            else:
+                others(message, category, filename, *rest, **more)
+
+        warnings.showwarning = show
+        yield
 
 
 def with_help(options: Any, *, nested: bool = False) -> Any:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from normlift_ns.asking import Answer
+from normlift_ns.errors import visible
 from normlift_ns.viewer.display import color_scale, palette, selection
 
 
 def clipped(text: str, most: int) -> str:
-    """The text on one line, cut where it is longer than `most` characters."""
-    line = " ".join(text.split())
+    """The text on one line, cut where it is longer than `most` characters, with escapes for what is not printed."""
+    line = visible(" ".join(text.split()))
     return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def as_text(text: str) -> str:
-    """Text that MDX shows as it is: whatever could be markup or code becomes a character reference.
+    """Text that MDX shows as it is: whatever could be markup or code becomes a character reference, and what is not
+    printed an escape.
 
     >>> as_text("a {b}")
     'a &#123;b&#125;'
     """
-    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in text)
+    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in visible(text, keep="\n"))
 
 
 def report(answer: Answer | None, shown: int | None) -> str:

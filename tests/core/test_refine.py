@@ -93,7 +93,7 @@ def test_chunks_do_not_change_the_vote(monkeypatch):
     assert torch.equal(refine(means, u, r, RefineConfig(k=12)), whole)
 
 
-@pytest.mark.parametrize("config", [RefineConfig(k=12, delta=math.inf), RefineConfig(k=1, delta=5.0)])
+@pytest.mark.parametrize("config", [RefineConfig(k=12, delta=1e30), RefineConfig(k=1, delta=5.0)])
 def test_a_margin_that_nobody_clears_is_the_identity(config):
     means, u, r = scene(2)
     assert torch.equal(refine(means, u, r, config), torch.arange(60, dtype=torch.int32))
@@ -174,7 +174,7 @@ def test_half_precision_directions_vote_like_float32():
     ],
 )
 def test_parameters_have_ranges(kwargs, message):
-    with pytest.raises(ValueError, match=f"RefineConfig.{message}"):
+    with pytest.raises(ValueError, match=message):
         RefineConfig(**kwargs)
 
 

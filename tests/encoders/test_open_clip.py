@@ -327,7 +327,7 @@ def test_downloads_use_the_activation_they_were_trained_with(offline, weights, m
             ValueError,
             "--text-template 'a {}' is for --encoder open_clip",
         ),
-        ({"crop_fill": "grey"}, ValueError, "fill of crops must be one of black, white; got 'grey'"),
+        ({"crop_fill": "grey"}, ValueError, "crop_fill must be one of black, white; got 'grey'"),
     ],
 )
 def test_unknown_names_are_refused_before_loading(options, error, message):

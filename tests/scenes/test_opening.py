@@ -297,7 +297,7 @@ def test_undistortion_and_masks_are_nerfstudios(tmp_path: Path) -> None:
         ({"colmap": "p", "images": "half"}, "13 of the 14 photographs .* are not in .*half"),
         ({"colmap": "p", "images": "flat"}, "is 160 x 60 pixels, but its camera .* the aspect differs"),
         ({"colmap": "empty", "images": "half"}, "has 0 cameras and 0 registered images"),
-        ({"colmap": "p", "images": "all", "test_every": 1}, "--test-every must be at least 2"),
+        ({"colmap": "p", "images": "all", "test_every": 1}, "test_every must be at least 2"),
         ({"colmap": "p", "images": "all", "test_every": 8, "holdout": ("0001",)}, "give one of them"),
         ({"colmap": "p", "images": "all", "holdout": ("1.5",)}, "1.5 is no share: expected a number between 0 and 1"),
         (

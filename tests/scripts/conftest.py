@@ -10,6 +10,12 @@ SMALL = ("--encoder", "colour", "--k", "12")
 """Flags that lift the small demo room in a moment."""
 
 
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, results and then errors, without line breaks."""
+    shown = capsys.readouterr()
+    return " ".join((shown.out + shown.err).split())
+
+
 def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> int:
     """Exit code of a command."""
     monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])

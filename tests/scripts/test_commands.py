@@ -23,7 +23,7 @@ from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import export, lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.encoders.tiny import CLIP, write_clip, write_sam
-from tests.scripts.conftest import SMALL, run_entry
+from tests.scripts.conftest import SMALL, run_entry, said
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
@@ -96,7 +96,7 @@ def test_a_query_replaces_nothing_unasked(output, lifted, tmp_path, monkeypatch,
         patch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
         for views in ((), ("--render-views", "0002", "images/0003.png")):
             assert run_entry(patch, query.entrypoint, *flags, *views) == 1
-            shown = " ".join(capsys.readouterr().out.split())
+            shown = said(capsys)
             assert f"{existing.name} exists; give another {output}, or --overwrite True." in shown
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
     asked = (*flags, "--render-views", "0003", "--overwrite", True)
@@ -117,7 +117,7 @@ def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     for path in before:
         for flag in ("--json", "--output-path"):
             assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red", flag, path) == 1
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = said(capsys)
     assert shown.count("--overwrite True") == 2 * len(before)
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
 
@@ -132,7 +132,7 @@ def test_a_damaged_run_is_refused_with_a_message(name, lifted, tmp_path, monkeyp
     path.write_bytes(content)
     flags = ("--load-config", config, "--data", lifted.parents[4] / "room")
     assert run_entry(monkeypatch, export.entrypoint, *flags, "--output-dir", tmp_path / "out") == 1
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = said(capsys)
     assert "is damaged" in shown and name in shown
     assert "ns-normlift --load-config" in shown or "ns-normlift-query --load-config" in shown
     assert not (tmp_path / "out").exists()
@@ -185,7 +185,7 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
     flags = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--timestamp", "t")
     monkeypatch.setattr(lifting, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
-    assert "rerun the command to resume" in capsys.readouterr().out
+    assert "rerun the command to resume" in capsys.readouterr().err
     written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
     assert {p.suffix for p in written} == {".safetensors"}
     assert all(".cache" in p.parts for p in written)
@@ -206,14 +206,14 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
         (("--encoder", "words"), "invalid choice"),
         (("--encoder", "colour", "--queries", ""), "is empty"),
         (("--encoder", "colour", "--queries", "oragne"), "orange"),
-        (("--encoder", "colour", "--max-views", "0"), "max_views must be at least 1, got 0"),
+        (("--encoder", "colour", "--max-views", "0"), "--max-views must be at least 1, got 0"),
         (("--encoder", "colour", "--device", "tpu"), "--device must be auto, cpu or cuda"),
         (("--encoder", "colour", "--timestamp", "one"), "exists; give another --timestamp"),
         (("--encoder", "colour", "--regions", "files"), "--regions-dir"),
         (("--encoder", "colour", "--regions", "files", "--regions-dir", "nowhere"), "nowhere"),
         (("--encoder", "colour", "--data", "nowhere"), "nowhere"),
         (("--encoder", "open_clip", "--encoder-pretrained", "missing.pt"), "missing.pt"),
-        (("--encoder", "colour", "--tau", "2"), "RefineConfig.tau must be in -1..1"),
+        (("--encoder", "colour", "--tau", "2"), "--tau must be in -1..1"),
     ],
 )
 def test_bad_flags_have_a_message_and_exit_code_1(flags, message, trained, lifted, monkeypatch, capsys):
@@ -230,7 +230,7 @@ def test_label_maps_of_another_size_are_refused_or_resampled(trained, tmp_path, 
         Image.open(path).resize((80, 60), Image.Resampling.NEAREST).save(folder / path.name)
     flags = ("--load-config", trained, *SMALL, "--regions", "files", "--regions-dir", folder, "--timestamp", "maps")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = said(capsys)
     assert "80" in shown
     assert "160" in shown
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--regions-resample", "True") == 0
@@ -252,7 +252,7 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     assert float(classes[classes > 0].min()) < 0.9
     capsys.readouterr()
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--timestamp", "none") == 1
-    assert "has 2 levels of regions, 0..1; choose one with --level" in " ".join(capsys.readouterr().out.split())
+    assert "has 2 levels of regions, 0..1; choose one with --level" in said(capsys)
 
 
 @pytest.fixture(scope="module")
@@ -319,13 +319,13 @@ def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
 def test_pictures_of_an_unknown_view_are_refused(lifted, monkeypatch, capsys):
     flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = said(capsys)
     assert "no training image '9999'; there are 12, from '0000' to '0011'" in shown
 
 
 def test_a_query_of_a_run_without_semantics_says_what_to_do(trained, monkeypatch, capsys):
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", trained, "--text", "red") == 1
-    assert "ns-normlift --load-config" in " ".join(capsys.readouterr().out.split())
+    assert "ns-normlift --load-config" in said(capsys)
 
 
 def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch, capsys):
@@ -338,7 +338,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
     data = lifted.parents[4] / "room"
     flags = ("--load-config", copy / "config.yml", "--text", "red", "--data", data)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
-    assert "was lifted from other Gaussians" in " ".join(capsys.readouterr().out.split())
+    assert "was lifted from other Gaussians" in said(capsys)
 
 
 def test_selection_follows_threshold_and_reliability(lifted):
@@ -381,7 +381,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     (tmp_path / "texts.npz").rename(tmp_path / "moved.npz")
     capsys.readouterr()
     assert run_entry(monkeypatch, query.entrypoint, *asking) == 1
-    assert "say where it is with --text-vectors" in " ".join(capsys.readouterr().out.split())
+    assert "say where it is with --text-vectors" in said(capsys)
     assert run_entry(monkeypatch, query.entrypoint, *asking, "--text-vectors", tmp_path / "moved.npz") == 0
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["negatives"] == []  # the file has no vectors of LERF's words
@@ -390,7 +390,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     np.savez(tmp_path / "short.npz", red=np.ones(5))
     flags = (*output, *importing, "--text-vectors", tmp_path / "short.npz", "--queries", "red", "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    assert "the vectors of --queries have 5 numbers, the features 343" in " ".join(capsys.readouterr().out.split())
+    assert "the vectors of --queries have 5 numbers, the features 343" in said(capsys)
 
 
 def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monkeypatch, capsys):
@@ -404,10 +404,12 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
         *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t"),
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    assert "1 of 12 images have no features" in " ".join(capsys.readouterr().out.split())
-    with pytest.warns(UserWarning, match=r"1 of 12 images have no features in .*: images/0003\.png; they are left out"):
-        assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
-    assert "1 images without features" in capsys.readouterr().out
+    assert "1 of 12 images have no features" in said(capsys)
+    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
+    shown = capsys.readouterr()
+    assert "1 images without features" in shown.out
+    assert "Warning: 1 of 12 images have no features in " in shown.err
+    assert "images/0003.png; they are left out" in " ".join(shown.err.split())
     field = open_run(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml").field
     assert field.manifest["statistics"]["views"] == 11
     assert int(field.scalars.view_count.max()) <= 11

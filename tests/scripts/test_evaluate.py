@@ -18,7 +18,7 @@ from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.evaluation import votes
 from normlift_ns.evaluation.scannet import NYU40
 from normlift_ns.scripts import evaluate, lift
-from tests.scripts.conftest import run_entry
+from tests.scripts.conftest import run_entry, said
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_nothing_is_replaced_unasked(existing, workspace, tmp_path, monkeypatch,
     flags = ("--protocol", "masks", "--load-config", config, "--labels", workspace / "room" / "instance")
     flags += ("--output-path", tmp_path / "scores.json", "--study", "sweeps", "signals")
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 1
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = said(capsys)
     assert f"{existing} exists; give another --output-path, or --overwrite True." in shown
     assert [path.name for path in tmp_path.iterdir()] == [existing]
     assert (tmp_path / existing).read_text() == "mine"
@@ -66,7 +66,7 @@ def test_the_default_output_is_not_replaced_either(workspace, tmp_path, monkeypa
     config = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml"
     flags = ("--protocol", "masks", "--load-config", config, "--labels", workspace / "room" / "instance")
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 1
-    assert "output.json exists" in capsys.readouterr().out
+    assert "output.json exists" in said(capsys)
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags, "--overwrite", True) == 0
     assert json.loads(Path("output.json").read_text())["experiment_name"] == "room"
 
@@ -183,9 +183,9 @@ def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--protocol", "masks"), "folder of instance masks"),
-        (("--protocol", "lerf"), "holds no label files"),
-        (("--protocol", "scannet"), "do not exist"),
+        (("--protocol", "masks"), "none, given with --labels, does not exist"),
+        (("--protocol", "lerf"), "none, given with --labels, does not exist"),
+        (("--protocol", "scannet"), "none, given with --labels, does not exist"),
     ],
 )
 def test_missing_files_are_named(workspace, monkeypatch, capsys, flags, message):
@@ -193,7 +193,6 @@ def test_missing_files_are_named(workspace, monkeypatch, capsys, flags, message)
     (workspace / "labels.json").write_text('{"1": "red"}')
     given = ("--load-config", config, "--labels", workspace / "none", "--output-path", workspace / "no.json")
     assert run_entry(monkeypatch, evaluate.entrypoint, *given, *flags) == 1
-    shown = capsys.readouterr().out
-    assert message in shown
+    assert message in said(capsys)
     assert not (workspace / "no.json").exists()
     assert torch.is_grad_enabled()

@@ -18,7 +18,7 @@ from normlift_ns.demo import DemoRoom
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.scripts import export
-from tests.scripts.conftest import run_entry
+from tests.scripts.conftest import run_entry, said
 
 EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "label"]
 
@@ -148,7 +148,7 @@ def test_nothing_is_overwritten_unasked(scene_ply: Path, lifted: Path, monkeypat
     before = scene_ply.read_bytes()
     flags = ("--load-config", lifted, "--output-dir", scene_ply.parent, "--part", "selection")
     assert run_entry(monkeypatch, export.entrypoint, *flags) == 1
-    assert "exists; give another --output-dir" in " ".join(capsys.readouterr().out.split())
+    assert "exists; give another --output-dir" in said(capsys)
     assert scene_ply.read_bytes() == before
     outside = ("--output-filename", "../../evil.ply")
     assert run_entry(monkeypatch, export.entrypoint, *flags[:-2], *outside) == 0
@@ -173,5 +173,5 @@ def test_no_part_of_an_export_is_replaced_unasked(existing, lifted: Path, tmp_pa
     monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
     (tmp_path / existing).write_text("mine")
     assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path) == 1
-    assert f"{existing} exists; give another --output-dir" in " ".join(capsys.readouterr().out.split())
+    assert f"{existing} exists; give another --output-dir" in said(capsys)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]

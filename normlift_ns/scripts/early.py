@@ -1,0 +1,275 @@
+"""Mistakes that can be told before torch and nerfstudio are imported, so that they cost no more than a moment.
+
+Every check here is made again by what uses the file; what it says is the same in other words.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from normlift_ns.core.files import clean
+from normlift_ns.errors import InputError
+from normlift_ns.options import AskOptions, SourceOptions, SplatOptions
+from normlift_ns.ranges import check_texts, shown
+from normlift_ns.runs.files import FIELD_FOLDER, field_folder, refuse_existing_run, run_directory, texts_cache
+from normlift_ns.scripts.glance import glance
+
+_LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
+_PATHS_ONLY = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
+_HUB = "https://huggingface.co"
+
+
+def readable_file(path: Path | None, flag: str) -> None:
+    """Raises FileNotFoundError, or InputError for anything but a regular file."""
+    if path is None:
+        return
+    mode = _mode(path, flag)
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise InputError(f"{path}, given with {flag}, is {what}; give a file")
+    _check_access(path, flag)
+
+
+def readable_folder(path: Path | None, flag: str) -> None:
+    """Raises FileNotFoundError, or InputError for anything but a folder."""
+    if path is None:
+        return
+    if not stat.S_ISDIR(_mode(path, flag)):
+        raise InputError(f"{path}, given with {flag}, is no folder; give the folder of the files")
+    _check_access(path, flag)
+
+
+def _mode(path: Path, flag: str) -> int:
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        link = " (a link that leads nowhere)" if path.is_symlink() else ""
+        raise FileNotFoundError(f"{path}{link}, given with {flag}, does not exist; check the path") from None
+    except OSError as error:  # a link to itself, a name that is too long, a folder that may not be searched
+        raise OSError(f"{shown(str(path))}, given with {flag}, cannot be opened: {error.strerror}") from None
+
+
+def _check_access(path: Path, flag: str) -> None:
+    if not os.access(path, os.R_OK):
+        raise PermissionError(f"{path}, given with {flag}, may not be read; change its rights")
+
+
+def writable_file(path: Path | None, flag: str) -> None:
+    """Raises InputError or OSError where a file cannot be written; the folders above need not exist."""
+    if path is None:
+        return
+    if path.name == "":
+        raise InputError(f"{path}, given with {flag}, is the name of a folder; give that of a file")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}, given with {flag}, is there and is no file; give another name")
+    writable_folder(path.parent, flag)
+
+
+def writable_folder(path: Path | None, flag: str) -> None:
+    """Raises InputError or OSError where nothing can be written into a folder; it need not exist."""
+    if path is None:
+        return
+    for parent in (path, *path.absolute().parents):
+        try:
+            mode = parent.stat().st_mode
+        except FileNotFoundError:
+            if not parent.is_symlink():
+                continue
+            raise InputError(
+                f"{parent}, named with {flag}, is a link that leads nowhere; give another folder"
+            ) from None
+        except NotADirectoryError:
+            continue  # a file is further above
+        except OSError as error:
+            raise OSError(f"{shown(str(path))}, named with {flag}, cannot be opened: {error.strerror}") from None
+        if not stat.S_ISDIR(mode):
+            raise InputError(f"{parent}, named with {flag}, is no folder; give another place")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise PermissionError(f"{parent}, named with {flag}, may not be written; choose another folder")
+        return
+
+
+def different(**paths: Path | None) -> None:
+    """Raises InputError where two flags name one file."""
+    seen: dict[str, str] = {}
+    for name, path in paths.items():
+        place = None if path is None else os.path.realpath(path)
+        if place is not None and place in seen:
+            raise InputError(f"--{seen[place]} and --{name.replace('_', '-')} name the same file, {path}")
+        if place is not None:
+            seen[place] = name.replace("_", "-")
+
+
+def check_config(config: Path, data: Path | None, step: int | None = None) -> None:
+    """A config.yml that can be opened, its dataset, and its checkpoint where a step is named."""
+    run_dir = Path(os.path.abspath(config)).parent
+    if not run_dir.exists():
+        clean(run_dir.parent)  # a lift that was killed while it replaced the run
+    if not config.is_file():
+        hint = f"; {config / 'config.yml'} exists, give that" if (config / "config.yml").is_file() else ""
+        raise FileNotFoundError(
+            f"No config at {config}{hint}. Expected the config.yml that ns-train wrote, "
+            "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
+        )
+    _check_access(config, "--load-config")
+    if data is not None and not data.exists():
+        raise FileNotFoundError(
+            f"There is no dataset at {data}, given with --data. Expected the folder or the transforms.json that "
+            "ns-train got."
+        )
+    seen = glance(config)
+    own = data is not None or (run_dir / "splat.json").is_file()  # a lifted splat says itself where photographs are
+    if not own and len(seen.data) > 0 and not any(place.exists() for place in seen.data):
+        raise FileNotFoundError(
+            f"The dataset of {config} is not at {' nor at '.join(map(str, seen.data[:2]))}. If it was moved, say "
+            "where it is with --data."
+        )
+    checkpoints = run_dir / "nerfstudio_models"
+    wanted = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
+    if checkpoints.is_dir() and not any(checkpoints.glob(wanted)):
+        there = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
+        raise FileNotFoundError(f"No checkpoint {wanted} in {checkpoints}; there is {there}. Copy it there again.")
+
+
+def check_lifted(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
+    """A lifted run, and what is needed to ask it texts."""
+    check_config(config, data)
+    folder = field_folder(Path(os.path.abspath(config)).parent)
+    if ask is None:
+        return
+    readable_file(ask.text_vectors, "--text-vectors")
+    stored = _encoder_of(folder)
+    if ask.text_vectors is None and stored.get("text_vectors") is None and stored.get("encoder") == "open_clip":
+        names = texts_cache(folder.parent)
+        if not (names.is_dir() and any(names.iterdir())):  # perhaps the texts are there
+            _check_clip(stored.get("encoder_model"), stored.get("encoder_pretrained"))
+
+
+def _encoder_of(folder: Path) -> dict[str, Any]:
+    """The encoder of the manifest; nothing where it is damaged, which shows when it is opened."""
+    try:
+        found = json.loads((folder / "manifest.json").read_text("utf8")).get("encoder")
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def has_question(config: Path) -> bool:
+    """Whether a lifted run stores texts."""
+    return (Path(os.path.abspath(config)).parent / FIELD_FOLDER / "queries.safetensors").exists()
+
+
+def check_new_run(
+    config: Path | None, splat: SplatOptions, output_dir: Path | None, timestamp: str | None, overwrite: bool
+) -> None:
+    """The place of a new run: it can be written, and no other run is there."""
+    writable_folder(output_dir, "--output-dir")
+    if config is not None:
+        seen = glance(config)
+        name, outputs = seen.experiment, output_dir or seen.output_dir
+    else:
+        cameras = (splat.colmap or splat.transforms or Path()).absolute()
+        name, outputs = (
+            (cameras.parent if cameras.suffix == ".json" else cameras).name or "splat",
+            output_dir or Path("outputs"),
+        )
+    run_dir = run_directory(outputs or Path(), name or "run", timestamp)
+    if name is None or outputs is None:
+        return
+    if timestamp is not None:
+        refuse_existing_run(run_dir, overwrite)
+    writable_folder(run_dir.parent, "--output-dir")
+
+
+def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:
+    """A splat without a run, and its cameras and photographs."""
+    readable_file(ply, "--load-ply")
+    readable_file(gsplat, "--load-gsplat")
+    if (splat.colmap is None) == (splat.transforms is None):
+        count = "none" if splat.colmap is None else "two"
+        raise InputError(
+            f"A splat needs one file of cameras, got {count}: give the folder of a COLMAP project with --colmap, or a "
+            "transforms.json with --transforms."
+        )
+    readable_folder(splat.colmap, "--colmap")
+    if splat.transforms is not None and not splat.transforms.is_dir():
+        readable_file(splat.transforms, "--transforms")
+    readable_folder(splat.images, "--images")
+    readable_folder(splat.masks, "--masks")
+    readable_file(splat.world_transform, "--world-transform")
+
+
+def check_source(source: SourceOptions, queries: Iterable[str], data: Path | None = None) -> None:
+    """What the 2D features are made of: folders, weights, levels, texts."""
+    texts = tuple(queries)
+    check_texts("queries", texts)
+    readable_folder(source.regions_dir, "--regions-dir")
+    readable_folder(source.features_dir, "--features-dir")
+    readable_file(source.text_vectors, "--text-vectors")
+    regions = source.regions
+    if regions == "auto" and (source.regions_dir is not None or source.sam_model is not None):
+        regions = "sam" if source.regions_dir is None else "files"
+    if source.features == "none" and regions == "files" and source.regions_dir is None:
+        raise InputError(
+            'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
+        )
+    if source.features != "none" and source.features_dir is None:
+        raise InputError(f"features {source.features!r} need their folder: give it with --features-dir")
+    _check_level(source.level, "langsplat" if source.features == "langsplat" else regions)
+    if source.sam_model is not None and _is_path(source.sam_model, 2):
+        _mode(Path(source.sam_model), "--sam-model")
+    if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
+        raise InputError(
+            f"--text-template {shown(source.text_template)} has no {{}}, which the text takes the place of"
+        )
+    asked = source.features == "none" or (len(texts) > 0 and source.text_vectors is None)
+    if source.encoder == "open_clip" and asked:
+        _check_clip(source.encoder_model, source.encoder_pretrained)
+
+
+def _check_level(level: str | None, kind: str) -> None:
+    if level is None or kind == "auto":
+        return
+    if kind == "files":
+        if not (level.isascii() and level.isdigit()):
+            raise InputError(f"--level of --regions files is the number of a map, 0, 1, ...; got {shown(level)}")
+        return
+    known = _LEVELS.get(kind, ())
+    if len(known) == 0:
+        raise InputError(f'--level {shown(level)} is for --regions files or sam, not for "{kind}"; leave it out')
+    if level not in known:
+        raise InputError(f"--level must be one of {', '.join(known)} for {kind}, got {shown(level)}")
+
+
+def _is_path(name: str, parts: int) -> bool:
+    """Whether a name can only be that of a file or folder here."""
+    path = Path(name)
+    return path.is_absolute() or len(path.parts) > parts or path.suffix in _PATHS_ONLY
+
+
+def _check_clip(model: Any, pretrained: Any) -> None:
+    """Weights of OpenCLIP that are neither on this machine nor to be had."""
+    if not isinstance(model, str) or not isinstance(pretrained, str) or Path(pretrained).is_file():
+        return
+    remedy = (
+        "give a local weight file with --encoder-pretrained, or use the encoder that needs no weights: --encoder colour"
+    )
+    if _is_path(pretrained, 1):
+        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
+    from normlift_ns.encoders.weights import clip_weights_at_hand, probe  # noqa: PLC0415 (rarely needed)
+
+    if clip_weights_at_hand(model, pretrained) is False:
+        try:
+            if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
+                raise ConnectionError("HF_HUB_OFFLINE forbids to download")
+            probe(os.environ.get("HF_ENDPOINT", _HUB))
+        except OSError as error:
+            raise FileNotFoundError(
+                f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine, and cannot be downloaded "
+                f"({error}); go online once, {remedy}"
+            ) from None

@@ -1,0 +1,118 @@
+"""Text is text: no markup, emoji code or escape of a prompt, path, name or label is interpreted by a command."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from normlift_ns.errors import visible
+from normlift_ns.scripts import evaluate, export, lift, query, shared
+
+HOSTILE = [
+    "[/red]",
+    "[bold]red[/bold]",
+    "[link=http://x]y[/link]",
+    ":smile:",
+    ":tada: [red",
+    "a[0]\\[1]",
+    "\x1b[31mred\x1b[0m",
+    "\x1b]0;title\x07",
+    "two\nlines",
+    "\rover",
+    "\u202eright to left",
+    "\x9b2J",
+    "\udc80",
+    "$\\frac{$",
+]
+NUMBERS = {"fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None}
+OBJECT = {"size": 3, "centroid": [0.0] * 3, "box": {"min": [0.0] * 3, "max": [1.0] * 3}, "mean_reliability": 0.5}
+
+
+def summary(text: str) -> Any:
+    manifest = {
+        "statistics": {
+            "gaussians": 1,
+            "zero_evidence_share": 0,
+            "excluded": 0,
+            "left_out": 0,
+            "reliability_quantiles": {},
+        },
+        "forms": {"float16": {"bytes": 1, "bound": 0.1}},
+        "form": "float16",
+        "features": {"kind": "given"},
+        "cost": {},
+    }
+    run = SimpleNamespace(field=SimpleNamespace(manifest=manifest), seconds={}, folder=Path(text), config=Path(text))
+    return lift.summary(run, 1.0, (text,))  # type: ignore[arg-type]
+
+
+TABLES: dict[str, Callable[[str], Any]] = {
+    "query": lambda text: query._table([{"text": text, **NUMBERS}], "lerf > 0.5"),
+    "export": lambda text: export._table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
+    "export nothing": lambda text: export._table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
+    "eval rows": lambda text: evaluate.rows_table([{"class": text, "iou": 0.5}], "ablation"),
+    "eval columns": lambda text: evaluate.rows_table([{text: 0.5}]),
+    "eval signals": lambda text: evaluate.signals_table([{"scene": text, "zero.share": 0.5}]),
+    "lift": summary,
+    "text": shared.plain,
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("text", HOSTILE)
+@pytest.mark.parametrize("stock", [False, True])
+def test_tables_show_texts_as_they_are(name, text, stock):
+    """Also on a console that would interpret markup, in colours."""
+    file = io.StringIO()
+    options: dict[str, Any] = {} if stock else {"markup": False, "emoji": False, "highlight": False}
+    console = Console(file=file, width=200, force_terminal=True, color_system="truecolor", **options)
+    console.print(TABLES[name](text))
+    shown = file.getvalue()
+    assert visible(text) in shown
+    for start in ("\x1b]", "\x1b[31m", "\x07", "\r", "\u202e", "\x9b"):
+        assert start not in shown
+    shown.encode("utf8")
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_lines_are_texts_too(text, capsys):
+    shared.say(f"Written: {text}/{'long/' * 60}end")
+    shared._say_error(f"{text} does not exist")
+    shown = capsys.readouterr()
+    assert shown.out == f"Written: {visible(text)}/{'long/' * 60}end\n"
+    assert shown.err == "\n".join(map(visible, text.split("\n"))) + " does not exist\n"
+
+
+@pytest.mark.parametrize("text", HOSTILE[:5])
+def test_the_consoles_of_commands_interpret_nothing(text, capsys):
+    shared.CONSOLE.rule(text)
+    shared.CONSOLE.print(text)
+    shared.ERRORS.print(text)
+    shown = capsys.readouterr()
+    assert shown.out.count(text) == 2 and shown.err == f"{text}\n"
+
+
+def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch, capsys):
+    """From the flag to the table, the files and their names; the colour is what the encoder reads."""
+    from tests.scripts.conftest import run_entry  # noqa: PLC0415
+
+    texts = ("red [/red]", ":smile: yellow", "[bold]green", "\x1b[31m orange")
+    folder = tmp_path / "[x] :smile: [/red]"
+    flags = ("--load-config", lifted, "--json", folder / "a.json", "--render-dir", folder, "--render-views", "0003")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", *texts) == 0
+    shown = capsys.readouterr().out
+    for text in texts:
+        assert visible(text) in shown
+    assert f"{folder}/a.json" in shown
+    assert len(list(folder.glob("*.png"))) == len(texts)
+    texts = (*texts, "blue $\\frac{$")
+    exported = ("--load-config", lifted, "--output-dir", folder / "ply", "--text", *texts)
+    assert run_entry(monkeypatch, export.entrypoint, *exported) == 0
+    shown = capsys.readouterr().out
+    assert all(visible(text) in shown for text in texts)

@@ -1,0 +1,171 @@
+"""The table of options: what is in no range is refused by every dataclass of options, with a message that names it."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import InputError, nearest_neighbors, refine
+from normlift_ns.core.refine import MOST_VOTERS, possible
+from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
+from normlift_ns.objects import connected_components
+from normlift_ns.options import AskOptions, LiftOptions, RefineConfig, SourceOptions, SplatOptions
+from normlift_ns.ranges import LONGEST_TEXT, RANGES, check_device, check_number, check_texts, named_as_flags
+from normlift_ns.scripts.demo import Demo
+from normlift_ns.scripts.evaluate import NormLiftEval
+from normlift_ns.scripts.export import NormLiftExport
+from normlift_ns.scripts.lift import NormLift
+from normlift_ns.scripts.query import NormLiftQuery
+
+OPTIONS: dict[type, dict[str, Any]] = {
+    **{cls: {} for cls in (LiftOptions, RefineConfig, SourceOptions, SplatOptions, AskOptions, NormLift, Demo)},
+    **{cls: {} for cls in (ScannetOptions, LerfOptions, MaskOptions)},
+    NormLiftQuery: {"load_config": Path("config.yml"), "text": ("red",)},
+    NormLiftExport: {"load_config": Path("config.yml"), "output_dir": Path("out")},
+    NormLiftEval: {"protocol": "masks", "load_config": (Path("config.yml"),), "labels": (Path("labels"),)},
+}
+"""With the options that have no default."""
+
+
+def kinds(hint: Any) -> set[Any]:
+    return set(get_args(hint)) - {type(None)} or {hint}
+
+
+FIELDS = [(cls, field.name, kinds(get_type_hints(cls)[field.name])) for cls in OPTIONS for field in fields(cls)]
+NUMBERS = [(cls, name, kind) for cls, name, kind in FIELDS if kind & {int, float}]
+HOSTILE = [math.nan, math.inf, -math.inf, 10**400, -(10**400), 10**5000, True, False, "1", b"1", [1], {}, object(), 1j]
+
+
+def test_every_number_has_a_range_and_defaults_are_in_it():
+    named = {(cls, name) for cls, name, _ in NUMBERS}
+    assert {name for _, name in named} == set(RANGES)
+    for cls, given_ in OPTIONS.items():
+        made = cls(**given_)
+        for field in fields(cls):
+            if field.default is not MISSING:
+                assert getattr(made, field.name) == field.default
+
+
+@pytest.mark.parametrize(("cls", "name", "kind"), NUMBERS, ids=lambda x: getattr(x, "__name__", str(x)))
+def test_what_is_no_number_or_in_no_range_is_refused(cls, name, kind):
+    ends = [RANGES[name].low - 1 - abs(RANGES[name].low), RANGES[name].high * 2 + 1]
+    for value in [*HOSTILE, *ends, *([1.5] if kind == {int} else [])]:
+        with pytest.raises(InputError, match=f"^{name} must be "):
+            cls(**{**OPTIONS[cls], name: value})
+
+
+@pytest.mark.parametrize(("cls", "name", "kind"), FIELDS, ids=lambda x: getattr(x, "__name__", str(x)))
+def test_values_of_other_types_are_refused(cls, name, kind):
+    if name == "holdout":  # a number is a share
+        return
+    for value in (object(), {}, 1j, b"x"):
+        with pytest.raises(InputError, match=f"^{name} "):
+            cls(**{**OPTIONS[cls], name: value})
+    if bool not in kind:
+        with pytest.raises(InputError, match=f"^{name} "):
+            cls(**{**OPTIONS[cls], name: True})
+
+
+@given(st.sampled_from(FIELDS), st.one_of(st.floats(), st.integers(), st.text(), st.none(), st.binary(), st.booleans()))
+@settings(max_examples=100, deadline=None)
+def test_options_are_made_or_refused(field, value):
+    cls, name, _ = field
+    try:
+        made = cls(**{**OPTIONS[cls], name: value})
+    except InputError as error:
+        assert name in str(error) and len(str(error)) < 300
+    else:
+        kept = getattr(made, name)
+        assert not isinstance(kept, float) or math.isfinite(kept)
+
+
+def test_a_message_names_the_flag_in_a_command_and_the_field_in_python():
+    with pytest.raises(InputError, match=r"^sigma_d must be positive, at least 1e-06, got nan$"):
+        RefineConfig(sigma_d=math.nan)
+    with named_as_flags(), pytest.raises(InputError, match=r"^--sigma-d must be positive, at least 1e-06, got nan$"):
+        RefineConfig(sigma_d=math.nan)
+    with pytest.raises(InputError, match=r"^sigma_d must be finite, got inf$"):
+        RefineConfig(sigma_d=math.inf)
+
+
+def test_values_take_the_type_of_their_field():
+    vote = RefineConfig(k=np.int64(7), sigma_d=2, tau=np.float32(0.5))
+    assert [type(x) for x in (vote.k, vote.sigma_d, vote.tau)] == [int, float, float]
+    assert SourceOptions(regions_dir="maps").regions_dir == Path("maps")  # type: ignore[arg-type]
+    assert AskOptions(negatives=["a", "b"]).negatives == ("a", "b")  # type: ignore[arg-type]
+    assert SplatOptions(holdout=0.1).holdout == ("0.1",)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["encoder", "regions", "features", "crop_fill", "features_missing"])
+def test_words_are_those_of_the_list(name):
+    for value in ("x", "", 1, None):
+        with pytest.raises(InputError, match=f"^{name} must be one of .*; got "):
+            SourceOptions(**{name: value})
+
+
+@pytest.mark.parametrize("value", ["a\0b", "a\udc80"])
+def test_names_hold_characters_only(value):
+    for name in ("encoder_model", "encoder_pretrained", "level", "text_template"):
+        with pytest.raises(InputError, match=name):
+            SourceOptions(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["a", ""], "text 2 of 2 of queries is empty"),
+        ([" \n\t"], "is empty"),
+        (["a", "b", "a"], "text 3 of 3 of queries, 'a', is given twice"),
+        (["a\0"], "holds a character that no text has"),
+        (["\udc80"], "holds a character that no text has"),
+        (["x" * 10**6], f"has 1,000,000 characters; give at most {LONGEST_TEXT:,}"),
+        ("red", "must be a list of texts"),
+        ([3], "must be a text, got 3"),
+    ],
+)
+def test_texts_that_cannot_be_asked(texts, message):
+    with pytest.raises(InputError, match=message) as told:
+        check_texts("queries", texts)
+    assert len(str(told.value)) < 300
+
+
+def test_texts_that_can_be_asked():
+    check_texts("text", ["[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left", "中文"])
+
+
+def test_devices():
+    assert [check_device(name) for name in ("auto", "cpu", "cuda", "cuda:3")] == ["auto", "cpu", "cuda", "cuda:3"]
+    for name in ("gpu", "cuda:x:", "cuda:-1", "cuda:", "cuda:99999", "cudax", "cpu:0", "", "CPU", None, "cuda:٣"):
+        with pytest.raises(InputError, match="must be auto, cpu or cuda"):
+            check_device(name)
+
+
+def test_more_neighbours_than_there_are():
+    means = torch.rand(6, 3, generator=torch.Generator().manual_seed(0))
+    u, r = torch.nn.functional.normalize(means, dim=1), means[:, 0]
+    with pytest.warns(UserWarning, match="k is 100,000, but a Gaussian has only 5 others; the vote is among 5"):
+        many = refine(means, u, r, RefineConfig(k=100_000, delta=0.0))
+    assert torch.equal(many, refine(means, u, r, RefineConfig(k=5, delta=0.0)))
+    with pytest.warns(UserWarning, match=f"k is 100,000, but at most {MOST_VOTERS} can vote"):
+        assert possible(RefineConfig(k=100_000), 6000).k == MOST_VOTERS
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert possible(RefineConfig(), 6000) == RefineConfig()
+    with pytest.raises(InputError, match="k must be at most 1,024, got 100,000"):
+        nearest_neighbors(means, 100_000)
+
+
+def test_objects_have_a_reach():
+    for reach in (math.nan, math.inf, 0.0, -1.0):
+        with pytest.raises(InputError, match="reach must be"):
+            connected_components(torch.rand(4, 3), torch.ones(4, dtype=torch.bool), reach=reach)
+    assert check_number("reach", 4) == 4.0

@@ -1,0 +1,38 @@
+"""What the panel says: nothing of a prompt or an error is compiled as MDX."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import pytest
+
+from normlift_ns.errors import visible
+from normlift_ns.viewer.status import as_text, clipped
+
+HOSTILE = [
+    "<script>x</script>",
+    "{1+1}",
+    "| a | b |",
+    "**b**",
+    "a\n# b",
+    "`x`",
+    "\x1b[31m",
+    "\u202ex",
+    "\udc80",
+    "\0",
+    "&lt;",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_markup_is_text(text):
+    shown = as_text(text)
+    assert re.fullmatch(r"(?:\w| |&#\d+;)*", shown)
+    assert html.unescape(shown) == visible(text, keep="\n")
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_choices_of_a_dropdown_can_be_sent_and_shown(text):
+    assert clipped(text, 40).isprintable()
+    clipped(text, 40).encode("utf8")
