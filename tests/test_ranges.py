@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 import torch
+import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -50,9 +51,9 @@ def test_every_number_has_a_range_and_defaults_are_in_it():
     assert {name for _, name in named} == set(RANGES)
     for cls, given_ in OPTIONS.items():
         made = cls(**given_)
-        for field in fields(cls):
-            if field.default is not MISSING:
-                assert getattr(made, field.name) == field.default
+        for one in fields(cls):
+            if one.default is not MISSING:
+                assert getattr(made, one.name) == one.default
 
 
 @pytest.mark.parametrize(("cls", "name", "kind"), NUMBERS, ids=lambda x: getattr(x, "__name__", str(x)))
@@ -169,3 +170,16 @@ def test_objects_have_a_reach():
         with pytest.raises(InputError, match="reach must be"):
             connected_components(torch.rand(4, 3), torch.ones(4, dtype=torch.bool), reach=reach)
     assert check_number("reach", 4) == 4.0
+
+
+def test_options_within_options_of_a_command_are_a_message(capsys):
+    """As in ns-train normlift, which reads its flags with tyro, before it trains."""
+
+    @dataclass
+    class Pipeline:
+        lift: LiftOptions = field(default_factory=LiftOptions)
+
+    with pytest.raises(SystemExit):
+        tyro.cli(Pipeline, args=["--lift.vote.sigma-d", "nan"])
+    shown = capsys.readouterr().err
+    assert "sigma_d must be positive, at least 1e-06, got nan" in shown and "Traceback" not in shown
