@@ -315,9 +315,9 @@ class Evidence:
             region_view, counts = tensors["region_view"], [int(facts[name]) for name in _COUNTS]
             if region_view.ndim != 1 or region_view.dtype != torch.int32:
                 raise InputError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")
+            rows.check("weights of regions", len(region_view))
             if not (0 <= counts[0] <= _MOST_VIEWS and counts[1] in (0, 1, 2) and 0 <= counts[2] <= len(rows)):
                 raise InputError(f"{', '.join(_COUNTS)} are {', '.join(map(str, counts))[:50]}, out of range")
-            rows.check("weights of regions", len(region_view))
             unlabeled.check("weights of unlabelled pixels", counts[0])
             return Evidence(rows, region_view, unlabeled, *counts), digest
         except (KeyError, ValueError) as error:
