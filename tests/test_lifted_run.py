@@ -181,7 +181,7 @@ def test_names_of_runs_are_names_of_folders(trained: Path, tmp_path: Path) -> No
         ({"a": [1, 2, 3]}, (), r"must have the same length, found \[2, 3\]"),
         ({"a": [1, 2]}, ["b"], "text 'b' has no vector in the texts given, which holds 1; near names: a"),
         (None, ["b"], "which holds none"),
-        ({"a": [1, 2]}, "a", "prompts must be a list of texts"),
+        ({"a": [1, 2]}, "a", "queries must be a list of texts"),
     ],
 )
 def test_texts_that_cannot_be_asked_are_refused_before_the_lift(trained: Path, tmp_path: Path, texts, queries, message):

@@ -109,7 +109,11 @@ def possible(config: RefineConfig, n: int) -> RefineConfig:
     k = min(config.k, max(1, n - 1), MOST_VOTERS)
     if k == config.k:
         return config
-    reason = f"a Gaussian has only {n - 1:,} others" if k < MOST_VOTERS else f"at most {MOST_VOTERS:,} can vote"
+    reason = (
+        f"a Gaussian has only {n - 1:,} other{'s' * (n != 2)}"
+        if k < MOST_VOTERS
+        else f"at most {MOST_VOTERS:,} can vote"
+    )
     warnings.warn(f"k is {config.k:,}, but {reason}; the vote is among {k:,} neighbours", stacklevel=2)
     return replace(config, k=k)
 

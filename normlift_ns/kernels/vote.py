@@ -28,8 +28,9 @@ def _vote(
     r = tl.load(reliability + member, mask=there, other=0.0)
     if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else nobody can win
         d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
-        nearest = tl.min(tl.where(r > 0, d * d, float("inf")), axis=0)
-        weight = r * tl.exp(-0.5 * tl.maximum(d * d - nearest, 0.0))
+        nearest = tl.min(tl.where(r > 0, d, float("inf")), axis=0)
+        beyond = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product rounds
+        weight = r * tl.exp(-0.5 * beyond)
         row = tl.load(row_of + member, mask=there, other=0).to(tl.int64) * dimension
         cosine = tl.zeros([GROUP, GROUP], tl.float32)
         for first in range(0, dimension, SLICE):

@@ -47,6 +47,8 @@ PAIRS: dict[str, str | None] = {
     "normlift_ns.plugin.model.NormLiftModelConfig": "normlift_ns.plugin.model.NormLiftModel",  # those of version 0.1
     "normlift_ns.plugin.pipeline.NormLiftPipelineConfig": "normlift_ns.plugin.pipeline.NormLiftPipeline",
     "normlift_ns.plugin.lifting.LiftOptions": None,
+    "normlift_ns.core.refine.RefineConfig": None,
+    "normlift_ns.encoders.build.SourceOptions": None,
     "normlift_ns.options.LiftOptions": None,
     "normlift_ns.options.SourceOptions": None,
     "normlift_ns.options.RefineConfig": None,

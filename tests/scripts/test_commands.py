@@ -338,7 +338,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
     data = lifted.parents[4] / "room"
     flags = ("--load-config", copy / "config.yml", "--text", "red", "--data", data)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
-    assert "was lifted from other Gaussians" in said(capsys)
+    assert checkpoint.name in (words := said(capsys)) and "copy it again from the whole run" in words
 
 
 def test_selection_follows_threshold_and_reliability(lifted):
@@ -381,7 +381,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     (tmp_path / "texts.npz").rename(tmp_path / "moved.npz")
     capsys.readouterr()
     assert run_entry(monkeypatch, query.entrypoint, *asking) == 1
-    assert "say where it is with --text-vectors" in said(capsys)
+    assert "give texts with vectors of the same network, --text-vectors" in said(capsys)
     assert run_entry(monkeypatch, query.entrypoint, *asking, "--text-vectors", tmp_path / "moved.npz") == 0
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["negatives"] == []  # the file has no vectors of LERF's words
