@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-import traceback
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -18,6 +16,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.asking import encoder_settings, make_question
+from normlift_ns.core.crash import explain
 from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.source import FeatureSource
@@ -142,15 +141,9 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
     except Exception as error:  # whatever it is
         if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
-        reason = str(error)
-        if not isinstance(error, ValueError | OSError | MemoryError):  # no mistake of the user's
-            log = trainer.base_dir / "normlift_error.txt"
-            with suppress(OSError):
-                write_text(log, traceback.format_exc(), overwrite=True)
-            reason = f"{type(error).__name__}: {error}; the details are in {log}"
         CONSOLE.rule("Error", style="red")
         CONSOLE.print(
-            f"The training is complete and saved, but lifting it at step {step} failed: {reason}\n"
+            f"The training is complete and saved, but lifting it at step {step} failed: {explain(error)[0]}\n"
             f"Lift it again with: ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,

@@ -165,7 +165,7 @@ def summary(run: LiftedRun, total: float, queries: tuple[str, ...]) -> Panel:
     quantiles = "  ".join(f"{float(q):.0%} {value:.2f}" for q, value in numbers["reliability_quantiles"].items())
     table.add_row("Gaussians", f"{numbers['gaussians']:,}, without evidence {numbers['zero_evidence_share']:.1%}")
     if numbers["excluded"] > 0:
-        table.add_row("not drawn", f"{numbers['excluded']:,} with non-finite parameters")
+        table.add_row("not drawn", f"{numbers['excluded']:,} with parameters that are not finite or out of range")
     if numbers["left_out"] > 0:
         table.add_row("left out", f"{numbers['left_out']} images without features")
     features = facts["features"]

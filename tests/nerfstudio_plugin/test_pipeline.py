@@ -106,17 +106,17 @@ def test_the_run_is_lifted_in_place(train: Callable[..., StockRun], registered: 
 
 @pytest.mark.parametrize("broken", ["lift_scene", "save_question", "make_question"])
 def test_a_failing_lift_leaves_the_training_whole(
-    train: Callable[..., StockRun], registered: None, monkeypatch, capsys, broken: str
+    train: Callable[..., StockRun], registered: None, monkeypatch, capsys, tmp_path: Path, broken: str
 ) -> None:
     def fail(*args: Any, **kwargs: Any) -> None:
         raise RuntimeError("out of luck")
 
     monkeypatch.setattr(module, broken, fail)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     trained = train(broken, queries=("red",))
     shown = capsys.readouterr()
-    log = trained.config.parent / "normlift_error.txt"
-    named = trained.trainer.base_dir / log.name
-    assert f"RuntimeError: out of luck; the details are in {named}" in shown.out
+    (log,) = (tmp_path / "normlift_ns").iterdir()
+    assert f"RuntimeError: out of luck. The details are in {log}" in shown.out
     assert "Traceback" in log.read_text()
     assert "Traceback" not in shown.out + shown.err
     assert "The training is complete and saved" in shown.out
