@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from normlift_ns.encoders.text_vectors import TextVectors
 from normlift_ns.errors import InputError
 from normlift_ns.objects import SceneObject, find_objects
 from normlift_ns.options import THRESHOLDS, Rule, SourceOptions
+from normlift_ns.ranges import check_bool, check_number, shown
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
@@ -325,14 +325,15 @@ def make_question(
     Raises:
         ValueError: a text that is empty or that the encoder does not understand.
     """
+    if negatives is not None and not isinstance(negatives, Sequence):
+        raise InputError(f"negatives must be a list of texts, got {shown(negatives)}")
     if isinstance(negatives, str):
         raise InputError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
     if rule not in ("auto", *get_args(Rule)):
         raise InputError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
-    if not 0 <= min_reliability <= 1 or (threshold is not None and not math.isfinite(threshold)):
-        raise InputError(
-            f"the minimum reliability must be in 0..1 and the threshold finite, got {min_reliability} and {threshold}"
-        )
+    min_reliability = check_number("min_reliability", min_reliability)
+    threshold = None if threshold is None else check_number("threshold", threshold)
+    check_bool("refined", refined)
     negatives = tuple(default_negatives(field) if negatives is None else negatives)
     if rule == "auto":
         rule = "cosine" if len(negatives) == 0 else "lerf"

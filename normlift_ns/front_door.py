@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.lifting import Export, lift_scene
 from normlift_ns.options import LiftOptions, SourceOptions
-from normlift_ns.ranges import check_texts
+from normlift_ns.ranges import check_bool, check_number, check_path, check_texts
 from normlift_ns.runs.files import (
     FIELD_FOLDER,
     TEXTS_FILE,
@@ -56,7 +57,8 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     >>> len(scene.train), scene.train[1].image.shape
     (12, torch.Size([120, 160, 3]))
     """
-    config, place = Path(load_config), None if data is None else Path(data)
+    config, place = check_path("load_config", load_config), None if data is None else check_path("data", data)
+    load_step = None if load_step is None else check_number("load_step", load_step, int)
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
         clean(run_dir.parent)  # a lift that was killed while it replaced the run
@@ -91,11 +93,13 @@ def open_run(
     >>> answer["yellow"].objects[0].size > 20
     True
     """
-    folder = Path(os.path.abspath(load_config)).parent
+    folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
+    vectors = None if text_vectors is None else check_path("text_vectors", text_vectors)
     check_run(folder)  # before nerfstudio, which takes 20 s
     device, scene = choose_device(device), open_scene(load_config, data=data)
     loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
-    vectors = None if text_vectors is None else Path(text_vectors)
+    for remark in scene.remarks:
+        warnings.warn(remark, stacklevel=2)
     return LiftedRun(folder, scene, with_texts(loaded, vectors=vectors, template=text_template), device)
 
 
@@ -162,6 +166,14 @@ def lift_run(
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step are for a config; give them to open_scene")
     check_texts("queries", queries)
+    check_bool("overwrite", overwrite)
+    check_bool("check", check)
+    target = None if output_dir is None else check_path("output_dir", output_dir)
+    if timestamp is not None:
+        run_directory(Path(), "run", timestamp)  # its name shows before the scene loads
+    for name, value, kind in (("source", source, SourceOptions), ("lift", lift, LiftOptions)):
+        if value is not None and not isinstance(value, kind):
+            raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
     device, options = choose_device(device), source or SourceOptions()
     made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
     if made is not None and len(queries) > 0:
@@ -176,7 +188,7 @@ def lift_run(
         raise TypeError(
             f"lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got {type(scene).__name__}"
         )
-    run_dir = run_directory(scene.runs_dir if output_dir is None else Path(output_dir), scene.name, timestamp)
+    run_dir = run_directory(target or scene.runs_dir, scene.name, timestamp)
     tidy(run_dir)
     if timestamp is not None:
         refuse_existing_run(run_dir, overwrite)

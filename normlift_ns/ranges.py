@@ -133,9 +133,15 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
     bounds, number = RANGES[name], cast(Any, value)
     if not bounds.low <= number <= bounds.high:  # nan is in no range
         beyond = number > bounds.high and not bounds.words.startswith("in ")
-        most = "finite" if number == math.inf else f"at most {bounds.high:g}"
+        most = "finite" if number == math.inf else f"at most {bounds.high:{',' if whole else 'g'}}"
         raise _mistake(name, most if beyond else bounds.words, value)
     return kind(number)
+
+
+def check_bool(name: str, value: object) -> None:
+    """Raises InputError for anything but True and False: "False" would count as true."""
+    if not isinstance(value, bool):
+        raise _mistake(name, "True or False", value)
 
 
 def check_device(device: Any) -> str:
@@ -223,7 +229,7 @@ def _plain(name: str, value: Any, hint: type) -> Any:
     if hint in (int, float):
         return check_number(name, value, hint)
     if hint is Path:
-        return _path(name, value)
+        return check_path(name, value)
     if not isinstance(value, hint):
         raise _mistake(name, {bool: "True or False", str: "a text"}.get(hint, f"of type {hint.__name__}"), value)
     if hint is str and ("\0" in value or not _is_unicode(value)):
@@ -238,7 +244,17 @@ def _one_of(name: str, value: object, choices: Sequence[Any]) -> Any:
     raise InputError(f"{option_name(name)} must be one of {', '.join(map(str, choices))}; got {shown(value)}")
 
 
-def _path(name: str, value: object) -> Path:
+def check_path(name: str, value: object) -> Path:
+    """A path from a text or a path.
+
+    Args:
+        name: of the option.
+    Raises:
+        InputError: something else, or a text that is no path.
+
+    >>> check_path("data", "fox").name
+    'fox'
+    """
     if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
         raise _mistake(name, "a path", value)
     if "\0" in os.fspath(value):

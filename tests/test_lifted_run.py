@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,11 +163,24 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.open_run(trained)
 
 
+@pytest.mark.parametrize("config", [None, 5, [], {}, float("nan"), b"x"])
+def test_arguments_of_other_types_are_named(trained: Path, tmp_path: Path, config: Any) -> None:
+    for opened in (nl.open_run, nl.open_scene):
+        with pytest.raises(nl.InputError, match="load_config must be a path"):
+            opened(config)
+    for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir"):
+        with pytest.raises(nl.InputError, match=name):
+            nl.lift_run(trained, **{"output_dir": tmp_path, name: 5})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_names_of_runs_are_names_of_folders(trained: Path, tmp_path: Path) -> None:
     half = [(torch.zeros(120, 160, dtype=torch.int64), torch.ones(1, 2))] * 12
-    for stamp in (".", "..", "a/b", "/x", "", "../splatfacto/run", ".cache"):
+    for stamp in (".", "..", "a/b", "/x", "", "../splatfacto/run", ".cache", "x\ny", "\x1b[31m"):
         with pytest.raises(ValueError, match="is not the name of a folder"):
             nl.lift_run(trained, features=half, output_dir=tmp_path, timestamp=stamp, overwrite=True)
+    with pytest.raises(ValueError, match="has 300 characters; give at most 200"):
+        nl.lift_run(trained, features=half, output_dir=tmp_path, timestamp="a" * 300)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -226,9 +240,16 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
         run.ask("red", negatives="blue")
     with pytest.raises(ValueError, match="rule must be auto, cosine, lerf, margin; got 'LERF'"):
         run.ask("red", rule="LERF")  # type: ignore[arg-type]
-    for wrong in ({"min_reliability": 5.0}, {"threshold": float("nan")}, {"min_reliability": float("nan")}):
-        with pytest.raises(ValueError, match=r"must be in 0\.\.1 and the threshold finite"):
-            run.ask("red", **wrong)
+    for wrong in (
+        *({"min_reliability": value} for value in (5.0, float("nan"), None, "x")),
+        *({"threshold": value} for value in (float("nan"), "x", [1], 10**400, True)),
+        *({"refined": value} for value in ("yes", None, 1)),
+        *({"negatives": value} for value in (5, [1])),
+    ):
+        with pytest.raises(nl.InputError):
+            run.ask("red", **wrong)  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="NUL"):
+        run.ask("red\0")
     for part in (answer.mask[:-1], answer.mask.int(), [1, 2]):
         with pytest.raises(ValueError, match="part must be an answer of this run"):
             run.export(tmp_path / "new" / "a.ply", part)

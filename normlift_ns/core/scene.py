@@ -118,6 +118,11 @@ class Scene(Protocol):
         ...
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a person should know of the files, in whole sentences."""
+        ...
+
+    @property
     def renderer(self) -> Callable[[Camera], UInt8[Tensor, "h w 3"]] | None:
         """A renderer of the scene's own; None: that of normlift_ns, with `colors` on `background`."""
         ...

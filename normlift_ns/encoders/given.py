@@ -122,4 +122,6 @@ def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
 def _floats(values: Any) -> Tensor:
     """Detached, on the CPU, in float32 or float64."""
     tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
+    if tensor.is_complex():
+        raise InputError("vectors must be of real numbers, got complex ones")
     return tensor if tensor.dtype == torch.float64 else tensor.float()

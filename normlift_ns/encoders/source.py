@@ -276,6 +276,9 @@ def check_prompts(prompts: Sequence[str]) -> None:
         raise InputError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
         raise InputError('no text given; name at least one thing to look for, such as --text "orange"')
+    for prompt in prompts:
+        if not isinstance(prompt, str) or "\0" in prompt:
+            raise InputError(f"a text must be of type str and without NUL characters, got {prompt!r:.60}")
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
         raise InputError(

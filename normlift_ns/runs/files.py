@@ -25,6 +25,8 @@ FIELD_FOLDER = "normlift"
 """Folder of the semantic field inside the run directory."""
 TEXTS_FILE = "texts.npz"
 """Texts with vectors of the user's own, in the folder of the field."""
+_LONGEST_NAME = 200
+"""Bytes of a folder's name; systems take 255, and some are left for numbers."""
 _SEAL = "# Lines below: "
 """How a config.yml of ours begins; their digest follows."""
 
@@ -39,10 +41,14 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
     """
     stamp = datetime.now().strftime("%Y-%m-%d_%H%M%S") if timestamp is None else timestamp
     for what, folder in (("timestamp", stamp), ("experiment name", name)):
-        if folder.startswith(".") or folder.strip() == "" or {"/", "\\", "\0"} & set(folder):
+        if not isinstance(folder, str):
+            raise InputError(f"the {what} must be a text, got {folder!r:.60}")
+        if folder.startswith(".") or folder.strip() == "" or {"/", "\\"} & set(folder) or not folder.isprintable():
             raise InputError(
                 f"the {what} {folder!r} is not the name of a folder; give one without slashes, such as 'run'"
             )
+        if len(os.fsencode(folder)) > _LONGEST_NAME:
+            raise InputError(f"the {what} {folder[:20]!r}… has {len(folder)} characters; give at most {_LONGEST_NAME}")
     return Path(os.path.abspath(output_dir)) / name / "normlift" / stamp
 
 

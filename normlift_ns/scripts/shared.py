@@ -45,6 +45,10 @@ class Terminated(BaseException):
     """The system wants the process to end: SIGTERM, as before a pre-emption."""
 
 
+class OutputError(Exception):
+    """Standard output takes no more. No OSError, which loaders take for one of the file that they read."""
+
+
 def run_command(command: type[Command]) -> None:
     """Reads the flags in the form of nerfstudio's commands (--flag True), runs the command and ends the process.
 
@@ -83,7 +87,7 @@ def _explained(error: Exception) -> int:
     """Tells of an error; the exit code."""
     if isinstance(error, BrokenPipeError):  # nobody reads any more
         return USER
-    message, code = explain(error)
+    message, code = (str(error), USER) if isinstance(error, OutputError) else explain(error)
     with suppress(OSError):
         ERRORS.rule("Error", style="red")
     _say_error(message)
@@ -155,7 +159,7 @@ def _of_the_output() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OSError(_CANNOT.format(error.strerror)) from error
+        raise OutputError(_CANNOT.format(error.strerror)) from error
 
 
 @contextmanager

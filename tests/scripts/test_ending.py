@@ -94,8 +94,11 @@ def test_what_cannot_be_encoded_is_replaced(encoding, tmp_path):
     assert err.splitlines()[-1] == "no ?"
 
 
+_CAUGHT = "try: print('a' * 10**6)\nexcept OSError: raise InputError('what a loader makes of a file')"
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-@pytest.mark.parametrize("body", ["say('a')", "print('a')", "say('a' * 10**6)", "sys.stdout.write('x')"])
+@pytest.mark.parametrize("body", ["say('a')", "print('a')", "say('a' * 10**6)", "sys.stdout.write('x')", _CAUGHT])
 def test_a_full_device_is_a_message(body, tmp_path):
     with open("/dev/full", "wb") as full:
         code, _, err = ended(body, state=tmp_path, stdout=full)
