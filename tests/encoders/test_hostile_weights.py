@@ -9,6 +9,7 @@ import pytest
 
 from normlift_ns.encoders.clip.network import load_clip
 from normlift_ns.encoders.sam.weights import load_sam
+from normlift_ns.errors import InputError
 from tests.encoders.tiny import CLIP, write_clip, write_sam
 from tests.hostile import damaged, fuzz, hostile_json
 
@@ -40,3 +41,13 @@ def test_damaged_folders_of_sam(file: str, examples: int, tmp_path: Path) -> Non
     fuzz(examples, damaged(whole), folder / file, lambda: load_sam(str(folder)))
     if file == "config.json":
         fuzz(examples, hostile_json(json.loads(whole)), folder / file, lambda: load_sam(str(folder)))
+
+
+@pytest.mark.parametrize(("name", "value"), [("num_labels", 2**31), ("hidden_size", 10**9), ("layer_norm_eps", 1e300)])
+def test_sizes_that_no_network_has_are_refused_before_it_is_built(name: str, value: float, tmp_path: Path) -> None:
+    write_sam(tmp_path / "sam_tiny.pth")
+    load_sam(str(tmp_path / "sam_tiny.pth")).save_pretrained(tmp_path / "folder")
+    config = tmp_path / "folder" / "config.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"vision_config": {name: value}}))
+    with pytest.raises(InputError, match=f"{name} of config.json is .* expected at most"):
+        load_sam(str(tmp_path / "folder"))

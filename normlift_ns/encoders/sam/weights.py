@@ -32,6 +32,8 @@ _OTHERS = {
     "mask_decoder.compress_vit_feat": "HQ-SAM",
 }
 """What the parameters of other networks begin with."""
+_MOST_PARTS, _LARGEST_SIZE, _DEEPEST = 512, 2**16, 8
+"""Of layers, labels and entries; of every other number in a config; and of values within values."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {
@@ -159,7 +161,24 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     if len(found) == 0:
         raise InputError(f"the folder has no {_FILES[0]}")
     config = json.loads((folder / "config.json").read_text())
+    _check_sizes(config)
     return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
+
+
+def _check_sizes(values: Any, name: str = "config.json", depth: int = 0) -> None:
+    """Raises InputError for numbers that no network has: transformers builds what a config says, however large."""
+    if depth > _DEEPEST or (isinstance(values, Mapping | list) and len(values) > _MOST_PARTS):
+        raise InputError(f"{name} is nested too deeply, or has more than {_MOST_PARTS} entries")
+    if isinstance(values, Mapping):
+        for key, value in values.items():
+            _check_sizes(value, str(key), depth + 1)
+    elif isinstance(values, list):
+        for value in values:
+            _check_sizes(value, name, depth + 1)
+    elif isinstance(values, int | float):
+        most = _MOST_PARTS if name.startswith("num_") or name.endswith("depth") else _LARGEST_SIZE
+        if not -1 <= values <= most:
+            raise InputError(f"{name} of config.json is {values!r:.40}, expected at most {most:,}")
 
 
 def _model_type(folder: Path) -> Any:
