@@ -68,7 +68,8 @@ def summarize(folder: Path) -> dict[str, Any]:
         "objects": json.loads((folder / "export" / "splat_objects.json").read_text()),
     }
     for file in sorted((run / "normlift").glob("*.safetensors")):
-        found[file.stem] = {name: _array(array, name) for name, array in sorted(load_file(file).items())}
+        arrays = sorted(load_file(file).items())
+        found[file.stem] = {name: _array(array, name) for name, array in arrays if name != "means"}  # not in 0.1
     found["npz"] = {name: _array(answers[name]) for name in ("relevancy", "reliability", "valid")}
     vertices = PlyData.read(folder / "export" / "splat.ply")["vertex"]
     found["ply"] = {p.name: _array(np.asarray(vertices[p.name])) for p in vertices.properties}
