@@ -250,7 +250,7 @@ def encoder_of(field: SemanticField, device: str = "cpu", cache: Path | None = N
 
 def _check_files(features: object, options: SourceOptions) -> None:
     """Makes sure that the files of the encoder have the content that they had in the lift, by its digests in the
-    manifest. All of them is read at every use: 0.1 s for weights of 600 MB, those of version 0.1 ten times as long.
+    manifest. Files are read whole at every use.
     """
     remedy = (
         "put the file of the lift back there; or give texts with vectors of the same network, --text-vectors; or lift "

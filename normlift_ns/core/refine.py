@@ -19,7 +19,7 @@ _CHUNK_ELEMENTS = 2**24
 _BLOCK = (2**14, 2**17)
 """Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
 MOST_VOTERS = 256
-"""Largest K of a vote: it compares every two of them, and more than some 30 change hardly anything."""
+"""Largest K of a vote, which compares every two of them: its time grows with the square."""
 _MOST_IN_KERNEL = 63
 """Neighbours, of `kernels.vote`."""
 
