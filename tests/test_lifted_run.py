@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +163,29 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match="is a run without semantics"):
         nl.open_run(trained)
+
+
+@pytest.mark.parametrize("change", ["focal", "order", "poses", "one pose"])
+def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_path: Path, change: str) -> None:
+    room = tmp_path / "room"
+    shutil.copytree(lifted.parents[4] / "room", room)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        nl.open_run(lifted, data=room)  # a copy has the same cameras
+    file = room / "transforms.json"
+    content = json.loads(file.read_text())
+    frames = content["frames"]
+    if change == "focal":
+        content["fl_x"] *= 1.003
+    elif change == "order":
+        first, second = frames[1], frames[2]
+        first["transform_matrix"], second["transform_matrix"] = second["transform_matrix"], first["transform_matrix"]
+    else:
+        for frame in frames[1 : 2 if change == "one pose" else None]:
+            frame["transform_matrix"][0][3] += 4e-4
+    file.write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match="the training cameras of .* are not those that the run was lifted with"):
+        nl.open_run(lifted, data=room)
 
 
 @pytest.mark.parametrize("config", [None, 5, [], {}, float("nan"), b"x"])
