@@ -48,7 +48,7 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
         return found[max(found)]
     if step not in found:
         raise FileNotFoundError(
-            f"No checkpoint of step {step} in {folder}; there is {', '.join(map(str, sorted(found)))}. "
+            f"No checkpoint of step {step} in {folder}; it has the steps {', '.join(map(str, sorted(found)))}. "
             "Give one of them with --load-step, or none for the last."
         )
     return found[step]
