@@ -184,7 +184,11 @@ def lift_run(
     target = None if output_dir is None else check_path("output_dir", output_dir)
     if timestamp is not None:
         run_directory(Path(), "run", timestamp)  # its name shows before the scene loads
-    for name, value, kind in (("source", source, SourceOptions), ("lift", lift, LiftOptions)):
+    for name, value, kind in (
+        ("source", source, SourceOptions),
+        ("lift", lift, LiftOptions),
+        ("export", export, Export),
+    ):
         if value is not None and not isinstance(value, kind):
             raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
     device, options = choose_device(device), source or SourceOptions()

@@ -193,7 +193,7 @@ def test_arguments_of_other_types_are_named(trained: Path, tmp_path: Path, confi
     for opened in (nl.open_run, nl.open_scene):
         with pytest.raises(nl.InputError, match="load_config must be a path"):
             opened(config)
-    for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir"):
+    for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir", "export", "features"):
         with pytest.raises(nl.InputError, match=name):
             nl.lift_run(trained, **{"output_dir": tmp_path, name: 5})
     assert list(tmp_path.iterdir()) == []
@@ -217,6 +217,9 @@ def test_names_of_runs_are_names_of_folders(trained: Path, tmp_path: Path) -> No
         ({"a": np.ones((1, 2))}, (), "the vector of text 'a' must be"),
         ({" ": [1, 2]}, (), "cannot be a text"),
         ({"fox.npy": [1, 2]}, (), "cannot be a text"),
+        ({5: [1, 2]}, (), "texts must be a dictionary"),
+        ({"a": ["x", "y"]}, (), "vectors must be numbers"),
+        ({"a": [1j, 2]}, (), "vectors must be of real numbers"),
         ({"a": [1, 2, 3]}, (), r"must have the same length, found \[2, 3\]"),
         ({"a": [1, 2]}, ["b"], "text 'b' has no vector in the texts given, which holds 1; near names: a"),
         (None, ["b"], "which holds none"),
@@ -275,9 +278,23 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
             run.ask("red", **wrong)  # type: ignore[arg-type]
     with pytest.raises(nl.InputError, match="NUL"):
         run.ask("red\0")
-    for part in (answer.mask[:-1], answer.mask.int(), [1, 2]):
+    for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
         with pytest.raises(ValueError, match="part must be an answer of this run"):
             run.export(tmp_path / "new" / "a.ply", part)
+    for path, more in (
+        ("", {}),
+        ("\0.ply", {}),
+        (None, {}),
+        (5, {}),
+        (tmp_path / "b.ply", {"answer": "x"}),
+        (tmp_path / "b.ply", {"objects": {"a": object()}}),
+        (tmp_path / "b.ply", {"objects": {"a": float("nan")}}),
+        (tmp_path / "b.ply", {"overwrite": "False"}),
+    ):
+        with pytest.raises(nl.InputError):
+            run.export(path, **more)  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="save takes an answer of this run or its question, got str"):
+        run.save("red")  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
     assert len(run.export(tmp_path / "a.ply", answer["red"].mask.numpy())) > 0
     with pytest.raises(TypeError, match="render draws an answer, or what it says of one text; got str"):

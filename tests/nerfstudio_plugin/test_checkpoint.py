@@ -78,7 +78,9 @@ def test_the_last_step_is_taken_and_any_can_be_chosen(workspace: Path) -> None:
     earlier = load_scene(run.config, load_step=1)
     assert earlier.checkpoint.step == 1
     assert not torch.equal(earlier.gaussians.means, load_scene(run.config).gaussians.means)
-    with pytest.raises(FileNotFoundError, match=r"No checkpoint of step 7 in .*; it has the steps 1, 2\. .*--load-step"):
+    with pytest.raises(
+        FileNotFoundError, match=r"No checkpoint of step 7 in .*; it has the steps 1, 2\. .*--load-step"
+    ):
         load_scene(run.config, load_step=7)
 
 
