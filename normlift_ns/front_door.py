@@ -16,7 +16,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
 from normlift_ns.core.gpu import choose_device
 from normlift_ns.core.query import CANONICAL_NEGATIVES
-from normlift_ns.core.scene import Scene
+from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.given import GivenFeatures, given_features
 from normlift_ns.encoders.source import FeatureSource
@@ -98,9 +98,22 @@ def open_run(
     check_run(folder)  # before nerfstudio, which takes 20 s
     device, scene = choose_device(device), open_scene(load_config, data=data)
     loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
-    for remark in scene.remarks:
+    changed = cameras_changed(loaded, scene)
+    for remark in (*scene.remarks, *([] if changed is None else [changed])):
         warnings.warn(remark, stacklevel=2)
     return LiftedRun(folder, scene, with_texts(loaded, vectors=vectors, template=text_template), device)
+
+
+def cameras_changed(field: SemanticField, scene: Scene) -> str | None:
+    """A warning where the training cameras are not those of the lift; None also for fields that do not know them."""
+    known = field.manifest.get("cameras")
+    if known is None or not cameras_differ(known, camera_summary(scene.train.cameras)):
+        return None
+    return (
+        f"the training cameras of {scene.name} are not those that the run was lifted with: the data set has changed "
+        "since. Answers are those of the lift, but pictures and evaluations use the new cameras; restore the data set, "
+        "say where it is with --data, or lift again"
+    )
 
 
 def lift_run(
@@ -171,7 +184,11 @@ def lift_run(
     target = None if output_dir is None else check_path("output_dir", output_dir)
     if timestamp is not None:
         run_directory(Path(), "run", timestamp)  # its name shows before the scene loads
-    for name, value, kind in (("source", source, SourceOptions), ("lift", lift, LiftOptions)):
+    for name, value, kind in (
+        ("source", source, SourceOptions),
+        ("lift", lift, LiftOptions),
+        ("export", export, Export),
+    ):
         if value is not None and not isinstance(value, kind):
             raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
     device, options = choose_device(device), source or SourceOptions()

@@ -23,6 +23,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
+from normlift_ns.ranges import check_bool, check_path
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.runs.files import FIELD_FOLDER, texts_cache
 from normlift_ns.runs.question import load_question, save_question
@@ -115,6 +116,8 @@ class LiftedRun:
             ValueError: vectors of another length than the field's.
         """
         question = question.question if isinstance(question, Answer) else question
+        if not isinstance(question, Question):
+            raise InputError(f"save takes an answer of this run or its question, got {type(question).__name__}")
         if question.vectors.shape[1] != self.field.dimension:
             raise InputError(
                 f"the question has vectors of {question.vectors.shape[1]} numbers, the features of {self.folder} have "
@@ -143,7 +146,12 @@ class LiftedRun:
             ValueError: no Gaussian of the part is ever drawn; a mask of another type or length; the name of a file of a
                 run.
         """
-        path = Path(path)
+        path = check_path("path", path)
+        check_bool("overwrite", overwrite)
+        if path.name == "":
+            raise InputError(f"{path} is no name of a file; give one such as splat.ply")
+        if answer is not None and not isinstance(answer, Answer):
+            raise InputError(f"answer must be an answer of this run, got {type(answer).__name__}")
         refuse_run_files(*export_files(path), instead="name")
         for file in export_files(path)[: 2 if objects is None else 3]:
             if file.exists() and not overwrite:
@@ -152,11 +160,12 @@ class LiftedRun:
             keep, asked = part.mask, part if isinstance(part, Answer) else part.answer
             answer = asked if answer is None else answer
         else:
-            keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else torch.as_tensor(part)
-        if keep.dtype != torch.bool or keep.shape != (len(self.field),):
+            keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else _tensor(part)
+        if keep is None or keep.dtype != torch.bool or keep.shape != (len(self.field),):
+            found = type(part).__name__ if keep is None else f"{keep.dtype} {tuple(keep.shape)}"
             raise InputError(
                 f"part must be an answer of this run, what it says of one text, or a mask of {len(self.field)} "
-                f"booleans; got {keep.dtype} {tuple(keep.shape)}"
+                f"booleans; got {found}"
             )
         return write_splats(
             path,
@@ -210,3 +219,11 @@ class LiftedRun:
         values, alpha = render(self.scene.gaussians, camera, display.values, rasterize_mode=self.scene.rasterize_mode)
         overlay = draw(display, picture.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _tensor(values: Any) -> Tensor | None:
+    """As a tensor, where it can be one."""
+    try:
+        return torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return None

@@ -18,7 +18,7 @@ from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.lift import Lifted, Scalars, lift
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import possible, refine, unsupported
-from normlift_ns.core.scene import Scene, View
+from normlift_ns.core.scene import Scene, View, camera_summary
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.langsplat.source import refuse_equal_stems, write_langsplat
 from normlift_ns.encoders.source import FeatureSource
@@ -90,6 +90,7 @@ def lift_scene(
         provenance = {
             **scene.identity,
             "encoder": dict(encoder),
+            "cameras": camera_summary(views.cameras),
             "features": source.identity,
             "options": asdict(options),
             "statistics": {**counts, **_statistics(lifted.scalars), **shares},

@@ -26,6 +26,8 @@ from normlift_ns.raster.settings import RasterSettings
 
 BLOCK = 16
 """Views per file of evidence: what an interrupted run may lose."""
+_SMALLEST = 8
+"""Pixels along a side of an image made smaller; fewer show nothing."""
 _KEY = "normlift_ns.block/3"
 """Part of every key: to be raised when evidence changes for the same input."""
 
@@ -176,7 +178,12 @@ def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
 def _smaller(view: View, divisor: int) -> View:
     """The view at a fraction of its size: pixels are averaged, a mask keeps what it keeps throughout."""
     camera = view.camera
-    height, width = max(1, camera.height // divisor), max(1, camera.width // divisor)
+    height, width = camera.height // divisor, camera.width // divisor
+    if min(height, width) < _SMALLEST:
+        raise InputError(
+            f"lift_downscale {divisor:,} leaves {width} x {height} pixels of {view.name}, which has {camera.width} x "
+            f"{camera.height}; give a number that leaves {_SMALLEST} pixels on each side"
+        )
     scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
     mask = None if view.mask is None else _averaged(view.mask[:, :, None], height, width)[:, :, 0] > 0.999
     image: UInt8[Tensor, "h w 3"] = _averaged(view.image, height, width).round().to(torch.uint8)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -163,12 +165,35 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.open_run(trained)
 
 
+@pytest.mark.parametrize("change", ["focal", "order", "poses", "one pose"])
+def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_path: Path, change: str) -> None:
+    room = tmp_path / "room"
+    shutil.copytree(lifted.parents[4] / "room", room)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        nl.open_run(lifted, data=room)  # a copy has the same cameras
+    file = room / "transforms.json"
+    content = json.loads(file.read_text())
+    frames = content["frames"]
+    if change == "focal":
+        content["fl_x"] *= 1.003
+    elif change == "order":
+        first, second = frames[1], frames[2]
+        first["transform_matrix"], second["transform_matrix"] = second["transform_matrix"], first["transform_matrix"]
+    else:
+        for frame in frames[1 : 2 if change == "one pose" else None]:
+            frame["transform_matrix"][0][3] += 4e-4
+    file.write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match="the training cameras of .* are not those that the run was lifted with"):
+        nl.open_run(lifted, data=room)
+
+
 @pytest.mark.parametrize("config", [None, 5, [], {}, float("nan"), b"x"])
 def test_arguments_of_other_types_are_named(trained: Path, tmp_path: Path, config: Any) -> None:
     for opened in (nl.open_run, nl.open_scene):
         with pytest.raises(nl.InputError, match="load_config must be a path"):
             opened(config)
-    for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir"):
+    for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir", "export", "features"):
         with pytest.raises(nl.InputError, match=name):
             nl.lift_run(trained, **{"output_dir": tmp_path, name: 5})
     assert list(tmp_path.iterdir()) == []
@@ -192,6 +217,9 @@ def test_names_of_runs_are_names_of_folders(trained: Path, tmp_path: Path) -> No
         ({"a": np.ones((1, 2))}, (), "the vector of text 'a' must be"),
         ({" ": [1, 2]}, (), "cannot be a text"),
         ({"fox.npy": [1, 2]}, (), "cannot be a text"),
+        ({5: [1, 2]}, (), "texts must be a dictionary"),
+        ({"a": ["x", "y"]}, (), "vectors must be numbers"),
+        ({"a": [1j, 2]}, (), "vectors must be of real numbers"),
         ({"a": [1, 2, 3]}, (), r"must have the same length, found \[2, 3\]"),
         ({"a": [1, 2]}, ["b"], "text 'b' has no vector in the texts given, which holds 1; near names: a"),
         (None, ["b"], "which holds none"),
@@ -250,9 +278,23 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
             run.ask("red", **wrong)  # type: ignore[arg-type]
     with pytest.raises(nl.InputError, match="NUL"):
         run.ask("red\0")
-    for part in (answer.mask[:-1], answer.mask.int(), [1, 2]):
+    for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
         with pytest.raises(ValueError, match="part must be an answer of this run"):
             run.export(tmp_path / "new" / "a.ply", part)
+    for path, more in (
+        ("", {}),
+        ("\0.ply", {}),
+        (None, {}),
+        (5, {}),
+        (tmp_path / "b.ply", {"answer": "x"}),
+        (tmp_path / "b.ply", {"objects": {"a": object()}}),
+        (tmp_path / "b.ply", {"objects": {"a": float("nan")}}),
+        (tmp_path / "b.ply", {"overwrite": "False"}),
+    ):
+        with pytest.raises(nl.InputError):
+            run.export(path, **more)  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="save takes an answer of this run or its question, got str"):
+        run.save("red")  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
     assert len(run.export(tmp_path / "a.ply", answer["red"].mask.numpy())) > 0
     with pytest.raises(TypeError, match="render draws an answer, or what it says of one text; got str"):

@@ -6,11 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
+
+_SAME = 1e-5
+"""Relative difference of numbers of cameras that are the same but for rounding: a tenth of it is taken absolutely, for
+numbers near zero."""
 
 
 class View(NamedTuple):
@@ -141,3 +146,32 @@ class Scene(Protocol):
     def has_harmonics(self) -> bool:
         """Whether colours are spherical harmonics; False: features_dc are logits."""
         ...
+
+
+def camera_summary(cameras: Sequence[Camera]) -> list[float]:
+    """A few numbers that change with every camera, and with their order: how many there are, and weighted means of
+    size, intrinsics and pose, of which later cameras have more. For manifests.
+
+    >>> import torch
+    >>> left = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
+    >>> camera_summary([left, left])[:5]
+    [2.0, 16.0, 12.0, 50.0, 0.0]
+    """
+    if len(cameras) == 0:
+        return [0.0]
+    rows = [
+        torch.cat([torch.tensor([c.width, c.height], dtype=torch.float64), c.K.double().flatten().cpu(),
+                   c.world_to_camera[:3].double().flatten().cpu()])
+        for c in cameras
+    ]  # fmt: skip
+    share = torch.linspace(1, 2, len(rows), dtype=torch.float64)
+    return [float(len(rows)), *(share[:, None] * torch.stack(rows)).sum(0).div(share.sum()).tolist()]
+
+
+def cameras_differ(first: Sequence[float], second: Sequence[float]) -> bool:
+    """Whether two summaries are of different cameras, for more than rounding.
+
+    >>> cameras_differ([2.0, 16.0], [2.0, 16.00001]), cameras_differ([2.0, 16.0], [2.0, 16.01])
+    (False, True)
+    """
+    return len(first) != len(second) or any(abs(a - b) > _SAME * (abs(a) + 0.1) for a, b in zip(first, second))

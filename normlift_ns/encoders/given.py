@@ -96,8 +96,9 @@ def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequen
     Raises:
         ValueError: a list of another length, no pair at all, or what `GivenFeatures` refuses.
     """
+    if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
+        raise InputError(f"features must be a list or a dictionary of pairs, got {type(features).__name__}")
     if not isinstance(features, Mapping):
-        features = list(features)
         if len(features) != len(names):
             raise InputError(
                 f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; give one "
@@ -106,6 +107,8 @@ def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequen
         features = dict(zip(names, features))
     if len(features) == 0:
         raise InputError("features are empty; give labels and vectors of at least one training image")
+    if texts is not None and not (isinstance(texts, Mapping) and all(isinstance(text, str) for text in texts)):
+        raise InputError("texts must be a dictionary from texts to vectors")
     views = {name: _pair(name, pair) for name, pair in features.items()}
     return GivenFeatures(views, {text: _floats(vector) for text, vector in (texts or {}).items()})
 
@@ -113,7 +116,10 @@ def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequen
 def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
-    labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
+    try:
+        labels = pair[0].detach().cpu().numpy() if isinstance(pair[0], Tensor) else np.asarray(pair[0])
+    except ValueError as error:  # rows of different lengths
+        raise InputError(f"labels of {name} must be a matrix of integers ({error})") from None
     if labels.dtype.kind not in "iub":
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     return torch.from_numpy(labels.astype(np.int64)), _floats(pair[1])
@@ -121,7 +127,10 @@ def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
 
 def _floats(values: Any) -> Tensor:
     """Detached, on the CPU, in float32 or float64."""
-    tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
+    try:
+        tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"vectors must be numbers ({error})") from None
     if tensor.is_complex():
         raise InputError("vectors must be of real numbers, got complex ones")
     return tensor if tensor.dtype == torch.float64 else tensor.float()

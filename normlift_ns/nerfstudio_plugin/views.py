@@ -86,15 +86,24 @@ class DatasetViews:
 
     @cached_property
     def _cameras(self) -> list[Camera]:
-        return [self._camera(i) for i in range(len(self))]
+        undistorted: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}  # photographs of one camera share it
+        return [self._camera(i, undistorted) for i in range(len(self))]
 
-    def _camera(self, index: int) -> Camera:
+    def _camera(self, index: int, undistorted: dict[tuple[float, ...], tuple[Tensor, int, int]]) -> Camera:
+        camera = self._dataset.cameras[index].reshape(())
+        numbers = (camera.camera_type, camera.width, camera.height, camera.get_intrinsics_matrices())
+        key = tuple(
+            float(x) for part in (*numbers, camera.distortion_params) if part is not None for x in part.flatten()
+        )
         try:
-            return self._pinhole(index)
+            if key not in undistorted:
+                undistorted[key] = self._pinhole(index)
+            return to_camera(self._poses[index], *undistorted[key])
         except InputError as error:
             raise InputError(f"The camera of {self.files[index]} cannot be used: {error}") from error
 
-    def _pinhole(self, index: int) -> Camera:
+    def _pinhole(self, index: int) -> tuple[Tensor, int, int]:
+        """Intrinsics, width and height without distortion."""
         camera = self._dataset.cameras[index].reshape(())
         if int(camera.camera_type) not in _DRAWN_AS_PINHOLE:
             raise InputError(
@@ -103,7 +112,7 @@ class DatasetViews:
             )
         blank = torch.zeros(int(camera.height), int(camera.width), 3, dtype=torch.uint8)
         image, intrinsics, _ = _undistorted(self._dataset.cameras, index, {"image": blank})
-        return to_camera(self._poses[index], intrinsics, image.shape[1], image.shape[0])
+        return intrinsics, image.shape[1], image.shape[0]
 
     def check_files(self) -> tuple[str, ...]:
         """Looks at the heads of all photographs and masks; returns what a person should know, in whole sentences.

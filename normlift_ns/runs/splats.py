@@ -90,7 +90,7 @@ def write_splats(
         overwrite: replace files of these names.
     Raises:
         FileExistsError: there are such, and `overwrite` is False.
-        ValueError: none of them can be written.
+        ValueError: none of the Gaussians can be written; objects that JSON cannot hold.
         OSError: the disk is full, or the like.
     """
     from plyfile import PlyData, PlyElement  # noqa: PLC0415 (import-light: every ns-* command loads this module)
@@ -108,6 +108,10 @@ def write_splats(
     if rasterize_mode == "antialiased":
         comments.append("SplatRenderMode: mip")
     comments += [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
+    try:
+        table_of_objects = json.dumps(objects, indent=2, allow_nan=False) + "\n"
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"objects must hold what JSON can say: {error}") from None
     files = export_files(path)
     written, gone = (files, ()) if objects is not None else (files[:2], files[2:])
     with new_files(*written, overwrite=overwrite, remove=gone if overwrite else ()) as drafts:
@@ -115,7 +119,7 @@ def write_splats(
             PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
         np.save(drafts[1], rows)
         if objects is not None:
-            drafts[2].write_text(json.dumps(objects, indent=2) + "\n", "utf8")
+            drafts[2].write_text(table_of_objects, "utf8")
     return rows
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import cv2
@@ -97,12 +97,17 @@ def _camera(frame: Frame) -> Camera:
 
 
 def _pinhole(frame: Frame) -> Camera:
-    width, height = frame.intrinsics.width, frame.intrinsics.height
-    blank = np.empty((height, width, 1), np.uint8) if any(frame.intrinsics.distortion) else None
-    pixels, matrix = (None, _matrix(frame.intrinsics)) if blank is None else _undistorted(blank, frame.intrinsics)
-    if pixels is not None:
-        height, width = pixels.shape[:2]
+    matrix, width, height = _without_distortion(frame.intrinsics)
     return to_camera(torch.from_numpy(frame.pose).float(), torch.from_numpy(matrix).float(), width, height)
+
+
+@lru_cache  # photographs of one camera differ in their poses only
+def _without_distortion(intrinsics: Intrinsics) -> tuple[Float[np.ndarray, "3 3"], int, int]:
+    """Camera matrix and size of the undistorted photograph."""
+    if not any(intrinsics.distortion):
+        return _matrix(intrinsics), intrinsics.width, intrinsics.height
+    pixels, matrix = _undistorted(np.empty((intrinsics.height, intrinsics.width, 1), np.uint8), intrinsics)
+    return matrix, pixels.shape[1], pixels.shape[0]
 
 
 def _matrix(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:

@@ -36,6 +36,8 @@ def glance(config: Path) -> Glance:
         raise InputError(f"{config} is not a nerfstudio config: it has more than {_MOST_BYTES:,} bytes. {expected}")
     try:
         root = yaml.compose(config.read_text("utf8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except OSError as error:
+        raise OSError(f"{config} cannot be read: {error.strerror}. {expected}") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         reason = error.problem if isinstance(error, yaml.MarkedYAMLError) else " ".join(str(error).split())
         raise InputError(f"{config} is not a nerfstudio config: it is no valid YAML ({reason}). {expected}") from None

@@ -35,6 +35,7 @@ class _Facts(msgspec.Struct):
     form: Storage
     encoder: dict[str, str | None] | None = None
     features: dict[str, Any] = {}
+    cameras: list[float] | None = None
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
