@@ -6,7 +6,6 @@ import json
 import math
 import os
 import platform
-import resource
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -83,11 +82,6 @@ def hardware() -> str:
     cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     cores = f"{len(os.sched_getaffinity(0))} cores of {cpu}"
     return f"{torch.cuda.get_device_name()}, {cores}" if torch.cuda.is_available() else cores
-
-
-def peak_gib() -> float:
-    """Largest resident memory of this process so far, the libraries included."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 class Stopwatch:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 
 import torch
 
@@ -50,12 +51,25 @@ class Stages:
 def cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
     """Seconds of the stages so far and in all, and the most memory of this process, where the system tells that, and
     of the GPU, GiB."""
-    memory = {}
-    if find_spec("resource") is not None:
-        import resource  # noqa: PLC0415 (Windows has none)
-
-        unit = 2**30 if sys.platform == "darwin" else 2**20
-        memory["memory_gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    peak = peak_gib()
+    memory = {} if peak is None else {"memory_gib": peak}
     if torch.device(device).type == "cuda":
         memory["gpu_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
     return {**{f"{stage}_s": value for stage, value in seconds.items()}, "total_s": sum(seconds.values()), **memory}
+
+
+def peak_gib() -> float | None:
+    """Largest resident memory of this process so far, the libraries included, GiB; None where the system does not say.
+
+    Linux: `VmHWM` of /proc, since `ru_maxrss` starts from that of the process by which this one was started.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        lines = dict(line.split(":", 1) for line in status.read_text().splitlines() if ":" in line)
+        if "VmHWM" in lines:
+            return int(lines["VmHWM"].split()[0]) / 2**20  # of kB
+    if find_spec("resource") is None:
+        return None
+    import resource  # noqa: PLC0415 (Windows has none)
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)

@@ -4,6 +4,8 @@ photographs that were undistorted."""
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -267,3 +269,16 @@ def test_a_text_is_drawn_as_it_is(text: str, tmp_path: Path) -> None:
     image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
     save_overlay(tmp_path / "a.png", image, torch.zeros(HEIGHT, WIDTH), text, answer)
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory otherwise")
+def test_memory_is_that_of_the_process_and_not_of_its_parent():
+    child = "from normlift_ns.stages import cost; print(cost({}, 'cpu')['memory_gib'])"
+    parent = f"""
+import subprocess, sys
+held = bytearray(3 << 30)
+held[:: 4096] = bytes([1]) * (len(held) // 4096)
+print(subprocess.run([sys.executable, "-c", {child!r}], capture_output=True, text=True, check=True).stdout)
+"""
+    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True, check=True)
+    assert 0.05 < float(done.stdout) < 1.5  # 3 GiB in its parent

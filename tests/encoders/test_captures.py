@@ -68,12 +68,13 @@ def test_objects_of_the_tabletop():
 
 
 SEE_ALL = """
-import resource, sys
+import sys
 from pathlib import Path
 from normlift_ns.encoders import RegionFeatures, cached, read_image
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
+from normlift_ns.stages import peak_gib
 from tests.encoders.tiny import write_clip, write_sam
 
 folder, images = Path(sys.argv[1]), sorted(Path(sys.argv[2]).iterdir())
@@ -83,7 +84,7 @@ clip = OpenClipEncoder("normlift-wide", str(folder / "tiny.pt"))
 sam = SamMasks(str(folder / "sam.pth"), rules=MaskRules(points_per_side=2, predicted_iou=0.5, stability=0.3))
 for source in (cached(RegionFeatures(sam, clip), folder / "cache"), cached(PatchFeatures(clip), folder / "cache")):
     views = [source.view(read_image(path), f"images/{path.name}") for path in images]
-    print(len(views), sum(len(view.features) for view in views), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    print(len(views), sum(len(view.features) for view in views), round(peak_gib() * 2**20))
 """
 
 
