@@ -24,7 +24,7 @@ from benchmarks.captures import SHARED, trained_scene, trained_state, training_c
 from benchmarks.cpu import clip_like_table, grid_labels
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, SemanticField, asking, lift, rasterize_evidence
-from normlift_ns.asking import Question
+from normlift_ns.question import Question
 from normlift_ns.core.query import CANONICAL_NEGATIVES, relevancy
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.options import Storage

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from normlift_ns.core.lift import lift as lift
     from normlift_ns.core.neighbors import Neighbors as Neighbors
     from normlift_ns.core.neighbors import nearest_neighbors as nearest_neighbors
-    from normlift_ns.core.query import BACKGROUND_WORDS as BACKGROUND_WORDS
-    from normlift_ns.core.query import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
+    from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
+    from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
     from normlift_ns.core.query import relevancy as relevancy
     from normlift_ns.core.refine import refine as refine
     from normlift_ns.core.refine import unsupported as unsupported
@@ -50,7 +50,7 @@ _HOMES = {
     "core.gaussians": ("Camera", "GaussianScene"),
     "core.lift": ("Lifted", "Scalars", "lift"),
     "core.neighbors": ("Neighbors", "nearest_neighbors"),
-    "core.query": ("BACKGROUND_WORDS", "CANONICAL_NEGATIVES", "relevancy"),
+    "core.query": ("relevancy",),
     "core.refine": ("refine", "unsupported"),
     "core.scene": ("Scene", "View"),
     "errors": ("InputError",),

@@ -11,11 +11,11 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.asking import Question, encoder_settings, given_settings, make_question, with_texts
+from normlift_ns.question import Question, make_question
+from normlift_ns.text_encoders import encoder_settings, given_settings, with_texts
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
 from normlift_ns.core.gpu import choose_device
-from normlift_ns.core.query import CANONICAL_NEGATIVES
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.given import GivenFeatures, given_features

@@ -15,7 +15,9 @@ from jaxtyping import Bool, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from normlift_ns.asking import Answer, Finding, Question, answer, encoder_of, make_question
+from normlift_ns.asking import Answer, Finding, answer
+from normlift_ns.question import Question, make_question
+from normlift_ns.text_encoders import encoder_of
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import refuse_run_files
 from normlift_ns.core.gaussians import Camera

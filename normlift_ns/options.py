@@ -31,6 +31,10 @@ Missing = Literal["error", "skip"]
 DEFAULT_MODEL, DEFAULT_PRETRAINED = "ViT-B-16", "laion2b_s34b_b88k"
 """Of OpenCLIP."""
 DEFAULT_SAM = "facebook/sam-vit-huge"
+CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
+"""Negative prompts of LERF."""
+BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
+"""Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 THRESHOLDS: dict[Rule, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
 """Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
 WithoutDirection = Literal["none", "first"]

@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from normlift_ns import SemanticField
-from normlift_ns.asking import ENCODER_KEYS, encoder_of, encoder_settings, given_settings, with_texts
+from normlift_ns.text_encoders import ENCODER_KEYS, encoder_of, encoder_settings, given_settings, with_texts
 from normlift_ns.core.disk.digests import file_digest
-from normlift_ns.encoders.cache import CachedTexts
+from normlift_ns.encoders.texts.kept import ClipTexts
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, SourceOptions
 from tests.core.test_digests import example

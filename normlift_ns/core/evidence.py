@@ -14,14 +14,10 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.disk.tensors import load_tensors, save_tensors
+from normlift_ns.core.disk.field_file import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
+from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
-
-_FORMAT = "normlift_ns.evidence/1"
-_COUNTS = ("num_views", "weight_power", "num_excluded")
-
-_MOST_VIEWS = 2**24
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels without a region, and of pixels that are no observation at all."""
@@ -281,7 +277,7 @@ class Evidence:
         tensors = {"offsets": rows.offsets, "region": rows.column, "weight": rows.weight}
         tensors |= {f"unlabeled_{name}": getattr(blank, name) for name in ("offsets", "column", "weight")}
         tensors["region_view"] = self.region_view
-        facts = {"format": _FORMAT, **{name: str(getattr(self, name)) for name in _COUNTS}}
+        facts = {"format": EVIDENCE_FORMAT, **{name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}}
         return save_tensors(Path(path), tensors, facts, key=key, overwrite=True)
 
     @staticmethod
@@ -303,25 +299,17 @@ class Evidence:
         Args:
             remedy: what to do about a damaged file, for the message.
         """
-        old = None if key else ("format", *_COUNTS)
-        tensors, facts, digest = load_tensors(path, key=key, undigested=old, remedy=remedy)
-        if facts.get("format") != _FORMAT:
-            raise InputError(
-                f"{path} is not an evidence file of this version: format {facts.get('format')!r}, expected {_FORMAT!r}"
-            )
+        found = read_evidence(path, key=key, remedy=remedy)
         try:
-            rows = SparseRows(*(tensors[name] for name in ("offsets", "region", "weight")))
-            unlabeled = SparseRows(*(tensors[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
-            region_view, counts = tensors["region_view"], [int(facts[name]) for name in _COUNTS]
-            if region_view.ndim != 1 or region_view.dtype != torch.int32:
-                raise InputError(f"region_view is {region_view.dtype} {tuple(region_view.shape)}, expected int32, [S]")
-            rows.check("weights of regions", len(region_view))
-            if not (0 <= counts[0] <= _MOST_VIEWS and counts[1] in (0, 1, 2) and 0 <= counts[2] <= len(rows)):
-                raise InputError(f"{', '.join(_COUNTS)} are {', '.join(map(str, counts))[:50]}, out of range")
-            unlabeled.check("weights of unlabelled pixels", counts[0])
-            return Evidence(rows, region_view, unlabeled, *counts), digest
-        except (KeyError, ValueError) as error:
+            return Evidence.of_arrays(found), found.digest
+        except ValueError as error:
             raise InputError(f"{path} is damaged ({error}); {remedy}") from error
+
+    @staticmethod
+    def of_arrays(found: EvidenceArrays) -> Evidence:
+        """What a file held, without a copy."""
+        rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (found.rows, found.unlabeled))
+        return Evidence(rows, torch.from_numpy(found.region_view), unlabeled, *found.counts)
 
 
 def _column_table(

@@ -15,15 +15,14 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.disk.field_file import EVIDENCE_FILE, FIELD_FILE, SCALARS, read_field
 from normlift_ns.core.disk.manifest import (
     MANIFEST,
     REMEDY,
     SCHEMA_VERSION,
-    check_digests,
-    read_manifest,
     write_manifest,
 )
-from normlift_ns.core.disk.tensors import LARGEST, check_tensor, load_tensors, save_tensors
+from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import smallest_basis
@@ -31,8 +30,6 @@ from normlift_ns.core.query import relevancy
 from normlift_ns.core.storage import StoredDirections, StoredEvidence, sizes_and_bounds, store_directions
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule, Storage
-
-_FIELD, _EVIDENCE = "field.safetensors", "evidence.safetensors"
 
 
 @dataclass(frozen=True)
@@ -203,11 +200,11 @@ class SemanticField:
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
         (folder / MANIFEST).unlink(missing_ok=True)  # without it the folder is incomplete, and may be written to
-        digests = {_FIELD: save_tensors(folder / _FIELD, dict(_tensors(self)), overwrite=True)}
+        digests = {FIELD_FILE: save_tensors(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
-            digests[_EVIDENCE] = self.store.evidence.save(folder / _EVIDENCE)
+            digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
         else:
-            (folder / _EVIDENCE).unlink(missing_ok=True)
+            (folder / EVIDENCE_FILE).unlink(missing_ok=True)
         write_manifest(folder, self.manifest, {**digests, **beside})
 
     @staticmethod
@@ -223,21 +220,13 @@ class SemanticField:
             ValueError: another schema, a damaged file, or a field of other Gaussians; the message names it.
         """
         folder = Path(folder)
-        manifest, digests = read_manifest(folder)
-        try:
-            tensors, _, digest = load_tensors(folder / _FIELD, undigested=(), remedy=REMEDY)
-            found, evidence = {_FIELD: digest}, None
-            if manifest["form"] == "evidence":
-                evidence, found[_EVIDENCE] = Evidence.read(folder / _EVIDENCE, remedy=REMEDY)
-            check_digests(folder, found, digests)
-            _check_tensors(folder / _FIELD, tensors, manifest, evidence)
-        except KeyError as error:
-            raise InputError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
+        manifest, arrays, evidence, _ = read_field(folder)
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         if means is not None:
             _check_belongs(manifest, tensors.get("means"), means, folder, checkpoint)
-        scalars = Scalars(**{f.name: tensors[f.name] for f in fields(Scalars)})
+        scalars = Scalars(**{name: tensors[name] for name in SCALARS})
         if evidence is not None:
-            store = StoredEvidence(evidence, tensors["features"])
+            store = StoredEvidence(Evidence.of_arrays(evidence), tensors["features"])
         else:
             store = StoredDirections(tensors["coordinates"], tensors.get("basis"))
         return SemanticField(scalars, tensors["source"], store, manifest, tensors.get("means"))
@@ -265,33 +254,6 @@ def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
         yield "coordinates", store.coordinates
         if store.basis is not None:
             yield "basis", store.basis
-
-
-def _check_tensors(
-    path: Path, tensors: Mapping[str, Tensor], manifest: Mapping[str, Any], evidence: Evidence | None
-) -> None:
-    """Makes sure that nothing in the arrays leads outside of them, and that all numbers are numbers."""
-    n, dimension = int(manifest["num_gaussians"]), int(manifest["dimension"])
-    try:
-        check_tensor("source", tensors["source"], torch.int32, (n,), 0, n - 1)
-        if "means" in tensors:  # a Gaussian that was never drawn may have any mean
-            check_tensor("means", tensors["means"].nan_to_num(), torch.float32, (n, 3), -LARGEST)
-        for f in fields(Scalars):
-            dtype = torch.int32 if f.name == "view_count" else torch.float32
-            check_tensor(f.name, tensors[f.name], dtype, (n,), 0)
-        if evidence is not None:
-            check_tensor("features", tensors["features"], torch.float32, (evidence.num_regions, dimension), -LARGEST)
-            if evidence.num_gaussians != n:
-                raise InputError(f"{_EVIDENCE} has {evidence.num_gaussians} Gaussians, expected {n}")
-            return
-        rank = dimension
-        if manifest["form"] == "low_rank":
-            rank = len(tensors["basis"])
-            check_tensor("basis", tensors["basis"], torch.float32, (rank, dimension), -LARGEST)
-        rows = int((tensors["norm"] > 0).sum())
-        check_tensor("coordinates", tensors["coordinates"], torch.float16, (rows, rank), -LARGEST)
-    except ValueError as error:
-        raise InputError(f"{path} is damaged: {error}; {REMEDY}") from error
 
 
 def _check_belongs(

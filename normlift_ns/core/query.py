@@ -7,13 +7,7 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import Rule
-
-CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
-"""Negative prompts of LERF."""
-BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
-"""Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
-
+from normlift_ns.options import CANONICAL_NEGATIVES, Rule
 
 def relevancy(
     positive: Float[Tensor, "*n q"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,25 +111,6 @@ class SparseRows:
         if low < 0:
             raise InputError(f"columns must be 0 or more, found {low}")
         return high + 1
-
-    def check(self, name: str, num_columns: int) -> None:
-        """Makes sure that the arrays, which may come from a file, describe weights in a matrix of so many columns.
-
-        Args:
-            name: of the matrix, for the message.
-        Raises:
-            ValueError: another type or shape, entries outside the matrix, weights that are negative or not finite.
-        """
-        weights = torch.float64 if self.weight.dtype == torch.float64 else torch.float32
-        arrays = (("offsets", self.offsets, torch.int64), ("columns", self.column, torch.int32))
-        for what, array, dtype in (*arrays, ("weights", self.weight, weights)):
-            if array.ndim != 1 or array.dtype != dtype:
-                raise InputError(f"{name}: {what} are {array.dtype} {tuple(array.shape)}, expected one row of {dtype}")
-        if self.num_columns > num_columns:
-            raise InputError(f"{name}: columns reach to {self.num_columns - 1}, expected 0..{num_columns - 1}")
-        least, most = (float(x) for x in self.weight.aminmax()) if len(self.weight) > 0 else (0, 0)
-        if not 0 <= least <= most < math.inf:
-            raise InputError(f"{name}: weights are in {least}..{most}, expected finite ones that are not negative")
 
     def to(self, device: torch.device | str) -> SparseRows:
         """A copy on another device."""

@@ -14,7 +14,8 @@ from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.encoders.sam.masks import SamMasks
 from normlift_ns.encoders.sam.weights import local_sam
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
-from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.encoders.texts.colours import refuse_template
+from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, EncoderName, FeaturesName, RegionsName, SourceOptions
 
@@ -77,8 +78,7 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     if options.encoder == "open_clip":
         return _make_clip(options, device)
     if options.encoder == "colour":
-        if options.text_template != "{}":
-            raise InputError(f"--text-template {options.text_template!r} is for --encoder open_clip; leave it out")
+        refuse_template(options.text_template)
         return ColourEncoder()
     raise InputError(f"unknown encoder {options.encoder!r}; --encoder is one of {', '.join(get_args(EncoderName))}")
 

@@ -22,20 +22,16 @@ from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
 from normlift_ns.core.disk.tensors import load_tensors, save_tensors
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.source import (
-    UNIT_TOLERANCE,
     Encoder,
     FeatureSource,
     RegionFeatures,
     Regions,
     ViewFeatures,
-    check_prompts,
 )
-
-_FORMAT = "normlift_ns.encoders/2"
-"""Part of every key: to be raised when labels or features change for the same settings."""
+from normlift_ns.encoders.texts.kept import cache_path
+from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 
 
 def cached(source: FeatureSource, folder: Path) -> FeatureSource:
@@ -88,7 +84,7 @@ class CachedRegions:
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
         """Where the label maps of an image are kept, whether they exist or not."""
         files = [file.read_bytes() for file in self.files(name)]
-        return _path(self.folder, self.identity, name.encode(), *_parts(image), *files)
+        return cache_path(self.folder, self.identity, name.encode(), *_parts(image), *files)
 
 
 @dataclass(frozen=True)
@@ -136,7 +132,7 @@ class CachedEncoder:
 
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
         """Where the features of an image's regions are kept, whether they exist or not."""
-        return _path(self.folder, self.identity, *_parts(image), *_parts(labels))
+        return cache_path(self.folder, self.identity, *_parts(image), *_parts(labels))
 
 
 @dataclass(frozen=True)
@@ -158,7 +154,7 @@ class CachedPatches:
         return self.source.available(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        path = _path(self.folder, self.identity, *_parts(image))
+        path = cache_path(self.folder, self.identity, *_parts(image))
         labels = self.source.labels(image)
         found = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
         if found is None:
@@ -170,45 +166,8 @@ class CachedPatches:
         return self.source.text(prompts)
 
 
-@dataclass(frozen=True)
-class CachedTexts:
-    """The texts of an `OpenClipEncoder`, kept, so that a question asked again needs no network.
-
-    The key: the text, and the settings that change its vector.
-    """
-
-    encoder: OpenClipEncoder
-    folder: Path
-    """Holds one safetensors file per text; made if it does not exist. Where it cannot be written to, nothing is
-    kept."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return self.encoder.identity
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        check_prompts(prompts)
-        paths = {prompt: _path(self.folder, self.encoder.text_identity, prompt.encode()) for prompt in prompts}
-        rows = {prompt: _read(path, "text", _are_units) for prompt, path in paths.items()}
-        new = [prompt for prompt, row in rows.items() if row is None]
-        for prompt, row in zip(new, self.encoder.text(new) if len(new) > 0 else []):
-            rows[prompt] = row
-            with suppress(OSError):
-                _write(paths[prompt], "text", row)
-        return torch.stack([row for prompt in prompts if (row := rows[prompt]) is not None])
-
-
 def _parts(tensor: Tensor) -> tuple[bytes, bytes]:
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
-
-
-def _digest(*parts: bytes) -> str:
-    return blake2b(b"".join(blake2b(part).digest() for part in parts), digest_size=16).hexdigest()
-
-
-def _path(folder: Path, identity: dict[str, Any], *content: bytes) -> Path:
-    key = _digest(_FORMAT.encode(), json.dumps(identity, sort_keys=True).encode(), *content)
-    return folder / f"{key}.safetensors"
 
 
 def _read(path: Path, name: str, fits: Callable[[Tensor], bool]) -> Tensor | None:
@@ -225,12 +184,10 @@ def _are_labels(found: Tensor, image: Tensor) -> bool:
     return fitting and found.numel() > 0 and int(found.min()) >= -1
 
 
-def _are_units(found: Tensor, count: int | None = None) -> bool:
-    """Unit rows, `count` of them, or one vector."""
-    if found.dtype != torch.float32 or found.ndim != (1 if count is None else 2) or found.shape[-1] == 0:
+def _are_units(found: Tensor, count: int) -> bool:
+    if found.dtype != torch.float32 or found.ndim != 2 or found.shape[-1] == 0 or len(found) != count:
         return False
-    length = torch.linalg.vector_norm(found, dim=-1)
-    return (count is None or len(found) == count) and bool(((length - 1).abs() < UNIT_TOLERANCE).all())
+    return bool(((torch.linalg.vector_norm(found, dim=-1) - 1).abs() < UNIT_TOLERANCE).all())
 
 
 def _write(path: Path, name: str, tensor: Tensor) -> None:

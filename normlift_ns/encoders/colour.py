@@ -1,168 +1,30 @@
-"""A joint space of image regions and texts without learned weights: colours, as they look under changing light.
-
-A region is its mean CIELAB colour, a text the colours that it names (the 949 names of the XKCD colour survey, which
-matplotlib ships). Shade multiplies the light of a surface by a factor, under which L* + 16, a* and b* all change by
-one factor too. Colours are therefore compared in coordinates that discount it, close to those of CIELAB at L* = 50::
-
-    p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
-
-Lightness counts in full among whites, greys and blacks, which differ in nothing else, and half among strong colours,
-of which photographs vary it most. A colour becomes the unit vector phi(x), such that the cosine falls with the
-distance of coordinates::
-
-    <phi(x), phi(y)> = exp(-|x - y|^2 / (2 sigma^2)),    sigma = 30
-
-which is 0.95 at a distance of 10 (neighbouring shades), 0.61 at 30, 0.14 at 60 and 0.004 at 100. No finite number of
-dimensions does that exactly. Here phi is the Nystroem approximation on 343 anchors, a lattice of 7 levels per channel
-of sRGB: with L L^T the kernel matrix of the anchors, phi(x) = L^-1 k(anchors, x), normalised. The cosine is right to
-4e-3 in random pairs of sRGB colours, and to 1e-3 in 99 % of them. It understands nothing but colour.
-"""
+"""The colour encoder: image regions as their mean colours, in the space of `encoders.texts.colours`."""
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int32, UInt8
-from matplotlib.colors import XKCD_COLORS, to_rgb
+from jaxtyping import Float32, Int32, UInt8
 from skimage.color import rgb2lab
 from torch import Tensor
 
-from normlift_ns.encoders.source import check_prompts
-from normlift_ns.errors import InputError
-
-SIGMA = 30.0
-"""Width of the kernel, in units of `shading_coordinates`."""
-_STRONG = 40.0
-"""Relative chroma at which a colour is a strong one."""
-_LEVELS = 7
-_LEVEL_POWER = 1.5
-"""Above 1, the lattice is denser among dark colours, whose coordinates change fast."""
-_JITTER = 1e-10
+from normlift_ns.encoders.texts.colours import ColourTexts, embed
 
 
 @dataclass(frozen=True)
-class ColourEncoder:
-    """Mean CIELAB colours against colour names; formulas at the top of this file. Needs neither weights nor a GPU."""
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        return {"kind": "colour", "sigma": SIGMA}
+class ColourEncoder(ColourTexts):
+    """Mean CIELAB colours against colour names; formulas at the top of `texts.colours`. Needs neither weights nor a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         depth, y, x = (labels >= 0).nonzero(as_tuple=True)
         lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()
         pixels = torch.bincount(region)
         total = torch.zeros(len(pixels), 3, dtype=torch.float64).index_add_(0, region, lab.double())
-        return embed(total / pixels[:, None]).float()
+        return torch.from_numpy(embed((total / pixels[:, None]).numpy())).float()
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
         return (self.encode(image, labels) for image, labels in views)
-
-    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """One unit row per prompt: the mean of the vectors of the colours it names, so that each of them answers.
-
-        Raises:
-            ValueError: no prompt, an empty one, or one without a colour name.
-        """
-        check_prompts(prompts)
-        rows = []
-        for prompt in prompts:
-            found = colour_names(prompt)
-            if len(found) == 0:
-                raise InputError(_unknown(prompt))
-            rows.append(embed(torch.stack([_names()[name] for name in found])).mean(dim=0))
-        return torch.nn.functional.normalize(torch.stack(rows), dim=1).float()
-
-
-def embed(lab: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 343"]:
-    """phi of CIELAB colours (D65, L* in 0..100): unit rows."""
-    anchors, cholesky = _anchors()
-    rows = torch.linalg.solve_triangular(cholesky, _kernel(anchors, shading_coordinates(lab)), upper=False).T
-    return torch.nn.functional.normalize(rows, dim=1)
-
-
-def shading_coordinates(lab: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3"]:
-    """x of CIELAB colours, formula at the top of this file.
-
-    >>> shading_coordinates(torch.tensor([[50.0, 0.0, 0.0], [50.0, 160.0, -120.0], [17.0, 80.0, -60.0]]))
-    tensor([[  50.0000,    0.0000,    0.0000],
-            [  25.0000,  160.0000, -120.0000],
-            [   8.5000,  160.0000, -120.0000]])
-    """
-    lightness, chroma = lab[:, :1], lab[:, 1:]
-    chroma = 66 * chroma / (lightness + 16)
-    strength = (chroma**2).sum(dim=1, keepdim=True) / _STRONG**2
-    return torch.cat([lightness * (1 + torch.exp(-strength)) / 2, chroma], dim=1)
-
-
-def colour_names(prompt: str) -> list[str]:
-    """The colour names in a prompt, read from left to right, each as long as possible; other words are passed over.
-
-    >>> colour_names("dark red shoes on a grey-green floor")
-    ['dark red', 'grey green']
-    """
-    words = _words(prompt)
-    found = []
-    i = 0
-    while i < len(words):
-        for length in range(min(len(words) - i, _longest_name()), 0, -1):
-            name = " ".join(words[i : i + length])
-            if name in _names():
-                found.append(name)
-                i += length
-                break
-        else:
-            i += 1
-    return found
-
-
-def _words(text: str) -> list[str]:
-    """Lower-case words; the survey spells grey with an e."""
-    return re.findall(r"[a-z]+(?:'[a-z]+)?", text.lower().replace("gray", "grey"))
-
-
-@cache
-def _names() -> dict[str, Tensor]:
-    """CIELAB colour of every name. The survey has eleven names twice, as "blue green" and "blue/green": the former
-    counts."""
-    colours = sorted(XKCD_COLORS.items(), key=lambda item: "/" in item[0], reverse=True)
-    names = [" ".join(_words(name.removeprefix("xkcd:"))) for name, _ in colours]
-    lab = rgb2lab(np.array([to_rgb(colour) for _, colour in colours]))
-    return dict(zip(names, torch.from_numpy(lab)))
-
-
-@cache
-def _longest_name() -> int:
-    return max(len(name.split()) for name in _names())
-
-
-@cache
-def _anchors() -> tuple[Tensor, Tensor]:
-    level = torch.linspace(0, 1, _LEVELS, dtype=torch.float64) ** _LEVEL_POWER
-    lattice = torch.cartesian_prod(level, level, level)
-    anchors = shading_coordinates(torch.from_numpy(rgb2lab(lattice.numpy())))
-    gram = _kernel(anchors, anchors) + _JITTER * torch.eye(len(anchors), dtype=torch.float64)
-    return anchors, torch.linalg.cholesky(gram)
-
-
-def _kernel(x: Tensor, y: Tensor) -> Tensor:
-    return torch.exp(-((x[:, None] - y) ** 2).sum(dim=2) / (2 * SIGMA**2))
-
-
-def _unknown(prompt: str) -> str:
-    names = list(_names())
-    near = [name for word in [prompt.lower(), *_words(prompt)] for name in difflib.get_close_matches(word, names)]
-    shown = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
-    return (
-        f"text {prompt!r} contains no colour name; the colour encoder knows the names of the XKCD colour survey only, "
-        f"such as {shown}: use one of them, or --encoder open_clip for other words"
-    )

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
-from normlift_ns.encoders.source import ViewFeatures, check_prompts, unit_rows
-from normlift_ns.encoders.text_vectors import look_up
+from normlift_ns.encoders.source import ViewFeatures
+from normlift_ns.encoders.texts.files import look_up
+from normlift_ns.encoders.texts.prompts import check_prompts, unit_rows
 from normlift_ns.errors import InputError
 
 
@@ -78,11 +79,12 @@ class GivenFeatures:
                 f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
                 "width, undistorted, after lift_downscale); give labels of that size"
             )
-        return ViewFeatures(labels.int().cpu(), unit_rows(vectors.cpu()))
+        return ViewFeatures(labels.int().cpu(), torch.from_numpy(unit_rows(vectors.cpu())))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
-        return look_up(prompts, self.texts, "the texts given")
+        known = {text: vector.cpu() for text, vector in self.texts.items()}
+        return torch.from_numpy(look_up(prompts, known, "the texts given"))
 
 
 def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> GivenFeatures:

@@ -22,10 +22,9 @@ import torch
 from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor
 
+from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 from normlift_ns.errors import InputError
 
-UNIT_TOLERANCE = 1e-3
-"""Rows of this length, 1 give or take, are unit vectors: half precision leaves 5e-4."""
 
 
 @dataclass(frozen=True)
@@ -268,34 +267,6 @@ def refuse_shared(files: Iterable[tuple[str, Path]], what: str, how: str) -> Non
         other = owner.setdefault(os.path.realpath(file), name)
         if other != name:
             raise InputError(f"images {other} and {name} would share the {what} {file}; give each its own, {how}")
-
-
-def check_prompts(prompts: Sequence[str]) -> None:
-    """Raises ValueError unless `prompts` is a list of at least one text, none of them empty."""
-    if isinstance(prompts, str):
-        raise InputError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
-    if len(prompts) == 0:
-        raise InputError('no text given; name at least one thing to look for, such as --text "orange"')
-    for prompt in prompts:
-        if not isinstance(prompt, str) or "\0" in prompt:
-            raise InputError(f"a text must be of type str and without NUL characters, got {prompt!r:.60}")
-    empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
-    if len(empty) > 0:
-        raise InputError(
-            f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or say what to look "
-            "for in words"
-        )
-
-
-def unit_rows(vectors: Float[Tensor, "*n d"]) -> Float32[Tensor, "*n d"]:
-    """Vectors at unit length, however long or short they are; they must be finite and not zero.
-
-    >>> unit_rows(torch.tensor([3e-320, 4e-320], dtype=torch.float64)), unit_rows(torch.tensor([3e38, 3e38]))
-    (tensor([0.6000, 0.8000]), tensor([0.7071, 0.7071]))
-    """
-    rows = vectors.double()
-    rows = rows / rows.abs().amax(dim=-1, keepdim=True)
-    return (rows / torch.linalg.vector_norm(rows, dim=-1, keepdim=True)).float()
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:

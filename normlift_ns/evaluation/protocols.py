@@ -14,7 +14,7 @@ from normlift_ns.core.evidence import UNLABELED
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.metrics import classify
-from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
+from normlift_ns.core.query import relevancy
 from normlift_ns.core.scene import Scene, Views
 from normlift_ns.encoders.regions import LabelFiles
 from normlift_ns.encoders.source import TextEncoder, refuse_shared

@@ -28,7 +28,9 @@ from nerfstudio.viewer.viewer_elements import (
 )
 from torch import Tensor
 
-from normlift_ns.asking import Answer, Question, default_negatives, encoder_of, make_question
+from normlift_ns.asking import Answer
+from normlift_ns.question import Question, make_question
+from normlift_ns.text_encoders import default_negatives, encoder_of
 from normlift_ns.core.crash import explain
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders.source import TextEncoder

@@ -15,7 +15,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from normlift_ns.asking import encoder_settings, make_question
+from normlift_ns.text_encoders import encoder_settings
+from normlift_ns.question import make_question
 from normlift_ns.core.crash import explain
 from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source

@@ -13,10 +13,10 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from normlift_ns.asking import Question
+from normlift_ns.question import Question
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.files import draft_directory, new_file, numbered, publish, write_text
-from normlift_ns.encoders.text_vectors import write_text_vectors
+from normlift_ns.encoders.texts.files import write_text_vectors
 from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.config import set_data, skip_seed_points
 from normlift_ns.nerfstudio_plugin.load import NerfstudioScene

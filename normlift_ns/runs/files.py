@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from normlift_ns.core.disk.digests import file_digest, text_digest
 from normlift_ns.core.disk.manifest import BESIDE, MANIFEST, check_files
@@ -95,12 +95,17 @@ def load_field(
 
 
 def with_paths(field: SemanticField, folder: Path) -> SemanticField:
-    """The field, with the file of its texts, which the manifest names as it lies in the folder, by its whole path."""
-    encoder = field.manifest.get("encoder")
+    """The field, with `stored_paths`."""
+    return replace(field, manifest=stored_paths(field.manifest, folder))
+
+
+def stored_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+    """The manifest, with the file of its texts, which it names as it lies in its folder, by its whole path."""
+    encoder = manifest.get("encoder")
     if not isinstance(encoder, dict) or encoder.get("text_vectors") is None:
-        return field
+        return manifest
     path = str(folder / encoder["text_vectors"])  # an absolute one stays
-    return replace(field, manifest={**field.manifest, "encoder": {**encoder, "text_vectors": path}})
+    return {**manifest, "encoder": {**encoder, "text_vectors": path}}
 
 
 def check_run(run_dir: Path) -> None:

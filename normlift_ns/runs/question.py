@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import torch
-from torch import Tensor
+import numpy as np
 
-from normlift_ns.asking import Question
-from normlift_ns.core.disk.tensors import check_tensor, load_tensors, save_tensors
+from normlift_ns.question import Question
+from normlift_ns.core.disk.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
 
@@ -51,13 +50,13 @@ def save_question(folder: Path, question: Question) -> Path:
         question.min_reliability,
     )  # fmt: skip
     given = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
-    tensors = {name: value.detach().float().cpu() for name, value in given.items()}
+    arrays = {name: value.astype(np.float32) for name, value in given.items()}
     try:
         stored = _encoded(facts)
-        _question(stored, tensors)
+        _question(stored, arrays)
     except (ValueError, TypeError) as error:
         raise InputError(f"the question cannot be stored: {error}") from error
-    save_tensors(folder / QUERIES_FILE, tensors, {_KEY: stored}, overwrite=True)
+    save_arrays(folder / QUERIES_FILE, arrays, {_KEY: stored}, overwrite=True)
     return folder / QUERIES_FILE
 
 
@@ -73,10 +72,10 @@ def load_question(folder: Path) -> Question | None:
     try:
         if not os.path.isfile(path):
             raise InputError("it is no file")
-        tensors, stored, _ = load_tensors(path, undigested=(_KEY,), remedy=_REMEDY)
+        arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
         if set(stored) != {_KEY}:
             raise InputError(f"its metadata has {sorted(stored)}, expected {_KEY}")
-        return _question(stored[_KEY], tensors)
+        return _question(stored[_KEY], arrays)
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
 
@@ -85,7 +84,7 @@ def _encoded(facts: _Facts) -> str:
     return msgspec.json.encode(facts).decode()
 
 
-def _question(stored: str, tensors: dict[str, Tensor]) -> Question:
+def _question(stored: str, arrays: dict[str, np.ndarray]) -> Question:
     """What the file says.
 
     Raises:
@@ -94,25 +93,25 @@ def _question(stored: str, tensors: dict[str, Tensor]) -> Question:
     facts = msgspec.json.decode(stored, type=_Facts)
     if not math.isfinite(facts.threshold):
         raise InputError(f"the threshold is {facts.threshold}, expected a finite number")
-    if not {"vectors"} <= set(tensors) <= set(_VECTORS):
-        raise InputError(f"it holds {', '.join(sorted(tensors)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
-    negative = tensors.get("negative_vectors")
+    if not {"vectors"} <= set(arrays) <= set(_VECTORS):
+        raise InputError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
+    negative = arrays.get("negative_vectors")
     if (negative is None) != (len(facts.negatives) == 0):
         raise InputError(f"{len(facts.negatives)} negatives, {'no' if negative is None else 'some'} vectors of them")
     if facts.form != "cosine" and negative is None:
         raise InputError(f"rule {facts.form!r} compares with negatives, and there are none")
-    size = tensors["vectors"].shape[-1] if tensors["vectors"].ndim > 0 else 0
-    _check_vectors("vectors", tensors["vectors"], facts.texts, size)
+    size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
+    _check_vectors("vectors", arrays["vectors"], facts.texts, size)
     if negative is not None:
         _check_vectors("negative_vectors", negative, facts.negatives, size)
     return Question(
-        facts.texts, tensors["vectors"], facts.negatives, negative, facts.form, facts.threshold,
+        facts.texts, arrays["vectors"], facts.negatives, negative, facts.form, facts.threshold,
         facts.min_reliability, facts.refined,
     )  # fmt: skip
 
 
-def _check_vectors(name: str, vectors: Tensor, texts: Sequence[str], size: int) -> None:
-    check_tensor(f"{name} of {len(texts)} texts", vectors, torch.float32, (len(texts), max(1, size)), -math.inf)
+def _check_vectors(name: str, vectors: np.ndarray, texts: Sequence[str], size: int) -> None:
+    check_array(f"{name} of {len(texts)} texts", vectors, "float32", (len(texts), max(1, size)), -math.inf)
     for text, row in zip(texts, vectors):
-        if not bool(row.isfinite().all()) or not bool(row.any()):
+        if not np.isfinite(row).all() or not row.any():
             raise InputError(f"the vector of {text!r} is zero or not finite")

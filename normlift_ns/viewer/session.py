@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from normlift_ns.asking import Answer, Question, answer, reselect
+from normlift_ns.asking import Answer, answer, reselect
+from normlift_ns.question import Question
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import file_name, numbered
 from normlift_ns.errors import InputError

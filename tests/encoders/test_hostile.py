@@ -22,7 +22,7 @@ from normlift_ns.encoders import LangSplat, RegionFeatures, cached, read_image
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.npy import read_npy
 from normlift_ns.encoders.regions import Grid, LabelFiles
-from normlift_ns.encoders.text_vectors import TextVectors, write_text_vectors
+from normlift_ns.encoders.texts.files import TextVectors, write_text_vectors
 from tests.hostile import EXAMPLES, damaged, fuzz, no_files, survives
 
 IMAGE = torch.randint(0, 256, (6, 8, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)

@@ -20,7 +20,7 @@ from normlift_ns.encoders import LangSplat, RegionFeatures, SourceOptions, make_
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles
-from normlift_ns.encoders.text_vectors import TextVectors, write_text_vectors
+from normlift_ns.encoders.texts.files import TextVectors, write_text_vectors
 
 NAME = "images/frame_00001.jpg"
 HEIGHT, WIDTH, D = 3, 4, 512

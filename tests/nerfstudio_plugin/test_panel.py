@@ -22,7 +22,9 @@ from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerElement
 from plyfile import PlyData
 
-from normlift_ns.asking import ENCODER_KEYS, Question, answer
+from normlift_ns.text_encoders import ENCODER_KEYS
+from normlift_ns.question import Question
+from normlift_ns.asking import answer
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene

@@ -17,7 +17,9 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from normlift_ns.asking import answer, encoder_of, make_question
+from normlift_ns.asking import answer
+from normlift_ns.text_encoders import encoder_of
+from normlift_ns.question import make_question
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.errors import InputError

@@ -13,7 +13,7 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns import open_run
-from normlift_ns.asking import Question
+from normlift_ns.question import Question
 from normlift_ns.core.disk import atomic
 from normlift_ns.nerfstudio_plugin.config import read_config
 from normlift_ns.nerfstudio_plugin.load import load_scene

@@ -11,7 +11,7 @@ import torch
 
 from normlift_ns.core.disk.manifest import MANIFEST, check_files, read_manifest
 from normlift_ns.core.files import refuse_existing, refuse_run_files
-from normlift_ns.encoders.text_vectors import write_text_vectors
+from normlift_ns.encoders.texts.files import write_text_vectors
 from normlift_ns.errors import InputError
 from normlift_ns.runs.files import check_run, digests_beside, refuse_existing_run, sealed
 from tests.core.test_digests import as_version_0_1, example, flipped

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from safetensors.torch import save_file
 
 from normlift_ns import InputError
-from normlift_ns.asking import Question
+from normlift_ns.question import Question
 from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.runs.question import load_question, save_question
 from tests.hostile import EXAMPLES, damaged, fuzz, hostile_json, no_files, survives

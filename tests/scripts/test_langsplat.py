@@ -19,7 +19,7 @@ from scipy import ndimage
 from benchmarks.captures import SHARED
 from normlift_ns import open_run
 from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
-from normlift_ns.encoders.text_vectors import TextVectors
+from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.captures import clip_vectors, needs_shared

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import torch
 
-from normlift_ns.asking import Answer, Question
+from normlift_ns.asking import Answer
+from normlift_ns.question import Question
 from normlift_ns.viewer.display import color_scale, colors_of, overlay, palette, segmentation
 from normlift_ns.viewer.status import as_text, clipped, report
 

@@ -10,7 +10,7 @@ import torch
 from plyfile import PlyData
 
 from normlift_ns import SemanticField, lift
-from normlift_ns.asking import Question
+from normlift_ns.question import Question
 from normlift_ns.runs.question import load_question
 from normlift_ns.viewer.display import PARTS
 from normlift_ns.viewer.session import CLICKED, MOST_PROMPTS, Session, check_prompts, split_prompts

@@ -20,7 +20,7 @@ from normlift_ns.encoders.batches import Batches
 from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
 from normlift_ns.encoders.clip.network import ClipNetwork, load_clip
 from normlift_ns.encoders.clip.weights import check_names, import_open_clip
-from normlift_ns.encoders.source import check_prompts
+from normlift_ns.encoders.texts.prompts import check_prompts
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
 
@@ -64,11 +64,6 @@ class OpenClipEncoder:
     def identity(self) -> dict[str, Any]:
         """A weight file counts by its content, wherever it lies."""
         return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
-
-    @property
-    def text_identity(self) -> dict[str, Any]:
-        """Every setting that changes `text`."""
-        return {"model": self.model, "pretrained": self._weights_identity, "template": self.template}
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         """As in `Encoder`.

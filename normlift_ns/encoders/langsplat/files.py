@@ -23,7 +23,7 @@ from torch import Tensor
 
 from normlift_ns.core.files import new_file
 from normlift_ns.encoders.npy import read_npy
-from normlift_ns.encoders.source import UNIT_TOLERANCE
+from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 from normlift_ns.errors import InputError
 
 LEVELS = ("default", "s", "m", "l")

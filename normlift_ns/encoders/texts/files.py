@@ -12,18 +12,19 @@ from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32
-from torch import Tensor
 
-from normlift_ns.core.disk.tensors import tensor_digest
+from normlift_ns.core.disk.arrays import array_digest
 from normlift_ns.core.files import new_file
 from normlift_ns.encoders.npy import read_array
-from normlift_ns.encoders.source import check_prompts, unit_rows
+from normlift_ns.encoders.texts.prompts import check_prompts, unit_rows
 from normlift_ns.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _LARGEST_VECTOR, _LARGEST_FILE = 2**20, 2**30
 """Bytes; few bytes of an archive can hold any number of equal ones."""
@@ -70,15 +71,21 @@ class TextVectors:
         Raises:
             ValueError: no prompt, an empty one, or one that is not in the file; a file as in `names`.
         """
+        import torch  # noqa: PLC0415 (a question that needs no more is asked without)
+
+        return torch.from_numpy(self.rows(prompts))
+
+    def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
+        """As `text`, without torch."""
         check_prompts(prompts)
         return look_up(prompts, self._vectors, str(self.file))
 
     @cached_property
-    def _vectors(self) -> dict[str, Tensor]:
+    def _vectors(self) -> dict[str, np.ndarray]:
         try:
             with zipfile.ZipFile(self.file) as archive:
                 arrays, comment = dict(_entries(archive)), archive.comment
-            expected = _seal({name: torch.from_numpy(array) for name, array in arrays.items()})
+            expected = _seal(arrays)
             if comment.startswith(_SEAL) and comment != expected:
                 raise InputError(f"its content has {expected.decode()!r}, expected {comment.decode('latin1')!r}")
         except (  # what zipfile and zlib raise
@@ -98,7 +105,7 @@ class TextVectors:
                 )
             if not np.isfinite(array).all() or not array.any():
                 raise InputError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the text again")
-        return {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
+        return {name: array.astype(np.float64) for name, array in arrays.items()}
 
 
 def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
@@ -124,10 +131,11 @@ def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
             raise InputError(f"the vector of {name!r} is none: {error}") from None
 
 
-def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -> Float32[Tensor, "q d"]:
+def look_up(prompts: Sequence[str], vectors: Mapping[str, Any], where: str) -> Float32[np.ndarray, "q d"]:
     """One unit row per prompt.
 
     Args:
+        vectors: arrays, or tensors on the CPU.
         where: the vectors come from, for the message.
     Raises:
         ValueError: a prompt without a vector.
@@ -139,23 +147,23 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Tensor], where: str) -
                 f"which holds {len(vectors)}; near names: {', '.join(near)}" if len(vectors) > 0 else "which holds none"
             )
             raise InputError(f"text {prompt!r} has no vector in {where}, {hint}")
-    return torch.stack([unit_rows(vectors[prompt].cpu()) for prompt in prompts])
+    return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
-def write_text_vectors(file: Path, vectors: Mapping[str, Tensor]) -> None:
+def write_text_vectors(file: Path, vectors: Mapping[str, Any]) -> None:
     """Writes what `TextVectors` reads, as unit vectors in float32, complete or not at all, with a digest.
 
     Raises:
         FileExistsError, OSError: as `new_file`.
     """
-    units = {text: unit_rows(vector.cpu()) for text, vector in vectors.items()}
+    units = {text: unit_rows(vector) for text, vector in vectors.items()}
     with new_file(file) as draft, zipfile.ZipFile(draft, "w") as archive:
         for text, unit in units.items():  # numpy.savez takes no text that is called "file"
             with archive.open(f"{text}.npy", "w") as entry:
-                np.lib.format.write_array(entry, unit.numpy(), allow_pickle=False)
+                np.lib.format.write_array(entry, unit, allow_pickle=False)
         archive.comment = _seal(units)
 
 
-def _seal(vectors: Mapping[str, Tensor]) -> bytes:
+def _seal(vectors: Mapping[str, np.ndarray]) -> bytes:
     """The comment of an archive of ours, with its digest."""
-    return _SEAL + tensor_digest(vectors, {}).encode()
+    return _SEAL + array_digest(vectors, {}).encode()

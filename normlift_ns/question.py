@@ -1,0 +1,96 @@
+"""Texts as a question to a semantic field: their vectors, and the rule by which they select. Needs no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from normlift_ns.errors import InputError
+from normlift_ns.options import THRESHOLDS, Rule
+from normlift_ns.ranges import check_bool, check_number, shown
+from normlift_ns.text_encoders import Field, default_negatives
+
+
+class Reader(Protocol):
+    """Whatever makes vectors of texts."""
+
+    def text(self, prompts: Sequence[str]) -> Any:
+        """One unit row per prompt."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """Q texts as the encoder of a field sees them, and what is selected by them. Vectors may be given as tensors."""
+
+    texts: tuple[str, ...]
+    vectors: Float[np.ndarray, "q d"]
+    """One per text, of any length > 0."""
+    negatives: tuple[str, ...] = ()
+    """What the texts are compared with, where the rule compares."""
+    negative_vectors: Float[np.ndarray, "b d"] | None = None
+    rule: Rule = "cosine"
+    threshold: float = 0.5
+    """Relevancy above which a Gaussian is selected."""
+    min_reliability: float = 0.0
+    """Minimum R of a selected Gaussian, in 0..1."""
+    refined: bool = True
+    """Use refined features."""
+
+    def __post_init__(self) -> None:
+        for name in ("vectors", "negative_vectors"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, np.ndarray):  # a tensor, on any device
+                object.__setattr__(self, name, value.detach().cpu().numpy())
+
+
+def make_question(
+    field: Field,
+    encoder: Reader,
+    texts: Sequence[str],
+    *,
+    negatives: Sequence[str] | None = None,
+    rule: Rule | Literal["auto"] = "auto",
+    threshold: float | None = None,
+    min_reliability: float = 0.0,
+    refined: bool = True,
+) -> Question:
+    """Texts as a question to a field.
+
+    Args:
+        negatives: what the texts are compared with; None: `default_negatives`.
+        rule: "auto": lerf with negatives, cosine without.
+        threshold: None: that of `THRESHOLDS`.
+        min_reliability: minimum R of a selected Gaussian, in 0..1.
+        refined: use refined features.
+    Raises:
+        ValueError: a text that is empty or that the encoder does not understand.
+    """
+    if negatives is not None and not isinstance(negatives, Sequence):
+        raise InputError(f"negatives must be a list of texts, got {shown(negatives)}")
+    if isinstance(negatives, str):
+        raise InputError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
+    if rule not in ("auto", *get_args(Rule)):
+        raise InputError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
+    min_reliability = check_number("min_reliability", min_reliability)
+    threshold = None if threshold is None else check_number("threshold", threshold)
+    check_bool("refined", refined)
+    negatives = tuple(default_negatives(field) if negatives is None else negatives)
+    if rule == "auto":
+        rule = "cosine" if len(negatives) == 0 else "lerf"
+    return Question(
+        texts=tuple(texts),
+        vectors=encoder.text(texts),
+        negatives=negatives,
+        negative_vectors=encoder.text(negatives) if len(negatives) > 0 else None,
+        rule=rule,
+        threshold=THRESHOLDS[rule] if threshold is None else threshold,
+        min_reliability=min_reliability,
+        refined=refined,
+    )
+
+

@@ -1,0 +1,176 @@
+"""A lifted run that is asked, and nothing else: it opens in a second, because it needs neither torch nor nerfstudio.
+
+What it answers is what `LiftedRun.ask` answers, but for the rounding of float32 sums (1e-6).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.sparse import csr_array
+
+from normlift_ns.core.disk.field_file import FieldArrays, read_field
+from normlift_ns.errors import InputError
+from normlift_ns.options import Rule
+from normlift_ns.question import Question, make_question
+from normlift_ns.runs.files import check_run, field_folder, stored_paths, texts_cache
+from normlift_ns.selection import Selection
+from normlift_ns.text_encoders import Texts, encoder_of, with_texts
+
+_BLOCK = 2**21
+"""Elements converted to float32 at once; few stay in a processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class QuickRun:
+    """The semantic field of a run in arrays, and the encoder of its texts."""
+
+    folder: Path
+    """The run directory."""
+    arrays: Mapping[str, np.ndarray]
+    """As in `FieldArrays`."""
+    field: FieldArrays
+    manifest: Mapping[str, Any]
+    """Of the field, with the encoder that was asked for."""
+    device: str = "cpu"
+    """Where the network of the text encoder works, where one is needed."""
+
+    @cached_property
+    def texts(self) -> Texts:
+        """The encoder of texts; raises as `encoder_of`."""
+        return encoder_of(self, self.device, texts_cache(self.folder))
+
+    def ask(
+        self,
+        texts: Sequence[str],
+        *,
+        negatives: Sequence[str] | None = None,
+        rule: Rule | Literal["auto"] = "auto",
+        threshold: float | None = None,
+        min_reliability: float = 0.0,
+        refined: bool = True,
+    ) -> QuickAnswer:
+        """Arguments and errors as in `LiftedRun.ask`."""
+        question = make_question(
+            self,
+            self.texts,
+            texts,
+            negatives=negatives,
+            rule=rule,
+            threshold=threshold,
+            min_reliability=min_reliability,
+            refined=refined,
+        )
+        return answer(self.arrays, self.field, question)
+
+
+@dataclass(frozen=True, eq=False)
+class QuickAnswer:
+    """What a field answers to Q texts."""
+
+    question: Question
+    arrays: Mapping[str, np.ndarray]
+    relevancy: Float32[np.ndarray, "n q"]
+    valid: Bool[np.ndarray, " n"]
+    """Gaussians that have a direction."""
+    selected: Bool[np.ndarray, "n q"]
+    """Valid, above the threshold and reliable enough."""
+
+    def summarize(self) -> list[dict[str, Any]]:
+        """The numbers of every text, ready for JSON, as `asking.summarize` gives them."""
+        return [self._row(i) for i in range(len(self.question.texts))]
+
+    def _row(self, index: int) -> dict[str, Any]:
+        mask, arrays = self.selected[:, index], (self.arrays[name] for name in ("means", "reliability", "weight"))
+        found = Selection(len(mask), *(array[mask] for array in arrays))
+        peak = float(self.relevancy[self.valid, index].max()) if self.valid.any() else None
+        numbers = {name: getattr(found, name) for name in ("fraction", "centroid", "extent")}
+        return {
+            "text": self.question.texts[index],
+            **numbers,
+            "peak": peak,
+            "mean_reliability": found.mean_reliability,
+        }
+
+
+def open_quick(
+    load_config: Path, *, device: str = "cpu", text_vectors: Path | None = None, text_template: str | None = None
+) -> QuickRun | None:
+    """Opens the field of a lifted run; None where that takes its scene too: for runs of version 0.1, whose fields hold
+    no centres, and where other checkpoints lie beside that of the lift.
+
+    Args:
+        text_vectors, text_template: as in `open_run`.
+    Raises:
+        FileNotFoundError, ValueError: a run without semantics, or a damaged one.
+    """
+    folder = Path(os.path.abspath(load_config)).parent
+    check_run(folder)
+    inside = field_folder(folder)
+    field = read_field(inside)
+    beside = {f"../{path.relative_to(folder).as_posix()}" for path in folder.glob("nerfstudio_models/step-*.ckpt")}
+    if "means" not in field.arrays or not beside <= field.digested:
+        return None
+    run = QuickRun(folder, field.arrays, field, stored_paths(field.manifest, inside), device)
+    return with_texts(run, vectors=text_vectors, template=text_template)
+
+
+def answer(arrays: Mapping[str, np.ndarray], field: FieldArrays, question: Question) -> QuickAnswer:
+    """Relevancy and selection of every Gaussian for each text, as `asking.answer` computes them.
+
+    Raises:
+        ValueError: vectors of another length than the field's.
+    """
+    source = arrays["source"] if question.refined else slice(None)
+    negatives = question.negative_vectors if question.rule != "cosine" else None
+    given = question.vectors if negatives is None else np.concatenate([question.vectors, negatives])
+    cosine, count = _cosines(field, given)[source], len(question.vectors)
+    valid = (arrays["norm"] > 0)[source]
+    relevancy = _relevancy(cosine[:, :count], cosine[:, count:], question.rule)
+    relevancy = np.where(valid[:, None], relevancy, np.float32(-2 if question.rule == "margin" else 0))
+    sure = valid & (arrays["reliability"] >= np.float32(question.min_reliability))
+    return QuickAnswer(question, arrays, relevancy, valid, (relevancy > question.threshold) & sure[:, None])
+
+
+def _relevancy(
+    positive: Float32[np.ndarray, "n q"], negative: Float32[np.ndarray, "n b"], rule: Rule
+) -> Float32[np.ndarray, "n q"]:
+    """As `core.query.relevancy`."""
+    if rule == "cosine":
+        return positive
+    difference = positive - negative.max(axis=1, keepdims=True)
+    return difference if rule == "margin" else 1 / (1 + np.exp(-10 * difference))
+
+
+def _cosines(field: FieldArrays, given: Float[np.ndarray, "q d"]) -> Float32[np.ndarray, "n q"]:
+    """As `SemanticField.query`, not refined."""
+    arrays, dimension = field.arrays, int(field.manifest["dimension"])
+    if given.shape[1] != dimension:
+        raise InputError(
+            f"text vectors must be [Q, {dimension}] like the field's features, got {given.shape}; use the encoder that "
+            "made them"
+        )
+    vectors = given.astype(np.float64)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    found = arrays["norm"] > 0
+    cosine = np.zeros((len(found), len(vectors)), np.float32)
+    if field.evidence is not None:
+        rows = field.evidence.rows
+        table = arrays["features"].astype(np.float64) @ vectors.T
+        matrix = csr_array((rows.weight, rows.column, rows.offsets), shape=(len(found), len(table)))
+        length = arrays["weight"].astype(np.float64) * arrays["norm"]
+        cosine[found] = (matrix @ table)[found] / length[found, None]
+    else:
+        coordinates, basis = arrays["coordinates"], arrays.get("basis")
+        projected = vectors.astype(np.float32) if basis is None else vectors.astype(np.float32) @ basis.T
+        step = max(1, _BLOCK // projected.shape[1])
+        blocks = (coordinates[i : i + step].astype(np.float32) for i in range(0, len(coordinates), step))
+        cosine[found] = np.concatenate([block @ projected.T for block in blocks] or [cosine[:0]])
+    return cosine.clip(-1, 1)
