@@ -63,7 +63,10 @@ def read(path: Path) -> Document:
 
 def documents() -> Documents:
     """All results files that the pages speak of, by their names."""
-    names = ("cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu")
+    names = (
+        "cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu",
+        "overhead",
+    )  # fmt: skip
     return {name: read(RESULTS / f"{name}.json") for name in names}
 
 

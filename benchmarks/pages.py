@@ -1,4 +1,4 @@
-"""Refreshes the tables of docs/accuracy.md, docs/numerics.md and docs/speed_and_error.md, and the plots, from
+"""Refreshes the tables of docs/accuracy.md, numerics.md, reliability.md and speed_and_error.md, and the plots, from
 benchmarks/results/*.json.
 
     python -m benchmarks.pages            writes tables and plots
@@ -21,7 +21,7 @@ from benchmarks.documents import documents
 from benchmarks.plots import DOCS, plots
 from benchmarks.tables import tables
 
-PAGES = ("accuracy.md", "speed_and_error.md", "numerics.md")
+PAGES = ("accuracy.md", "speed_and_error.md", "numerics.md", "reliability.md")
 MARKER = re.compile(r"<!-- (?:table: (?P<name>[\w-]+)|end) -->")
 LIKE_A_MARKER = re.compile(r"<!--\s*(table|end)\b", re.IGNORECASE)
 

@@ -1,4 +1,4 @@
-"""The tables of docs/accuracy.md, docs/numerics.md and docs/speed_and_error.md, as Markdown, from the results files."""
+"""The tables of docs/accuracy.md, numerics.md, reliability.md and speed_and_error.md, from the results files."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ def tables(found: Documents) -> dict[str, str]:
         "numerics-rule": numerics_rule(),
         "numerics-cases": numerics_cases(),
         "numerics-errors": numerics_errors(found["numerics"], found["numerics_gpu"]),
+        "overhead": overhead(found["overhead"]),
     }
 
 
@@ -167,6 +168,17 @@ def stages(h100: Document) -> str:
         times = (v[f"{case}.evidence_lift_s"], post, v[f"{case}.total_s"])
         rows.append((case, size, *(f"{t:.3f} s" for t in times), f"{v[f'{case}.peak_gib']:.1f} GiB"))
     return table(("", "Gaussians, views", "lift", "reliability, neighbours, vote", "total", "peak memory"), rows)
+
+
+def overhead(document: Document) -> str:
+    """Whole commands, in turns with those of another version."""
+    v, rows = document.values, []
+    for what in ("lift", "query"):
+        for kind in ("wall", "cpu"):
+            key = f"{what}_{kind}"
+            costs = (f"{v[f'{key}_{one}']:.2f} ± {v[f'{key}_{one}_spread']:.2f} s" for one in ("before", "now"))
+            rows.append((f"{what}, {kind} time", *costs, f"{v[f'{key}_change']:+.1%}"))
+    return table(("command", "version 0.1", "now", "change"), rows)
 
 
 def every_metric(document: Document, having: str = "") -> str:

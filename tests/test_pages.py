@@ -95,7 +95,7 @@ def test_check_names_the_page_and_the_table(folder, capsys):
 
 def test_a_refresh_writes_pages_in_place_or_nothing(folder, monkeypatch):
     monkeypatch.setattr(pages, "plots", lambda found, folder: [])
-    good, bad, _ = (folder / name for name in PAGES)
+    good, bad, *_ = (folder / name for name in PAGES)
     good.write_text(good.read_text().replace("| 36 |", "| 48 |"))
     before = good.read_text()
     bad.write_text(bad.read_text() + "<!-- end -->\n")
