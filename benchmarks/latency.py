@@ -24,10 +24,10 @@ from benchmarks.captures import SHARED, trained_scene, trained_state, training_c
 from benchmarks.cpu import clip_like_table, grid_labels
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, SemanticField, asking, lift, rasterize_evidence
-from normlift_ns.question import Question
-from normlift_ns.core.query import CANONICAL_NEGATIVES, relevancy
+from normlift_ns.core.query import relevancy
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.options import Storage
+from normlift_ns.options import CANONICAL_NEGATIVES, Storage
+from normlift_ns.question import Question
 from normlift_ns.viewer.display import make_display
 from normlift_ns.viewer.status import report as status
 
@@ -49,14 +49,14 @@ def least(device: str, action: Callable[[], object]) -> float:
 
 def questions() -> Question:
     """A prompt that a class of the features has, against four others."""
-    names = torch.from_numpy(np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float32))
+    names = np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float32)
     return Question(("thing",), names[:1], CANONICAL_NEGATIVES, names[10:14], "lerf")
 
 
 def true_relevancy(exact_directions: torch.Tensor, question: Question) -> torch.Tensor:
     """[M, 1] in float64, from directions in float64."""
     positive, negative = (
-        exact_directions @ torch.nn.functional.normalize(vectors.to(exact_directions), dim=1).T
+        exact_directions @ torch.nn.functional.normalize(torch.from_numpy(vectors).to(exact_directions), dim=1).T
         for vectors in (question.vectors, question.negative_vectors)
         if vectors is not None
     )

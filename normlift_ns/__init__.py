@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from normlift_ns.core.lift import lift as lift
     from normlift_ns.core.neighbors import Neighbors as Neighbors
     from normlift_ns.core.neighbors import nearest_neighbors as nearest_neighbors
-    from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
-    from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
     from normlift_ns.core.query import relevancy as relevancy
     from normlift_ns.core.refine import refine as refine
     from normlift_ns.core.refine import unsupported as unsupported
@@ -31,6 +29,8 @@ if TYPE_CHECKING:
     from normlift_ns.front_door import open_run as open_run
     from normlift_ns.front_door import open_scene as open_scene
     from normlift_ns.lifted_run import LiftedRun as LiftedRun
+    from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
+    from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
     from normlift_ns.options import LiftOptions as LiftOptions
     from normlift_ns.options import RefineConfig as RefineConfig
     from normlift_ns.options import SourceOptions as SourceOptions
@@ -56,7 +56,14 @@ _HOMES = {
     "errors": ("InputError",),
     "front_door": ("lift_run", "open_run", "open_scene"),
     "lifted_run": ("LiftedRun",),
-    "options": ("LiftOptions", "RefineConfig", "SourceOptions", "SplatOptions"),
+    "options": (
+        "BACKGROUND_WORDS",
+        "CANONICAL_NEGATIVES",
+        "LiftOptions",
+        "RefineConfig",
+        "SourceOptions",
+        "SplatOptions",
+    ),  # fmt: skip
     "raster.rasterize": ("rasterize_evidence", "render"),
     "raster.settings": ("RasterSettings",),
     "scenes.opening": ("open_splat",),

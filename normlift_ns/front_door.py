@@ -11,8 +11,6 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.question import Question, make_question
-from normlift_ns.text_encoders import encoder_settings, given_settings, with_texts
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
 from normlift_ns.core.gpu import choose_device
@@ -23,7 +21,8 @@ from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.lifting import Export, lift_scene
-from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.options import CANONICAL_NEGATIVES, LiftOptions, SourceOptions
+from normlift_ns.question import Question, make_question
 from normlift_ns.ranges import check_bool, check_number, check_path, check_texts
 from normlift_ns.runs.files import (
     FIELD_FOLDER,
@@ -40,6 +39,7 @@ from normlift_ns.scenes.match import judge, match_photographs
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import is_saved_splat, open_saved_splat
 from normlift_ns.stages import Report
+from normlift_ns.text_encoders import encoder_settings, given_settings, with_texts
 
 
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
@@ -259,4 +259,4 @@ def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str
     negatives = None
     if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
         negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
-    return make_question(field, source, queries, negatives=negatives)
+    return make_question(field, source.text, queries, negatives=negatives)

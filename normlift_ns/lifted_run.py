@@ -16,20 +16,19 @@ from numpy import ndarray
 from torch import Tensor
 
 from normlift_ns.asking import Answer, Finding, answer
-from normlift_ns.question import Question, make_question
-from normlift_ns.text_encoders import encoder_of
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import refuse_run_files
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
-from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
+from normlift_ns.question import Question, make_question
 from normlift_ns.ranges import check_bool, check_path
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.runs.files import FIELD_FOLDER, texts_cache
 from normlift_ns.runs.question import load_question, save_question
 from normlift_ns.runs.splats import export_files, write_splats
+from normlift_ns.text_encoders import Texts, encoder_of
 from normlift_ns.viewer.display import draw, make_display
 
 
@@ -64,7 +63,7 @@ class LiftedRun:
         return self.folder / "config.yml"
 
     @cached_property
-    def texts(self) -> TextEncoder:
+    def texts(self) -> Texts:
         """The encoder of texts that fits the field; it loads its network when it first needs it.
 
         Raises:
@@ -96,7 +95,7 @@ class LiftedRun:
             raise InputError(f'ask takes texts one after the other, as in ask("red", "blue"); got {texts!r}')
         question = make_question(
             self.field,
-            self.texts,
+            self.texts.rows,
             texts,
             negatives=negatives,
             rule=rule,

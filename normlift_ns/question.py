@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -13,14 +13,6 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import THRESHOLDS, Rule
 from normlift_ns.ranges import check_bool, check_number, shown
 from normlift_ns.text_encoders import Field, default_negatives
-
-
-class Reader(Protocol):
-    """Whatever makes vectors of texts."""
-
-    def text(self, prompts: Sequence[str]) -> Any:
-        """One unit row per prompt."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +42,7 @@ class Question:
 
 def make_question(
     field: Field,
-    encoder: Reader,
+    read: Callable[[Sequence[str]], Any],
     texts: Sequence[str],
     *,
     negatives: Sequence[str] | None = None,
@@ -62,6 +54,7 @@ def make_question(
     """Texts as a question to a field.
 
     Args:
+        read: makes one vector per text, of an encoder that fits the field.
         negatives: what the texts are compared with; None: `default_negatives`.
         rule: "auto": lerf with negatives, cosine without.
         threshold: None: that of `THRESHOLDS`.
@@ -84,13 +77,11 @@ def make_question(
         rule = "cosine" if len(negatives) == 0 else "lerf"
     return Question(
         texts=tuple(texts),
-        vectors=encoder.text(texts),
+        vectors=read(texts),
         negatives=negatives,
-        negative_vectors=encoder.text(negatives) if len(negatives) > 0 else None,
+        negative_vectors=read(negatives) if len(negatives) > 0 else None,
         rule=rule,
         threshold=THRESHOLDS[rule] if threshold is None else threshold,
         min_reliability=min_reliability,
         refined=refined,
     )
-
-

@@ -34,9 +34,8 @@ class QuickRun:
 
     folder: Path
     """The run directory."""
-    arrays: Mapping[str, np.ndarray]
-    """As in `FieldArrays`."""
     field: FieldArrays
+    """With the centres of the Gaussians, `means`."""
     manifest: Mapping[str, Any]
     """Of the field, with the encoder that was asked for."""
     device: str = "cpu"
@@ -60,7 +59,7 @@ class QuickRun:
         """Arguments and errors as in `LiftedRun.ask`."""
         question = make_question(
             self,
-            self.texts,
+            self.texts.rows,
             texts,
             negatives=negatives,
             rule=rule,
@@ -68,7 +67,7 @@ class QuickRun:
             min_reliability=min_reliability,
             refined=refined,
         )
-        return answer(self.arrays, self.field, question)
+        return answer(self.field, question)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ class QuickAnswer:
     """What a field answers to Q texts."""
 
     question: Question
-    arrays: Mapping[str, np.ndarray]
+    field: FieldArrays
     relevancy: Float32[np.ndarray, "n q"]
     valid: Bool[np.ndarray, " n"]
     """Gaussians that have a direction."""
@@ -88,7 +87,7 @@ class QuickAnswer:
         return [self._row(i) for i in range(len(self.question.texts))]
 
     def _row(self, index: int) -> dict[str, Any]:
-        mask, arrays = self.selected[:, index], (self.arrays[name] for name in ("means", "reliability", "weight"))
+        mask, arrays = self.selected[:, index], (self.field.arrays[name] for name in ("means", "reliability", "weight"))
         found = Selection(len(mask), *(array[mask] for array in arrays))
         peak = float(self.relevancy[self.valid, index].max()) if self.valid.any() else None
         numbers = {name: getattr(found, name) for name in ("fraction", "centroid", "extent")}
@@ -101,12 +100,18 @@ class QuickAnswer:
 
 
 def open_quick(
-    load_config: Path, *, device: str = "cpu", text_vectors: Path | None = None, text_template: str | None = None
+    load_config: Path,
+    *,
+    means: Float32[np.ndarray, "n 3"] | None = None,
+    device: str = "cpu",
+    text_vectors: Path | None = None,
+    text_template: str | None = None,
 ) -> QuickRun | None:
-    """Opens the field of a lifted run; None where that takes its scene too: for runs of version 0.1, whose fields hold
-    no centres, and where other checkpoints lie beside that of the lift.
+    """Opens the field of a lifted run; None where its files alone do not tell what scene it is of: runs of version 0.1
+    hold no centres of Gaussians, and other checkpoints may lie beside that of the lift.
 
     Args:
+        means: centres of the Gaussians, of the scene that `open_run` found to be the field's.
         text_vectors, text_template: as in `open_run`.
     Raises:
         FileNotFoundError, ValueError: a run without semantics, or a damaged one.
@@ -116,18 +121,21 @@ def open_quick(
     inside = field_folder(folder)
     field = read_field(inside)
     beside = {f"../{path.relative_to(folder).as_posix()}" for path in folder.glob("nerfstudio_models/step-*.ckpt")}
-    if "means" not in field.arrays or not beside <= field.digested:
+    if means is not None:
+        field = field._replace(arrays={**field.arrays, "means": means})
+    elif "means" not in field.arrays or not beside <= field.digested:
         return None
-    run = QuickRun(folder, field.arrays, field, stored_paths(field.manifest, inside), device)
+    run = QuickRun(folder, field, stored_paths(field.manifest, inside), device)
     return with_texts(run, vectors=text_vectors, template=text_template)
 
 
-def answer(arrays: Mapping[str, np.ndarray], field: FieldArrays, question: Question) -> QuickAnswer:
+def answer(field: FieldArrays, question: Question) -> QuickAnswer:
     """Relevancy and selection of every Gaussian for each text, as `asking.answer` computes them.
 
     Raises:
         ValueError: vectors of another length than the field's.
     """
+    arrays = field.arrays
     source = arrays["source"] if question.refined else slice(None)
     negatives = question.negative_vectors if question.rule != "cosine" else None
     given = question.vectors if negatives is None else np.concatenate([question.vectors, negatives])
@@ -136,7 +144,7 @@ def answer(arrays: Mapping[str, np.ndarray], field: FieldArrays, question: Quest
     relevancy = _relevancy(cosine[:, :count], cosine[:, count:], question.rule)
     relevancy = np.where(valid[:, None], relevancy, np.float32(-2 if question.rule == "margin" else 0))
     sure = valid & (arrays["reliability"] >= np.float32(question.min_reliability))
-    return QuickAnswer(question, arrays, relevancy, valid, (relevancy > question.threshold) & sure[:, None])
+    return QuickAnswer(question, field, relevancy, valid, (relevancy > question.threshold) & sure[:, None])
 
 
 def _relevancy(

@@ -13,8 +13,9 @@ _CENTRAL = (0.05, 0.95)
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """M selected Gaussians of N. Places are in the scene's own units; None where nothing is selected. Means are weighted
-    by W_j, what the views saw of each Gaussian.
+    """M selected Gaussians of N. Places are in the scene's own units; None where nothing is selected.
+
+    Means are weighted by W_j, what the views saw of each Gaussian.
     """
 
     total: int

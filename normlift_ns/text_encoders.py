@@ -152,5 +152,3 @@ def default_negatives(field: Field) -> tuple[str, ...]:
     vectors = stored.get("text_vectors")
     known = CANONICAL_NEGATIVES if vectors is None else TextVectors(Path(vectors)).names
     return CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(known) else ()
-
-

@@ -14,8 +14,8 @@ import torch
 from plyfile import PlyData
 
 import normlift_ns as nl
-from normlift_ns.question import Question
 from normlift_ns.demo import DemoRoom
+from normlift_ns.question import Question
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry, said
 

@@ -73,10 +73,15 @@ def log_traceback(error: BaseException) -> Path | None:
 
 def _folders() -> list[Path]:
     """Where log files may go, the best first."""
-    found = []
-    with suppress(RuntimeError):  # a user without a home
-        state = Path(os.environ.get("XDG_STATE_HOME", ""))
-        found.append((state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns")
+    found = [folder] if (folder := state_folder()) is not None else []
     with suppress(OSError):  # no folder for temporary files
         found.append(Path(tempfile.gettempdir()))
     return found
+
+
+def state_folder() -> Path | None:
+    """Where a user's programs keep what they remember; it may not be there yet. None: a user without a home."""
+    state = Path(os.environ.get("XDG_STATE_HOME", ""))
+    with suppress(RuntimeError):
+        return (state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns"
+    return None

@@ -9,6 +9,7 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, Rule
 
+
 def relevancy(
     positive: Float[Tensor, "*n q"],
     negative: Float[Tensor, "*n b"] | None = None,

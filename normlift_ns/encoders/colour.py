@@ -15,7 +15,7 @@ from normlift_ns.encoders.texts.colours import ColourTexts, embed
 
 @dataclass(frozen=True)
 class ColourEncoder(ColourTexts):
-    """Mean CIELAB colours against colour names; formulas at the top of `texts.colours`. Needs neither weights nor a GPU."""
+    """Mean CIELAB colours against colour names; formulas in `texts.colours`. Needs neither weights nor a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         depth, y, x = (labels >= 0).nonzero(as_tuple=True)

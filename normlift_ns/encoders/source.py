@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 from normlift_ns.errors import InputError
-
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_f
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.evaluation.results import Evaluation
 from normlift_ns.evaluation.scannet import NYU40, SceneLabels, check_identity, evaluate_scannet, read_labels
+from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.raster.rasterize import rasterize_evidence, render
 
 

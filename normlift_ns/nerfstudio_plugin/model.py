@@ -15,7 +15,6 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from torch import Tensor
 
-from normlift_ns.question import Question
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.picking import ray_weights
@@ -23,6 +22,7 @@ from normlift_ns.nerfstudio_plugin.appearance import shading_degree
 from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
 from normlift_ns.nerfstudio_plugin.panel import Panel
 from normlift_ns.options import RasterizeMode
+from normlift_ns.question import Question
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.files import check_run, with_paths

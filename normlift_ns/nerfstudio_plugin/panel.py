@@ -29,15 +29,14 @@ from nerfstudio.viewer.viewer_elements import (
 from torch import Tensor
 
 from normlift_ns.asking import Answer
-from normlift_ns.question import Question, make_question
-from normlift_ns.text_encoders import default_negatives, encoder_of
 from normlift_ns.core.crash import explain
 from normlift_ns.core.field import SemanticField
-from normlift_ns.encoders.source import TextEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.widgets import FreeButton, Markdown, TextBox, set_value
 from normlift_ns.options import THRESHOLDS, RasterizeMode
+from normlift_ns.question import Question, make_question
 from normlift_ns.runs.files import texts_cache
+from normlift_ns.text_encoders import Texts, default_negatives, encoder_of
 from normlift_ns.viewer.display import COLORMAPS, PARTS, Display
 from normlift_ns.viewer.session import ALL_PROMPTS, Session, check_prompts, split_prompts
 from normlift_ns.viewer.status import as_text, clipped
@@ -83,7 +82,7 @@ class Panel(torch.nn.Module):
     def __init__(self, host: Host) -> None:
         super().__init__()
         self._host = [host]  # in lists: a module that holds its parent, or an encoder that is saved with the model
-        self._encoder: list[TextEncoder] = []
+        self._encoder: list[Texts] = []
         self._folder: Path | None = None
         self._session: Session | None = None
         self._turn = object()  # of the last query, clear or click: what was asked before it comes too late
@@ -194,7 +193,7 @@ class Panel(torch.nn.Module):
             self._report("")
             try:
                 encoder = self._encoder_of(session.field)
-                return make_question(session.field, encoder, prompts, negatives=negatives, rule=rule)
+                return make_question(session.field, encoder.rows, prompts, negatives=negatives, rule=rule)
             finally:
                 self._busy = ""
 
@@ -215,7 +214,7 @@ class Panel(torch.nn.Module):
         if message:
             self.note(message)
 
-    def _encoder_of(self, field: SemanticField) -> TextEncoder:
+    def _encoder_of(self, field: SemanticField) -> Texts:
         if len(self._encoder) == 0:
             cache = None if self._folder is None else texts_cache(self._folder.parent)
             self._encoder.append(encoder_of(field, str(field.source.device), cache))

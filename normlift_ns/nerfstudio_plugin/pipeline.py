@@ -15,8 +15,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from normlift_ns.text_encoders import encoder_settings
-from normlift_ns.question import make_question
 from normlift_ns.core.crash import explain
 from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source
@@ -28,9 +26,11 @@ from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
 from normlift_ns.nerfstudio_plugin.views import DatasetViews, image_name
 from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.question import make_question
 from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, digests_beside, sealed
 from normlift_ns.runs.question import save_question
 from normlift_ns.scenes.checkpoint import numpy_numbers
+from normlift_ns.text_encoders import encoder_settings
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -171,7 +171,7 @@ def lift_trained(trainer: Trainer) -> Path:
     result.field.save(folder, overwrite=True, beside=digests_beside(folder, files))
     question = None
     if len(options.queries) > 0:
-        question = make_question(result.field, source, options.queries)
+        question = make_question(result.field, source.text, options.queries)
         save_question(folder, question)
     trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
     write_text(path, sealed(yaml.dump(trainer.config)), overwrite=True)

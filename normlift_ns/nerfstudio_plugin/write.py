@@ -13,7 +13,6 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from normlift_ns.question import Question
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.files import draft_directory, new_file, numbered, publish, write_text
 from normlift_ns.encoders.texts.files import write_text_vectors
@@ -22,6 +21,7 @@ from normlift_ns.nerfstudio_plugin.config import set_data, skip_seed_points
 from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
 from normlift_ns.nerfstudio_plugin.splat_config import splat_config
+from normlift_ns.question import Question
 from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, digests_beside, refuse_existing_run, sealed, tidy
 from normlift_ns.runs.question import save_question
 from normlift_ns.scenes.checkpoint import Checkpoint

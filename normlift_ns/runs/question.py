@@ -14,10 +14,10 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from normlift_ns.question import Question
 from normlift_ns.core.disk.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
+from normlift_ns.question import Question
 
 QUERIES_FILE = "queries.safetensors"
 """In the folder of the field: vectors, and everything else as JSON in the file's metadata."""

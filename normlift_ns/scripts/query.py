@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import glob
 import json
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from rich.table import Table
+from typing import TYPE_CHECKING, Any, cast
 
 from normlift_ns.core.files import file_name, new_file, refuse_existing, write_text
 from normlift_ns.errors import InputError
 from normlift_ns.options import AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
+from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.scripts.early import check_lifted, different, writable_file, writable_folder
-from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
+from normlift_ns.scripts.shared import run_command, say
 
 if TYPE_CHECKING:
-    from normlift_ns.lifted_run import Answer
+    from normlift_ns.question import Question
+    from normlift_ns.quick import QuickAnswer, QuickRun
 
 
 @dataclass
@@ -27,9 +30,15 @@ class NormLiftQuery:
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
-    text: tuple[str, ...]
+    text: tuple[str, ...] = ()
     """What to look for, one or several texts."""
     ask: AskOptions = field(default_factory=AskOptions)
+    interactive: bool = False
+    """Ask text after text at a prompt; the run stays open."""
+    stdin: bool = False
+    """Ask every line of the standard input, and print the answer to each as one line of JSON."""
+    history: bool = True
+    """Keep what is asked at the prompt, in a file that only you can read."""
     save: bool = False
     """Store the queries in the run, in place of earlier ones. ns-render and ns-viewer then draw the answer."""
     json: Path | None = None
@@ -53,39 +62,66 @@ class NormLiftQuery:
     def main(self) -> list[dict[str, Any]]:
         """Asks, writes and prints; returns the rows of the table."""
         self._check()
-        from normlift_ns.asking import summarize  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.front_door import open_run  # noqa: PLC0415
-        from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
+        from normlift_ns.runs.question import save_question  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.scripts.prompting import answer_lines, converse, show  # noqa: PLC0415
 
-        run = open_run(
-            self.load_config,
-            data=self.data,
-            device=self.device,
-            text_vectors=self.ask.text_vectors,
-            text_template=self.ask.text_template,
-        )
-        cameras = training_cameras(run.scene, self.render_views)
-        answer = run.ask(*self.text, **self.ask.rules())
-        rows, question = summarize(answer), answer.question
+        run = self._open()
+        if self.stdin:
+            answer_lines(run, self.ask.rules())
+            return []
+        if self.interactive:
+            converse(run, self.ask.rules(), keep_history=self.history)
+            return []
+        found = run.ask(self.text, **self.ask.rules())
+        pictured = self._pictured(found.question) if self.render_dir is not None else None
+        rows = found.summarize()
         if self.json is not None:
-            _write_json(self.json, rows, answer, self.overwrite)
+            _write_json(self.json, rows, found.question, self.overwrite)
         if self.output_path is not None:
-            _write_arrays(self.output_path, answer, self.overwrite)
-        if self.render_dir is not None:
-            save_overlays(run.scene, answer, cameras, self.render_dir, overwrite=self.overwrite)
-        stored = run.save(question) if self.save else None
+            _write_arrays(self.output_path, found, self.overwrite)
+        if pictured is not None:
+            pictured()
+        stored = save_question(run.folder / FIELD_FOLDER, found.question) if self.save else None
         written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
-        CONSOLE.print(_table(rows, f"{question.rule} > {question.threshold:g}"))
+        show(rows, found.question)
         if len(written) > 0:
             say("Written: " + ", ".join(map(str, written)))
         return rows
 
+    def _open(self) -> QuickRun:
+        """The run, with its scene only where its own files do not tell which that is."""
+        from normlift_ns.quick import open_quick  # noqa: PLC0415 (as above)
+
+        if self.device.startswith("cuda"):
+            from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
+
+            choose_device(self.device)
+        opened = partial(
+            open_quick, self.load_config, device=self.device, text_vectors=self.ask.text_vectors,
+            text_template=self.ask.text_template,
+        )  # fmt: skip
+        run = opened()
+        if run is not None:
+            return run
+        from normlift_ns.front_door import open_run  # noqa: PLC0415 (as above)
+
+        return cast("QuickRun", opened(means=open_run(self.load_config, data=self.data).scene.gaussians.means.numpy()))
+
+    def _pictured(self, question: Question) -> Callable[[], list[Path]]:
+        """What draws the pictures; everything that they need is there when it is returned."""
+        from normlift_ns.asking import answer  # noqa: PLC0415 (as above)
+        from normlift_ns.front_door import open_run  # noqa: PLC0415
+        from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
+
+        run, folder = open_run(self.load_config, data=self.data), cast(Path, self.render_dir)
+        cameras = training_cameras(run.scene, self.render_views)
+        found = answer(run.field, run.scene.gaussians.means, question)
+        return lambda: save_overlays(run.scene, found, cameras, folder, overwrite=self.overwrite)
+
     def _check(self) -> None:
         """Raises what can be told before anything is loaded."""
         check_device(self.device)
-        if len(self.text) == 0:
-            raise InputError('no text given; name at least one thing to look for, such as --text "orange"')
-        check_texts("text", self.text)
+        self._check_texts()
         check_lifted(self.load_config, self.data, self.ask)
         different(json=self.json, output_path=self.output_path)
         for flag, path in (("--json", self.json), ("--output-path", self.output_path)):
@@ -95,6 +131,24 @@ class NormLiftQuery:
         writable_folder(self.render_dir, "--render-dir")
         refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
 
+    def _check_texts(self) -> None:
+        ways = [f"--{name}" for name in ("text", "stdin", "interactive") if getattr(self, name)]
+        if len(ways) == 0:
+            raise InputError(
+                'no text given; name at least one thing to look for, such as --text "orange", or ask one after the '
+                "other with --interactive"
+            )
+        if len(ways) > 1:
+            raise InputError(f"{ways[0]} and {ways[1]} are two ways to give texts; leave one of them out")
+        for name in ("json", "output_path", "render_dir", "save"):
+            if ways != ["--text"] and getattr(self, name):
+                raise InputError(f"--{name.replace('_', '-')} stores the answer to --text; leave it out with {ways[0]}")
+        if self.interactive and not sys.stdin.isatty():
+            raise InputError(
+                "--interactive needs a terminal to read from; to ask the lines of a file, use --stdin True"
+            )
+        check_texts("text", self.text)
+
     def _pictures(self) -> list[Path]:
         """Pictures that new ones would replace: of the same texts, and of the same views where some are named."""
         views = [glob.escape(Path(name).stem) for name in self.render_views] or ["*"]
@@ -102,34 +156,21 @@ class NormLiftQuery:
         return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
 
 
-def _write_json(path: Path, rows: list[dict[str, Any]], answer: Answer, overwrite: bool) -> None:
-    question = answer.question
+def _write_json(path: Path, rows: list[dict[str, Any]], question: Question, overwrite: bool) -> None:
     facts = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
     write_text(path, json.dumps({"queries": rows, **facts}, indent=2) + "\n", overwrite=overwrite)
 
 
-def _write_arrays(path: Path, answer: Answer, overwrite: bool) -> None:
+def _write_arrays(path: Path, found: QuickAnswer, overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
-    tensors = {
-        "relevancy": answer.relevancy,
-        "reliability": answer.field.scalars.reliability,
-        "valid": answer.valid,
+    arrays: dict[str, Any] = {
+        "relevancy": found.relevancy,
+        "reliability": found.field.arrays["reliability"],
+        "valid": found.valid,
     }
-    arrays: dict[str, Any] = {name: value.numpy() for name, value in tensors.items()}
     with new_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
-        np.savez(file, names=np.array(answer.texts), **arrays)
-
-
-def _table(rows: list[dict[str, Any]], rule: str) -> Table:
-    table = Table(title=f"Selected: {rule}")
-    for name in ("text", "Gaussians", "centroid", "extent", "peak relevancy", "mean reliability"):
-        table.add_column(name, justify="left" if name == "text" else "right")
-    for row in rows:
-        vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
-        numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
-        table.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers)
-    return table
+        np.savez(file, names=np.array(found.question.texts), **arrays)
 
 
 def entrypoint() -> None:

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -76,7 +76,7 @@ def _ended(command: type[Command]) -> int:
         return USER if code == 2 else code
     except (KeyboardInterrupt, Terminated) as stop:
         word, number = ("Interrupted", signal.SIGINT) if isinstance(stop, KeyboardInterrupt) else _TERMINATED
-        _say_error(f"{word}. No partial files remain; rerun the command to resume.")
+        say_error(f"{word}. No partial files remain; rerun the command to resume.")
         return 128 + number
     except Exception as error:  # whatever it is: a traceback helps no user
         return _explained(error)
@@ -90,7 +90,7 @@ def _explained(error: Exception) -> int:
     message, code = (str(error), USER) if isinstance(error, OutputError) else explain(error)
     with suppress(OSError):
         ERRORS.rule("Error", style="red")
-    _say_error(message)
+    say_error(message)
     return code
 
 
@@ -100,7 +100,30 @@ def _run(command: type[Command]) -> None:
         return
     tyro.extras.set_accent_color("bright_yellow")
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
-    tyro.cli(flags, description=summary(command)).main()
+    words = with_values(sys.argv[1:], switches(command))
+    tyro.cli(flags, args=words, description=summary(command)).main()
+
+
+def switches(options: Any) -> set[str]:
+    """The flags that are True or False."""
+    found = set()
+    for name, hint in get_type_hints(options).items():
+        found |= switches(hint) if is_dataclass(hint) else {f"--{name.replace('_', '-')}"} if hint is bool else set()
+    return found
+
+
+def with_values(words: Sequence[str], flags: Collection[str]) -> list[str]:
+    """The words of a command line, with True behind every one of the flags that stands alone.
+
+    >>> with_values(["--save", "--text", "a", "--stdin"], {"--save", "--stdin"})
+    ['--save', 'True', '--text', 'a', '--stdin', 'True']
+    """
+    found = []
+    for word, following in zip(words, [*words[1:], "--"]):
+        found.append(word)
+        if word.replace("_", "-") in flags and following.startswith("--"):
+            found.append("True")
+    return found
 
 
 def plain(value: object) -> Text:
@@ -113,7 +136,8 @@ def say(text: str) -> None:
     CONSOLE.print(plain(text), soft_wrap=True)
 
 
-def _say_error(text: str) -> None:
+def say_error(text: str) -> None:
+    """A message on standard error, as it is."""
     with suppress(OSError):  # nobody can be told
         ERRORS.print(Text(visible(text, keep="\n")), soft_wrap=True)
 
@@ -130,7 +154,7 @@ def _flushed(stream: TextIO | None, tell: bool) -> int:
             os.dup2(nowhere, cast(TextIO, stream).fileno())
             os.close(nowhere)
         if tell and not isinstance(error, BrokenPipeError):
-            _say_error(_CANNOT.format(error.strerror))
+            say_error(_CANNOT.format(error.strerror))
         return USER
 
 
@@ -199,7 +223,7 @@ def _plain_warnings() -> Iterator[None]:
 
         def show(message: Warning | str, category: type[Warning], filename: str, *rest: Any, **more: Any) -> None:
             if filename.startswith(_PACKAGE):
-                _say_error(f"Warning: {message}")
+                say_error(f"Warning: {message}")
             else:
                 others(message, category, filename, *rest, **more)
 

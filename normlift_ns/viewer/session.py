@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from normlift_ns.asking import Answer, answer, reselect
-from normlift_ns.question import Question
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import file_name, numbered
 from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
+from normlift_ns.question import Question
 from normlift_ns.runs.question import save_question
 from normlift_ns.runs.splats import export_files, write_splats
 from normlift_ns.viewer.display import COLORMAPS, PARTS, Colormap, Display, Part, make_display, selection
@@ -120,7 +120,7 @@ class Session:
         met = int(weights.argmax())
         if float(weights[met]) == 0:
             return self, "There is nothing with semantics where you clicked."
-        vector = self.field.directions(torch.tensor([met], device=weights.device), refined=refined)
+        vector = self.field.directions(torch.tensor([met], device=weights.device), refined=refined).cpu().numpy()
         question = Question((CLICKED,), vector, threshold=_ALIKE, min_reliability=min_reliability, refined=refined)
         reliability = float(self.field.scalars.reliability[met])
         return self.ask(question), f"Clicked Gaussian {met}, reliability {reliability:.2f}."

@@ -2,6 +2,7 @@
 
 import random
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from safetensors import SafetensorError
 
 from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
 from normlift_ns.encoders.batches import Batches
-from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, CachedTexts
+from normlift_ns.encoders.cache import CachedEncoder, CachedRegions
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid, LabelFiles
 from normlift_ns.encoders.source import each_view
+from normlift_ns.encoders.texts.kept import ClipTexts
 from tests.encoders.tiny import CLIP, write_clip
 
 IMAGE = torch.randint(0, 256, (20, 30, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
@@ -231,26 +233,31 @@ def unusable(encoder: OpenClipEncoder) -> OpenClipEncoder:
     return copy
 
 
+def kept_texts(encoder: OpenClipEncoder, folder: Path | None) -> ClipTexts:
+    return ClipTexts(encoder.model, encoder.pretrained, encoder.template, lambda: encoder, folder)
+
+
 def test_texts_asked_again_need_no_network(clip, tmp_path):
     prompts = ["a red mug", "table", "a red mug"]
-    expected = CachedTexts(clip, tmp_path / "texts").text(prompts)
+    expected = kept_texts(clip, tmp_path / "texts").text(prompts)
     torch.testing.assert_close(expected, clip.text(prompts), rtol=0, atol=1e-6)
-    again = CachedTexts(unusable(clip), tmp_path / "texts")
+    again = kept_texts(unusable(clip), tmp_path / "texts")
     assert torch.equal(again.text(prompts), expected)
-    assert again.identity == clip.identity
+    assert (again.rows(prompts) == expected.numpy()).all()
+    assert torch.equal(kept_texts(clip, None).text(prompts), clip.text(prompts))
     with pytest.raises(AttributeError):
         again.text(["chair"])
     for change in ({"template": "a {}"}, {"pretrained": clip.pretrained.replace(".pt", ".safetensors")}):
         with pytest.raises(AttributeError):
-            CachedTexts(unusable(replace(clip, **change)), tmp_path / "texts").text(["table"])
+            kept_texts(unusable(replace(clip, **change)), tmp_path / "texts").text(["table"])
 
 
 def test_texts_of_a_folder_that_cannot_be_written_to(clip, tmp_path):
     (tmp_path / "file").write_text("")
-    rows = CachedTexts(clip, tmp_path / "file" / "texts").text(["table"])
+    rows = kept_texts(clip, tmp_path / "file" / "texts").text(["table"])
     assert torch.equal(rows, clip.text(["table"]))
     with pytest.raises(ValueError, match="text 1 of 1 is empty"):
-        CachedTexts(clip, tmp_path).text([" "])
+        kept_texts(clip, tmp_path).text([" "])
 
 
 def test_patches_seen_before_need_no_network(clip, tmp_path):
@@ -302,7 +309,7 @@ def test_every_flipped_bit_of_an_entry_is_noticed(counted, tmp_path):
 
 
 def test_a_text_under_the_name_of_another_is_encoded_again(clip, tmp_path):
-    texts = CachedTexts(clip, tmp_path)
+    texts = kept_texts(clip, tmp_path)
     mug, table = texts.text(["mug"]), texts.text(["table"])
     first, second = tmp_path.iterdir()
     content = first.read_bytes()

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from matplotlib.colors import XKCD_COLORS, to_rgb
 from skimage.color import lab2rgb, rgb2lab
 
-from normlift_ns.encoders.colour import SIGMA, ColourEncoder, colour_names, embed, shading_coordinates
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.texts import colours as space
+from normlift_ns.encoders.texts.colours import SIGMA, colour_names
 
 COLOUR = ColourEncoder()
 rgb = st.tuples(*[st.floats(0, 1, width=32)] * 3)
@@ -17,6 +19,14 @@ rgb = st.tuples(*[st.floats(0, 1, width=32)] * 3)
 
 def lab(colours) -> torch.Tensor:
     return torch.from_numpy(rgb2lab(torch.as_tensor(colours, dtype=torch.float64).numpy()))
+
+
+def embed(colours: torch.Tensor) -> torch.Tensor:
+    return torch.from_numpy(space.embed(colours.numpy()))
+
+
+def shading_coordinates(colours: torch.Tensor) -> torch.Tensor:
+    return torch.from_numpy(space.shading_coordinates(colours.numpy()))
 
 
 def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch
 from normlift_ns.encoders import RegionFeatures, SourceOptions, ViewFeatures, make_source
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
-from normlift_ns.encoders.source import check_prompts
+from normlift_ns.encoders.texts.prompts import check_prompts
 
 UNIT = torch.nn.functional.normalize(torch.arange(1.0, 7.0).reshape(2, 3), dim=1)
 

@@ -12,10 +12,10 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns import asking
-from normlift_ns.question import Question
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
+from normlift_ns.question import Question
 from normlift_ns.raster import reference
 from normlift_ns.raster.backend import TileBackend
 from normlift_ns.raster.rasterize import render, render_picture

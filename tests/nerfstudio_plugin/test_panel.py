@@ -22,14 +22,14 @@ from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerElement
 from plyfile import PlyData
 
-from normlift_ns.text_encoders import ENCODER_KEYS
-from normlift_ns.question import Question
 from normlift_ns.asking import answer
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.options import SourceOptions
+from normlift_ns.question import Question
 from normlift_ns.runs.question import load_question
+from normlift_ns.text_encoders import ENCODER_KEYS
 from normlift_ns.viewer.session import MOST_PROMPTS
 from tests.nerfstudio_plugin.conftest import lifted_field, write
 from tests.nerfstudio_plugin.stock_run import StockRun

@@ -18,8 +18,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from normlift_ns.asking import answer
-from normlift_ns.text_encoders import encoder_of
-from normlift_ns.question import make_question
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.errors import InputError
@@ -30,7 +28,9 @@ from normlift_ns.method_configs.scannet import scannet_method
 from normlift_ns.nerfstudio_plugin import pipeline as module
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.question import make_question
 from normlift_ns.runs.question import load_question
+from normlift_ns.text_encoders import encoder_of
 from tests.nerfstudio_plugin.conftest import field_of
 from tests.nerfstudio_plugin.stock_run import HEIGHT, WIDTH, StockRun, train_splatfacto
 
@@ -91,7 +91,7 @@ def test_the_run_is_lifted_in_place(train: Callable[..., StockRun], registered: 
     question = load_question(run_dir / "normlift")
     assert question is not None
     assert question.texts == ("red", "sky blue")
-    expected = answer(field, run.gaussians.means, make_question(field, encoder_of(field), ["red", "sky blue"]))
+    expected = answer(field, run.gaussians.means, make_question(field, encoder_of(field).rows, ["red", "sky blue"]))
 
     model = trained.trainer.pipeline.model  # the viewer of the training
     assert torch.equal(model.normlift.answer.relevancy, expected.relevancy)

@@ -12,11 +12,11 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from normlift_ns.core.query import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.evaluation import votes
 from normlift_ns.evaluation.scannet import NYU40
+from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.scripts import evaluate, lift
 from tests.scripts.conftest import run_entry, said
 

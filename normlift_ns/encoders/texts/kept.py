@@ -1,4 +1,4 @@
-"""Texts that a network of OpenCLIP has read before, kept on disk: asked again, they need neither the network nor torch."""
+"""Texts that a network of OpenCLIP has read before: asked again, they need neither the network nor torch."""
 
 from __future__ import annotations
 
@@ -75,12 +75,17 @@ class ClipTexts:
     def _encoder(self) -> TextEncoder:
         return self.network()
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Every setting that changes `text`."""
+        return self._identity
+
     @cached_property
-    def _identity(self) -> dict[str, str]:
+    def _identity(self) -> dict[str, Any]:
         return text_identity(self.model, self.pretrained, self.template)
 
     def _path(self, prompt: str) -> Path | None:
-        return None if self.folder is None else cache_path(self.folder, self._identity, prompt.encode())
+        return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())
 
     def _kept(self, prompt: str) -> Float32[np.ndarray, " d"] | None:
         """None also where the file is damaged, or holds no unit vector."""
@@ -99,7 +104,7 @@ class ClipTexts:
             save_arrays(path, {_TEXT: row}, key=path.stem, overwrite=True)
 
 
-def text_identity(model: str, pretrained: str, template: str) -> dict[str, str]:
+def text_identity(model: str, pretrained: str, template: str) -> dict[str, Any]:
     """Every setting of an OpenCLIP model that changes what it makes of a text."""
     weights = file_digest(Path(pretrained)) if os.path.isfile(pretrained) else pretrained
     return {"model": model, "pretrained": weights, "template": template}

@@ -1,0 +1,188 @@
+"""Questions without torch: the same answers as with it, from files alone."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from prompt_toolkit.application import create_app_session
+from prompt_toolkit.input import create_pipe_input
+from prompt_toolkit.output import DummyOutput
+
+from normlift_ns import InputError, SemanticField, asking, open_run, quick
+from normlift_ns.core.disk.field_file import read_field
+from normlift_ns.question import Question
+from normlift_ns.scripts import query
+from normlift_ns.scripts.prompting import answer_lines, converse
+from tests.core.test_field import FORMS, D, example
+from tests.scenes import unit_rows
+from tests.scripts.conftest import run_entry, said
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 50),
+    form=st.sampled_from(FORMS),
+    rule=st.sampled_from(["cosine", "lerf", "margin"]),
+    refined=st.booleans(),
+    min_reliability=st.sampled_from([0.0, 0.2, 0.9]),
+)
+def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
+    lifted, means, source = example(seed)
+    field = SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)
+    vectors, negatives = (100 * unit_rows(count, D, seed + 7).float().numpy() for count in (3, 2))
+    question = Question(
+        ("a", "b", "c"), vectors, ("d", "e"), negatives, rule, 0.1, min_reliability=min_reliability, refined=refined
+    )
+    expected = asking.answer(field, means, question)
+    with tempfile.TemporaryDirectory() as folder:
+        field.save(folder)
+        found = quick.answer(read_field(Path(folder)), question)
+    np.testing.assert_allclose(found.relevancy, expected.relevancy.numpy(), rtol=0, atol=2e-6)
+    assert np.array_equal(found.valid, expected.valid.numpy())
+    near = np.abs(expected.relevancy.numpy() - 0.1) < 2e-6
+    assert np.array_equal(found.selected | near, expected.selected.numpy() | near)
+    if not near.any():
+        for ours, theirs in zip(found.summarize(), asking.summarize(expected), strict=True):
+            assert set(ours) == set(theirs)
+            for name, value in ours.items():
+                assert value == (pytest.approx(theirs[name], abs=1e-5) if value is not None else None), name
+
+
+def test_vectors_of_another_encoder_are_refused(tmp_path):
+    lifted, means, source = example()
+    SemanticField.build(lifted, means, source).save(tmp_path)
+    with pytest.raises(InputError, match=rf"must be \[Q, {D}\].*got \(1, 3\)"):
+        quick.answer(read_field(tmp_path), Question(("a",), np.ones((1, 3), np.float32)))
+
+
+BLOCK = """
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name in ("torch", "nerfstudio", "open_clip"):
+            raise AssertionError(f"{name} is imported")
+
+sys.meta_path.insert(0, Blocked())
+from normlift_ns.scripts.query import entrypoint
+entrypoint()
+"""
+
+
+def ask(*flags: object, stdin: str = "") -> subprocess.CompletedProcess[str]:
+    """ns-normlift-query where neither torch nor nerfstudio can be imported."""
+    words = [sys.executable, "-c", BLOCK, *map(str, flags)]
+    return subprocess.run(words, input=stdin, capture_output=True, text=True, check=False)
+
+
+def test_colours_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
+    outputs = ("--json", tmp_path / "a.json", "--output-path", tmp_path / "a.npz", "--save")
+    done = ask("--load-config", lifted, "--text", "red", "sky blue", *outputs)
+    assert done.returncode == 0, done.stderr
+    assert "sky blue" in done.stdout
+    rows = json.loads((tmp_path / "a.json").read_text())["queries"]
+    run = open_run(lifted)
+    expected = run.ask("red", "sky blue")
+    for row, other in zip(rows, asking.summarize(expected), strict=True):
+        assert row == {key: pytest.approx(value, abs=1e-5) for key, value in other.items()}
+    stored = run.ask_stored()
+    assert stored is not None and stored.texts == ("red", "sky blue")
+    assert torch.equal(stored.relevancy, expected.relevancy)
+
+
+def test_given_texts_need_neither(lifted, tmp_path):
+    np.savez(tmp_path / "t.npz", fox=np.ones(343, np.float32))
+    done = ask("--load-config", lifted, "--text", "fox", "--text-vectors", tmp_path / "t.npz")
+    assert done.returncode == 0, done.stderr
+
+
+def test_lines_become_lines_of_json(lifted):
+    done = ask("--load-config", lifted, "--stdin", stdin="red\n\n  wooden  \nsky blue\n")
+    assert done.returncode == 1
+    red, wooden, blue = map(json.loads, done.stdout.splitlines())
+    assert red["text"] == "red" and 0.005 < red["fraction"] < 0.1 and red["rule"] == "cosine"
+    assert "no colour name" in wooden["error"]
+    assert blue["threshold"] == 0.5
+    assert "1 lines could not be answered" in done.stderr
+    whole = ask("--load-config", lifted, "--text", "red")
+    assert f"{red['fraction']:.2%}" in whole.stdout
+    assert ask("--load-config", lifted, "--stdin", "True", stdin="red\n").returncode == 0
+
+
+def test_lines_are_answered_as_they_come(lifted, monkeypatch):
+    run, shown = quick.open_quick(lifted), io.StringIO()
+    monkeypatch.setattr(sys, "stdout", shown)
+
+    def lines():
+        for number, text in enumerate([b"red\n", "blau\xff".encode("latin1"), b"blue"]):
+            assert len(shown.getvalue().splitlines()) == number
+            yield text
+
+    assert run is not None
+    with pytest.raises(InputError, match="1 lines"):
+        answer_lines(run, {}, lines())
+
+
+def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    run = quick.open_quick(lifted)
+    assert run is not None
+    with create_pipe_input() as typed, create_app_session(input=typed, output=DummyOutput()):
+        typed.send_text("red\nwooden\n \nsky blue\n\x04")
+        converse(run, {}, keep_history=True)
+        shown = said(capsys)
+        assert "red" in shown and "sky blue" in shown and "no colour name" in shown
+        history = tmp_path / "normlift_ns" / "history"
+        assert stat.S_IMODE(history.stat().st_mode) == 0o600
+        before = history.read_text()
+        assert "+wooden" in before
+        typed.send_text("yellow\n\x04")
+        converse(run, {}, keep_history=False)
+        assert history.read_text() == before
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+        typed.send_text("yellow\n\x04")
+        converse(run, {}, keep_history=True)  # no place for it
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ((), "no text given"),
+        (("--text", "a", "--stdin"), "--text and --stdin are two ways to give texts"),
+        (("--stdin", "--interactive", "True"), "--stdin and --interactive are two ways"),
+        (("--stdin", "--json", "a.json"), "--json stores the answer to --text; leave it out with --stdin"),
+        (("--interactive", "--save"), "--save stores the answer to --text; leave it out with --interactive"),
+        (("--interactive",), "--interactive needs a terminal"),
+    ],
+)
+def test_ways_to_ask_that_do_not_fit(flags, message, lifted, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
+    assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, *flags) == 1
+    assert message in said(capsys)
+
+
+def test_a_run_with_another_checkpoint_is_opened_whole(lifted, tmp_path):
+    """Its own files do not tell then which one the scene is."""
+    copy = shutil.copytree(lifted.parent, tmp_path / "run")
+    assert quick.open_quick(copy / "config.yml") is not None
+    (checkpoint,) = (copy / "nerfstudio_models").iterdir()
+    os.link(checkpoint, copy / "nerfstudio_models" / "step-000099999.ckpt")
+    assert quick.open_quick(copy / "config.yml") is None
+    means = torch.zeros(3, 3).numpy()
+    opened = quick.open_quick(copy / "config.yml", means=means)
+    assert opened is not None and opened.field.arrays["means"] is means
