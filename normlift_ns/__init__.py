@@ -63,7 +63,7 @@ _HOMES = {
         "RefineConfig",
         "SourceOptions",
         "SplatOptions",
-    ),  # fmt: skip
+    ),
     "raster.rasterize": ("rasterize_evidence", "render"),
     "raster.settings": ("RasterSettings",),
     "scenes.opening": ("open_splat",),

@@ -19,6 +19,10 @@ class InputError(ValueError):
     """
 
 
+class OutputError(Exception):
+    """Standard output takes no more. No OSError, which loaders take for one of the file that they read."""
+
+
 def visible(text: str, keep: str = "") -> str:
     r"""The text with escapes in place of characters that are not printed themselves, so that nothing in it moves the
     cursor, hides or turns around.

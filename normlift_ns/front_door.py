@@ -105,14 +105,18 @@ def open_run(
 
 
 def cameras_changed(field: SemanticField, scene: Scene) -> str | None:
-    """A warning where the training cameras are not those of the lift; None also for fields that do not know them."""
-    known = field.manifest.get("cameras")
-    if known is None or not cameras_differ(known, camera_summary(scene.train.cameras)):
+    """A warning where the cameras are not those of the lift; None also for fields that do not know them."""
+    changed = [
+        what
+        for what, key, views in (("training", "cameras", scene.train), ("held-out", "cameras_held_out", scene.held_out))
+        if (known := field.manifest.get(key)) is not None and cameras_differ(known, camera_summary(views.cameras))
+    ]
+    if len(changed) == 0:
         return None
     return (
-        f"the training cameras of {scene.name} are not those that the run was lifted with: the data set has changed "
-        "since. Answers are those of the lift, but pictures and evaluations use the new cameras; restore the data set, "
-        "say where it is with --data, or lift again"
+        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the data set "
+        "has changed since. Answers are those of the lift, but pictures and evaluations use the new cameras; restore "
+        "the data set, say where it is with --data, or lift again"
     )
 
 

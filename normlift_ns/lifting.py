@@ -90,7 +90,8 @@ def lift_scene(
         provenance = {
             **scene.identity,
             "encoder": dict(encoder),
-            "cameras": camera_summary(views.cameras),
+            "cameras": camera_summary(scene.train.cameras),
+            "cameras_held_out": camera_summary(scene.held_out.cameras),
             "features": source.identity,
             "options": asdict(options),
             "statistics": {**counts, **_statistics(lifted.scalars), **shares},

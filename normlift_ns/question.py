@@ -12,7 +12,7 @@ from jaxtyping import Float
 from normlift_ns.errors import InputError
 from normlift_ns.options import THRESHOLDS, Rule
 from normlift_ns.ranges import check_bool, check_number, shown
-from normlift_ns.text_encoders import Field, default_negatives
+from normlift_ns.text_encoders import Field, default_negatives, encoder_digest
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,8 @@ class Question:
     """Minimum R of a selected Gaussian, in 0..1."""
     refined: bool = True
     """Use refined features."""
+    encoder: str | None = None
+    """Digest of the encoder that made the vectors, see `encoder_digest`; None: nobody knows."""
 
     def __post_init__(self) -> None:
         for name in ("vectors", "negative_vectors"):
@@ -84,4 +86,5 @@ def make_question(
         threshold=THRESHOLDS[rule] if threshold is None else threshold,
         min_reliability=min_reliability,
         refined=refined,
+        encoder=encoder_digest(field.manifest),
     )

@@ -4,13 +4,14 @@ network, and for nothing else.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, get_args
 
-from normlift_ns.core.disk.digests import file_digest
+from normlift_ns.core.disk.digests import file_digest, text_digest
 from normlift_ns.encoders.texts.colours import ColourTexts, refuse_template
 from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.encoders.texts.kept import ClipTexts
@@ -84,7 +85,13 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
     if not field.manifest.get(_CHOSEN):
         _check_files(field.manifest.get("features"), options)
     if options.text_vectors is not None:
-        return TextVectors(options.text_vectors)
+        vectors = TextVectors(options.text_vectors)
+        if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
+            raise InputError(
+                f"the vectors in {vectors.file} have {vectors.dimension} numbers, the features of the run "
+                f"{field.manifest['dimension']}; give texts with vectors of the network that made them (--text-vectors)"
+            )
+        return vectors
     if options.encoder == "colour":
         refuse_template(options.text_template)
         return ColourTexts()
@@ -99,6 +106,14 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
     return ClipTexts(options.encoder_model, options.encoder_pretrained, options.text_template, network, cache)
 
 
+def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
+    """Tells the encoder of one field from that of another; None where the manifest does not name it."""
+    features = manifest.get("features")
+    if not isinstance(features, Mapping) or len(features) == 0:
+        return None
+    return text_digest(json.dumps(features.get("texts", features.get("encoder", features)), sort_keys=True))
+
+
 def _check_files(features: object, options: SourceOptions) -> None:
     """Makes sure that the files of the encoder have the content that they had in the lift, by its digests in the
     manifest. Files are read whole at every use.
@@ -111,6 +126,8 @@ def _check_files(features: object, options: SourceOptions) -> None:
     texts = texts if isinstance(texts, Mapping) else {}
     if options.text_vectors is not None:
         path, expected, found = options.text_vectors, texts.get("content"), ""
+        if os.path.lexists(path) and not path.is_file():
+            raise InputError(f"the run's file of text vectors {path} is no file any more; {remedy}")
         if not path.is_file():
             raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
         if isinstance(expected, str):
@@ -119,6 +136,8 @@ def _check_files(features: object, options: SourceOptions) -> None:
         path, expected, found = Path(options.encoder_pretrained), texts.get("pretrained"), options.encoder_pretrained
         if path.is_file():
             found = file_digest(path, like=str(expected))
+        elif isinstance(expected, str) and expected.startswith(_OF_FILES) and os.path.lexists(path):
+            raise InputError(f"weight file {path}, with which the run was lifted, is no file any more; {remedy}")
         elif isinstance(expected, str) and expected.startswith(_OF_FILES):
             raise FileNotFoundError(f"weight file {path}, with which the run was lifted, does not exist; {remedy}")
     else:

@@ -165,7 +165,12 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.open_run(trained)
 
 
-@pytest.mark.parametrize("change", ["focal", "order", "poses", "one pose"])
+def _held_out(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """Two frames that are kept for evaluation."""
+    return [frame for frame in content["frames"] if frame["file_path"] in content["test_filenames"]][:2]
+
+
+@pytest.mark.parametrize("change", ["focal", "order", "poses", "one pose", "held out"])
 def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_path: Path, change: str) -> None:
     room = tmp_path / "room"
     shutil.copytree(lifted.parents[4] / "room", room)
@@ -177,14 +182,15 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
     frames = content["frames"]
     if change == "focal":
         content["fl_x"] *= 1.003
-    elif change == "order":
-        first, second = frames[1], frames[2]
+    elif change in ("order", "held out"):
+        first, second = (frames[1], frames[2]) if change == "order" else _held_out(content)
         first["transform_matrix"], second["transform_matrix"] = second["transform_matrix"], first["transform_matrix"]
     else:
         for frame in frames[1 : 2 if change == "one pose" else None]:
             frame["transform_matrix"][0][3] += 4e-4
     file.write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match="the training cameras of .* are not those that the run was lifted with"):
+    changed = {"held out": "held-out", "order": "training"}.get(change, "training and held-out")
+    with pytest.warns(UserWarning, match=f"the {changed} cameras of .* are not those that the run was lifted with"):
         nl.open_run(lifted, data=room)
 
 

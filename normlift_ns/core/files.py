@@ -6,23 +6,25 @@ its temporary folder as long as it lives, so that the next one can tell what is 
 
 from __future__ import annotations
 
-import json
 import os
+import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 from safetensors import SafetensorError
 
 from normlift_ns.core.disk.atomic import exchange, held, hold, release, rename_new
+from normlift_ns.core.disk.journal import complete, write_journal
 from normlift_ns.errors import InputError
 
-_TEMPORARY, _JOURNAL = ".normlift-", ".journal"
+_TEMPORARY = ".normlift-"
+_OURS = re.compile(r"\.normlift-[0-9a-f]{16}")
+"""Names of temporary folders."""
 _RUN_FILES = {"config.yml", "dataparser_transforms.json", "splat.json", "transforms.json"}
 _RUN_FILES |= {"nerfstudio_models", "normlift"}
 _AGE = 86400
@@ -118,7 +120,7 @@ def _take_places(temporary: Path, drafts: Sequence[Path], overwrite: bool, remov
     if len(drafts) + len(remove) > 1:
         clean(folder)  # an older export that was never completed must not be completed after this one
         names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
-        journal = _write_journal(temporary, names | {"overwrite": overwrite})
+        journal = write_journal(temporary, names | {"overwrite": overwrite})
     for draft in drafts:
         if overwrite:
             os.replace(draft, folder / draft.name)
@@ -133,40 +135,12 @@ def _take_places(temporary: Path, drafts: Sequence[Path], overwrite: bool, remov
 
 def _replace_in_steps(draft: Path, path: Path) -> None:
     old, temporary = f"{path.name}.old", draft.parent
-    _write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
+    write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
     try:
         os.rename(path, temporary / old)
         os.rename(draft, path)
     finally:
-        _complete(temporary)
-
-
-def _write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
-    """By hand: `new_files` would lock the folder, which is locked."""
-    unfinished, journal = temporary / "steps.json", temporary / f"steps{_JOURNAL}"
-    unfinished.write_text(json.dumps(steps), "utf8")
-    _flush(temporary)
-    os.rename(unfinished, journal)
-    _flush_names(temporary)
-    return journal
-
-
-def _complete(temporary: Path) -> None:
-    """Completes, or undoes, what a journal says is under way."""
-    for journal in temporary.glob(f"*{_JOURNAL}"):
-        steps, folder = json.loads(journal.read_text("utf8")), temporary.parent
-        if "place" in steps:
-            place = folder / Path(steps["place"]).name
-            for name in (steps["new"], steps["old"]):
-                if not os.path.lexists(place) and (temporary / Path(name).name).exists():
-                    os.rename(temporary / Path(name).name, place)
-            continue
-        for name in (Path(name).name for name in steps["files"]):
-            if (temporary / name).exists() and (steps["overwrite"] or not os.path.lexists(folder / name)):
-                os.replace(temporary / name, folder / name)
-        for name in steps["remove"]:
-            (folder / Path(name).name).unlink(missing_ok=True)
-        journal.unlink()
+        complete(temporary)
 
 
 def clean(folder: Path) -> None:
@@ -175,13 +149,13 @@ def clean(folder: Path) -> None:
     What a running process writes is left alone.
     """
     for temporary in folder.glob(f"{_TEMPORARY}*"):
-        with suppress(
-            OSError, ValueError, LookupError, TypeError
-        ):  # a process holds it, it is another user's or no journal
+        if _OURS.fullmatch(temporary.name) is None or temporary.is_symlink():
+            continue
+        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):  # a process holds it, or no journal
             descriptor = hold(temporary)
             try:
-                _complete(temporary)
-                if descriptor is not None or time.time() - temporary.stat().st_mtime > _AGE:
+                ours = complete(temporary)
+                if ours and (descriptor is not None or time.time() - temporary.stat().st_mtime > _AGE):
                     shutil.rmtree(temporary, ignore_errors=True)
             finally:
                 release(descriptor)
@@ -199,7 +173,7 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             yield temporary
         finally:
             try:
-                _complete(temporary)
+                complete(temporary)
                 shutil.rmtree(temporary, ignore_errors=True)
             finally:
                 release(descriptor)
@@ -209,7 +183,9 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             reason = reason.replace(f"{temporary}{os.sep}", f"{folder}{os.sep}")
         if not isinstance(error, NotWrittenError):
             names = ", ".join(map(str, paths))
-            reason = f"{names} cannot be written ({reason}); free disk space or choose another folder, then run again"
+            blocked = isinstance(error, IsADirectoryError | NotADirectoryError | FileExistsError)
+            remedy = "delete what is in its place" if blocked else "free disk space or choose another folder"
+            reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
         raise NotWrittenError(reason) from error
 
 

@@ -73,3 +73,10 @@ def _opened(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Image.I
             f"{what} {path} is damaged or no picture ({error}); expected a file that Pillow can decode, such as "
             f"{formats[0]}: replace it"
         ) from error
+
+
+def grey_depth(path: Path) -> int | None:
+    """Bits per pixel of a grey PNG; None of other files. Pillow stretches the values of 2 and 4 bits to 0..255."""
+    with path.open("rb") as file:
+        head = file.read(26)
+    return head[24] if head.startswith(b"\x89PNG") and len(head) == 26 and head[25] == 0 else None

@@ -14,11 +14,13 @@ from jaxtyping import Int32, UInt8
 from skimage.segmentation import slic
 from torch import Tensor
 
-from normlift_ns.encoders.images import read_pixels, read_size
+from normlift_ns.encoders.images import grey_depth, read_pixels, read_size
 from normlift_ns.encoders.npy import read_npy
 from normlift_ns.errors import InputError
 
 _SUFFIXES, _FORMATS = (".png", ".npy"), ("PNG",)
+_MOST_BYTES = 2**31
+"""Of a label map."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,12 @@ class LabelFiles:
         return () if self.level is None else (self.level,)
 
     def files(self, name: str) -> tuple[Path, ...]:
-        return (self.path(name),)
+        path = self.path(name)
+        if not path.is_file():
+            raise InputError(f"{self.what} {path} is no file; expected a PNG or NPY file with one value per pixel")
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{self.what} {path} has {path.stat().st_size:,} bytes, expected {_MOST_BYTES:,} at most")
+        return (path,)
 
     def path(self, name: str) -> Path:
         """The label map of an image.
@@ -190,6 +197,12 @@ class LabelFiles:
             found = read_npy(path, self.what)
         else:
             found = read_pixels(path, what=self.what, formats=_FORMATS)
+            depth = grey_depth(path)
+            if depth in (2, 4):
+                raise InputError(
+                    f"{self.what} {path} is a grey PNG of {depth} bits, whose values readers multiply by "
+                    f"{255 // (2**depth - 1)}; save it as grey of 8 or 16 bits, as a palette PNG, or as NPY"
+                )
         if found.ndim == 3 and path.suffix == ".png":
             raise InputError(
                 f"{self.what} {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "

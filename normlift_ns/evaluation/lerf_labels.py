@@ -89,7 +89,14 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
     for category, points, box in shapes:
         mask = masks.setdefault(category, np.zeros((height, width), np.uint8))
         scaled = points * scale
-        cv2.fillPoly(mask, [np.int32(scaled)], 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        drawn = np.zeros_like(mask)
+        cv2.fillPoly(drawn, [np.int32(scaled)], 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        if not drawn.any():
+            raise InputError(
+                f"{file}: a segmentation of {category!r} lies wholly outside of its image of {labelled[0]} x "
+                f"{labelled[1]} pixels; correct or remove it"
+            )
+        mask |= drawn
         low, high = (scaled.min(0), scaled.max(0)) if box is None else box * scale
         boxes.setdefault(category, []).append((low[0], low[1], high[0], high[1]))
     return LabeledFrame(file.stem, {name: torch.from_numpy(m).bool() for name, m in masks.items()}, boxes)

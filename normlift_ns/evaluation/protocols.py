@@ -157,7 +157,7 @@ def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
     if not bool((truth >= 0).any()):
         raise InputError(
             f"no Gaussian lies in a mask of {folder}: check that their values are those named in "
-            f"{options.names or folder.parent / 'labels.json'}, and --masks.purity and --masks.min-weight"
+            f"{options.names or folder.parent / 'labels.json'}, and --purity and --min-weight"
         )
     settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
     return MaskTruth(names.classes, truth, list(classes(scene.held_out)), settings)

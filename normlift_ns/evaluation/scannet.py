@@ -137,6 +137,12 @@ def evaluate_scannet(
             rule: [scene_scores(s, classes, min_opacity=min_opacity, without_direction=rule) for s in scenes]
             for rule in (without_direction, other)
         }
+        if all(math.isnan(score.miou) for score in scores[without_direction]):
+            names = ", ".join(scene.name for scene in scenes)
+            raise InputError(
+                f"nothing can be scored with {classes} classes: no Gaussian of {names} has a label "
+                f"among them and an opacity of at least {min_opacity:g} (--min-opacity)"
+            )
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
             results[f"macc_{classes}{suffix}"] = mean([s.macc for s in scores[rule]])

@@ -18,7 +18,7 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, OutputError
 from normlift_ns.nerfstudio_plugin.appearance import LOADED_STEP, background, shading_degree
 from normlift_ns.nerfstudio_plugin.config import RunLocation, locate, read_config, rerooted, stored_data
 from normlift_ns.nerfstudio_plugin.datasets import check_dataset
@@ -185,7 +185,11 @@ def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
             f"{error.filename} is missing from the dataset {data}. Expected the dataset that the run was trained with; "
             "say where it is with --data."
         ) from error
+    except OutputError:  # it prints while it reads
+        raise
     except (Exception, SystemExit) as error:  # whatever nerfstudio makes of a data set that it was not trained with
+        if isinstance(error.__context__, BrokenPipeError):  # nobody reads what it prints
+            raise
         raise InputError(
             f"nerfstudio cannot read the dataset {data} ({type(error).__name__}: {error}). Expected the dataset that "
             "the run was trained with; say where it is with --data."

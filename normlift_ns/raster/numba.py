@@ -5,6 +5,8 @@ reaches.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numba
 import numpy as np
@@ -21,6 +23,18 @@ _REACH_MARGIN = 1e-2
 """Added to the exponent at which alpha falls below min_alpha, so that rounding in a Gaussian's reach never costs a
 pixel.
 """
+
+
+def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit`, with what it compiles kept on disk where there is a place for that."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:  # neither beside the code nor in the user's cache
+            return numba.njit(**options)(function)
+
+    return decorate
 
 
 def view_evidence(
@@ -67,7 +81,7 @@ def _inputs(projected: Projected, settings: RasterSettings):
     return arrays, tuple(arrays[0].dtype.type(x) for x in limits)
 
 
-@numba.njit(cache=True)
+@_compiled()
 def _tile_labels(labels, tile, size, local, distinct):  # pragma: no cover (compiled)
     """Numbers the labels of a tile 0, 1, … in order of appearance; fills local[pixel] and distinct[number], returns
     how many.
@@ -88,7 +102,7 @@ def _tile_labels(labels, tile, size, local, distinct):  # pragma: no cover (comp
     return count
 
 
-@numba.njit(cache=True, parallel=True)
+@_compiled(parallel=True)
 def _count_labels(labels, size):  # pragma: no cover (compiled)
     height, width = labels.shape
     counts = np.empty(((height + size - 1) // size) * ((width + size - 1) // size), np.int64)
@@ -99,7 +113,7 @@ def _count_labels(labels, size):  # pragma: no cover (compiled)
     return counts
 
 
-@numba.njit(cache=True)
+@_compiled()
 def _splat(g, box, means2d, conics, opacities, transmittance, limits, pixels, weights):  # pragma: no cover (compiled)
     """Composites one Gaussian over the open pixels of a tile: their numbers and A_ij, how many, and how many closed.
 
@@ -148,14 +162,14 @@ def _splat(g, box, means2d, conics, opacities, transmittance, limits, pixels, we
     return drawn, closed
 
 
-@numba.njit(cache=True)
+@_compiled()
 def _tile_box(tile, height, width, size):  # pragma: no cover (compiled)
     columns = (width + size - 1) // size
     top, left = tile // columns * size, tile % columns * size
     return top, left, min(top + size, height), min(left + size, width), size
 
 
-@numba.njit(cache=True, parallel=True)
+@_compiled(parallel=True)
 def _fill_slots(  # pragma: no cover (compiled)
     offsets, members, means2d, conics, opacities, labels, first_slot, slots, power, size, limits
 ):
@@ -193,7 +207,7 @@ def _fill_slots(  # pragma: no cover (compiled)
                 slot += 1
 
 
-@numba.njit(cache=True, parallel=True)
+@_compiled(parallel=True)
 def _composite(  # pragma: no cover (compiled)
     offsets, members, means2d, conics, opacities, values, image, alpha, size, limits
 ):

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
 from normlift_ns.core.disk.arrays import check_array, load_arrays, save_arrays
+from normlift_ns.core.disk.manifest import MANIFEST, read_manifest
 from normlift_ns.errors import InputError
 from normlift_ns.options import Rule
 from normlift_ns.question import Question
+from normlift_ns.text_encoders import encoder_digest
 
 QUERIES_FILE = "queries.safetensors"
 """In the folder of the field: vectors, and everything else as JSON in the file's metadata."""
@@ -36,6 +38,7 @@ class _Facts(msgspec.Struct, forbid_unknown_fields=True):
     form: Rule
     threshold: float
     min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)]
+    encoder: str | None = None
 
 
 def save_question(folder: Path, question: Question) -> Path:
@@ -47,7 +50,7 @@ def save_question(folder: Path, question: Question) -> Path:
     """
     facts = _Facts(
         question.texts, question.negatives, question.refined, question.rule, question.threshold,
-        question.min_reliability,
+        question.min_reliability, question.encoder,
     )  # fmt: skip
     given = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
     arrays = {name: value.astype(np.float32) for name, value in given.items()}
@@ -75,7 +78,10 @@ def load_question(folder: Path) -> Question | None:
         arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
         if set(stored) != {_KEY}:
             raise InputError(f"its metadata has {sorted(stored)}, expected {_KEY}")
-        return _question(stored[_KEY], arrays)
+        question = _question(stored[_KEY], arrays)
+        if (folder / MANIFEST).exists():
+            _check_belongs(question, read_manifest(folder)[0])
+        return question
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
 
@@ -106,8 +112,17 @@ def _question(stored: str, arrays: dict[str, np.ndarray]) -> Question:
         _check_vectors("negative_vectors", negative, facts.negatives, size)
     return Question(
         facts.texts, arrays["vectors"], facts.negatives, negative, facts.form, facts.threshold,
-        facts.min_reliability, facts.refined,
+        facts.min_reliability, facts.refined, facts.encoder,
     )  # fmt: skip
+
+
+def _check_belongs(question: Question, manifest: Mapping[str, Any]) -> None:
+    """Raises ValueError where the vectors are of another encoder than the field beside them."""
+    size, known = question.vectors.shape[1], encoder_digest(manifest)
+    if size != manifest["dimension"]:
+        raise InputError(f"its vectors have {size} numbers, the features of the run {manifest['dimension']}")
+    if question.encoder is not None and known is not None and question.encoder != known:
+        raise InputError(f"its texts were read by another encoder ({question.encoder}) than that of the run ({known})")
 
 
 def _check_vectors(name: str, vectors: np.ndarray, texts: Sequence[str], size: int) -> None:

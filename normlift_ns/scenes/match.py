@@ -43,6 +43,8 @@ class Match(NamedTuple):
 
     psnr: float
     """Mean over the views, in dB."""
+    worst: tuple[str, float]
+    """The photograph that agrees least, and its PSNR in dB."""
     in_view: float
     """Largest share of the Gaussians that lie in a view, in 0..1."""
     grey_psnr: float
@@ -59,11 +61,12 @@ def match_photographs(scene: Scene) -> Match:
     """
     views = _some_views(scene)
     in_view = max(_share_in_view(scene, small.view.camera) for small in views)
-    plain = _mean_psnr(scene, views, 1.0)
+    each = {small.view.name: _psnr(small.view, _picture(scene, small, 1.0)) for small in views}
+    plain, worst = sum(each.values()) / len(each), min(each, key=lambda name: each[name])
     grey = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
     others = {factor: _mean_psnr(scene, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
     best = max(others, key=lambda factor: others[factor])
-    return Match(plain, in_view, grey, best if others[best] > plain + _FOCAL_GAIN else 1.0)
+    return Match(plain, (worst, each[worst]), in_view, grey, best if others[best] > plain + _FOCAL_GAIN else 1.0)
 
 
 def mean_psnr(scene: Scene) -> float:
@@ -112,6 +115,13 @@ def judge(match: Match, *, own_cameras: bool) -> str | None:
             f"Focal lengths that are {abs(match.focal - 1):.0%} {'longer' if match.focal > 1 else 'shorter'} fit the "
             f"photographs better by more than 1 dB. The cameras may not be those of the training: has their file "
             "changed since, or were the images rescaled?"
+        )
+    name, least = match.worst
+    if match.psnr >= LEAST_PSNR > least:
+        return (
+            f"The splat reaches only {least:.1f} dB on {name}, one of three photographs of its training that were "
+            f"looked at; {LEAST_PSNR:.0f} dB or more is usual. Was this photograph, or its camera, changed since the "
+            "training? Others may have been as well: only three are looked at."
         )
     if match.psnr < LEAST_PSNR:
         return (

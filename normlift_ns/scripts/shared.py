@@ -21,7 +21,7 @@ from rich.text import Text
 
 import normlift_ns
 from normlift_ns.core.crash import USER, explain
-from normlift_ns.errors import visible
+from normlift_ns.errors import OutputError, visible
 from normlift_ns.ranges import named_as_flags
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
@@ -43,10 +43,6 @@ class Command(Protocol):
 
 class Terminated(BaseException):
     """The system wants the process to end: SIGTERM, as before a pre-emption."""
-
-
-class OutputError(Exception):
-    """Standard output takes no more. No OSError, which loaders take for one of the file that they read."""
 
 
 def run_command(command: type[Command]) -> None:
@@ -139,7 +135,7 @@ def say(text: str) -> None:
 def say_error(text: str) -> None:
     """A message on standard error, as it is."""
     with suppress(OSError):  # nobody can be told
-        ERRORS.print(Text(visible(text, keep="\n")), soft_wrap=True)
+        ERRORS.print(Text(visible(text)), soft_wrap=True)
 
 
 def _flushed(stream: TextIO | None, tell: bool) -> int:

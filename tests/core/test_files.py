@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import os
 import resource
 import shutil
 import signal
+import stat
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +17,8 @@ import pytest
 import torch
 
 from normlift_ns.core import files
-from normlift_ns.core.disk import atomic
+from normlift_ns.core.disk import atomic, journal
+from normlift_ns.core.disk.journal import write_journal
 from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.core.files import (
     clean,
@@ -255,10 +259,10 @@ def test_files_that_belong_together_are_completed_after_a_kill(overwrite: bool, 
 
 def test_an_export_that_was_never_completed_is_not_completed_over_a_later_one(tmp_path: Path):
     paths = [tmp_path / "a", tmp_path / "b"]
-    left = tmp_path / ".normlift-dead"
+    left = tmp_path / f".normlift-{'dead' * 4}"
     left.mkdir()
     (left / "b").write_text("older")
-    (left / "steps.journal").write_text('{"files": ["a", "b"], "remove": [], "overwrite": true}')
+    write_journal(left, {"files": ["a", "b"], "remove": [], "overwrite": True})
     with new_files(*paths, overwrite=True) as drafts:
         for draft in drafts:
             draft.write_text("later")
@@ -294,13 +298,13 @@ def test_without_locks_only_old_leftovers_are_removed(tmp_path: Path, monkeypatc
     """As on Windows and on some network drives."""
     for module in (files, atomic):
         monkeypatch.setattr(module, "hold", lambda folder: None)
-    new, old, other = (tmp_path / name for name in (".normlift-1", ".normlift-2", ".other"))
+    new, old, other = (tmp_path / name for name in (f".normlift-{'1' * 16}", f".normlift-{'2' * 16}", ".other"))
     for folder in (new, old, other):
         folder.mkdir()
     os.utime(old, (0, 0))
     os.utime(other, (0, 0))
     write_text(tmp_path / "a.txt", "text")
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".normlift-1", ".other", "a.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [new.name, ".other", "a.txt"]
 
 
 def test_a_folder_that_another_program_has_locked_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -312,16 +316,87 @@ def test_a_folder_that_another_program_has_locked_can_be_written_to(tmp_path: Pa
 
 
 def test_a_journal_leads_nowhere_else(tmp_path: Path):
-    temporary = tmp_path / "runs" / ".normlift-1"
+    temporary = tmp_path / "runs" / f".normlift-{'1' * 16}"
     (temporary / "x").mkdir(parents=True)
-    (temporary / "a.journal").write_text('{"place": "../away", "new": "../../y", "old": "x"}')
-    (temporary / "b.journal").write_text("[]")
-    other = tmp_path / "runs" / ".normlift-2"
+    write_journal(temporary, {"place": "../away", "new": "../../y", "old": "x"})
+    other = tmp_path / "runs" / f".normlift-{'2' * 16}"
     other.mkdir()
     (other / "y").write_text("")
     (tmp_path / "kept").touch()
-    steps = '{"files": ["../../away", "../y"], "remove": ["../kept", "../../kept"], "overwrite": true}'
-    (other / "c.journal").write_text(steps)
+    write_journal(other, {"files": ["../../away", "../y"], "remove": ["../kept", "../../kept"], "overwrite": True})
     clean(tmp_path / "runs")
     assert not (tmp_path / "away").exists()
     assert {p.name for p in tmp_path.iterdir()} == {"runs", "kept"}
+    assert {p.name for p in (tmp_path / "runs").iterdir()} == {"away", "y"}
+
+
+STEPS = {"files": ["mine"], "remove": ["thesis"], "overwrite": True}
+
+
+@pytest.fixture
+def visited(tmp_path: Path) -> tuple[Path, Path]:
+    """A folder with two files of a user, and one that somebody sent, which looks like a leftover of ours."""
+    for name in ("mine", "thesis"):
+        (tmp_path / name).write_text("precious")
+    sent = tmp_path / f".normlift-{'a' * 16}"
+    sent.mkdir()
+    (sent / "mine").write_text("evil")
+    return tmp_path, sent
+
+
+@pytest.mark.parametrize("text", [json.dumps(STEPS), f"{'0' * 64}\n{json.dumps(STEPS)}", "[" * 200_000, "", "\0"])
+def test_a_journal_of_somebody_else_is_not_followed(text: str, visited: tuple[Path, Path]):
+    folder, sent = visited
+    (sent / "steps.journal").write_text(text)
+    with pytest.warns(UserWarning, match=f"{sent.name} holds files that another user"):
+        write_text(folder / "other", "")
+    assert [(folder / name).read_text() for name in ("mine", "thesis")] == ["precious"] * 2
+    assert (sent / "mine").read_text() == "evil"
+
+
+def test_a_journal_that_was_moved_is_not_followed(visited: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch):
+    folder, sent = visited
+    write_journal(sent, STEPS)
+    moved = sent.rename(folder / f".normlift-{'b' * 16}")
+    with pytest.warns(UserWarning, match="another machine"):
+        clean(folder)
+    moved.rename(sent)
+    with monkeypatch.context() as patch:
+        patch.setattr(journal, "_key", lambda: b"of another user")
+        with pytest.warns(UserWarning, match="another user"):
+            clean(folder)
+    assert (folder / "thesis").exists()
+    clean(folder)  # where it belongs
+    assert (folder / "mine").read_text() == "evil" and not (folder / "thesis").exists() and not sent.exists()
+
+
+def test_nothing_but_leftovers_of_ours_is_touched_and_nothing_makes_us_wait(visited: tuple[Path, Path]):
+    folder, sent = visited
+    for name in (".normlift-backup", ".normlift-0", f".normlift-{'A' * 16}"):
+        (folder / name).mkdir()
+        (folder / name / "notes").write_text("")
+    os.mkfifo(folder / f".normlift-{'c' * 16}")
+    (folder / f".normlift-{'d' * 16}").symlink_to(folder / ".normlift-backup")
+    os.mkfifo(sent / "steps.journal")
+    with pytest.warns(UserWarning, match="another user"):
+        clean(folder)
+    assert len(list(folder.iterdir())) == 8 and len(list(folder.glob("*/notes"))) == 4
+
+
+@pytest.mark.parametrize("state", ["new", "unwritable", "broken", "none"])
+def test_the_key_is_the_users_own(state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder, make = tmp_path / "state" / "normlift_ns", inspect.unwrap(journal._key)
+    if state == "unwritable":
+        (tmp_path / "state").write_text("")
+    if state == "broken":
+        folder.mkdir(parents=True)
+        (folder / "key").write_text("short")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    if state == "none":
+        monkeypatch.setattr(journal, "state_folder", lambda: None)
+    first, second = make(), make()
+    assert len(first) == len(second) == 32
+    assert (first == second) == (state == "new")
+    if state == "new":
+        assert stat.S_IMODE((folder / "key").stat().st_mode) == 0o600
+        assert [path.name for path in folder.iterdir()] == ["key"]

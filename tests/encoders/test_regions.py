@@ -1,5 +1,9 @@
 """Superpixels, grid and label files."""
 
+import os
+import struct
+import zlib
+
 import numpy as np
 import pytest
 import torch
@@ -99,6 +103,36 @@ def test_label_files_of_every_integer_type(tmp_path, file, write):
     labels = LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg")[0, 0]
     assert labels.dtype == torch.int32
     assert labels.tolist() == COMPACT
+
+
+@pytest.mark.parametrize("bits", [2, 4])
+def test_grey_of_few_bits_is_refused(tmp_path, bits):
+    """Readers multiply its values: 1 of 4 bits becomes 17."""
+    rows = np.array([[0, 1, 2], [3, 0, 1]], np.uint8)
+    packed = [b"\0" + np.packbits(np.unpackbits(row[:, None], axis=1)[:, -bits:].ravel()).tobytes() for row in rows]
+    head = struct.pack(">IIBBBBB", 3, 2, bits, 0, 0, 0, 0)
+    parts = [(b"IHDR", head), (b"IDAT", zlib.compress(b"".join(packed))), (b"IEND", b"")]
+    chunks = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    ]
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    assert np.array(Image.open(tmp_path / "a.png")).max() == 3 * 255 // (2**bits - 1)
+    with pytest.raises(ValueError, match=rf"a\.png is a grey PNG of {bits} bits, whose values readers multiply"):
+        LabelFiles(tmp_path).labels(IMAGE, "a.jpg")
+
+
+@pytest.mark.parametrize("suffix", ["png", "npy"])
+def test_what_is_no_file_makes_nobody_wait(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    for make in (lambda: os.mkfifo(path), path.mkdir, lambda: path.symlink_to(tmp_path / "nowhere")):
+        make()
+        with pytest.raises(ValueError, match=rf"label map .*a\.{suffix} is no file; expected a PNG or NPY file"):
+            LabelFiles(tmp_path).files("a.jpg")
+        path.rmdir() if path.is_dir() else path.unlink()
+    with path.open("wb") as file:
+        file.truncate(2**32)
+    with pytest.raises(ValueError, match="has 4,294,967,296 bytes, expected 2,147,483,648 at most"):
+        LabelFiles(tmp_path).files("a.jpg")
 
 
 def test_large_16_bit_ids_stay_apart(tmp_path):

@@ -49,6 +49,12 @@ def test_polygons_are_filled_joined_and_scaled(tmp_path):
         read_frame(file, 40, 40)
 
 
+def test_a_segmentation_outside_of_its_image_is_refused(tmp_path):
+    file = write_frame(tmp_path, "frame_3", [square("bowl", 4, 4), square("egg", -20, 3)])
+    with pytest.raises(ValueError, match=r"frame_3\.json: a segmentation of 'egg' lies wholly outside"):
+        read_frame(file, 40, 30)
+
+
 def test_files_that_do_not_fit(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no label files"):
         read_frames(tmp_path)

@@ -94,6 +94,12 @@ def test_opacity_absent_classes_and_missing_directions_by_hand():
     assert not any(math.isnan(value) for value in evaluation.results.values())
 
 
+def test_what_cannot_be_scored_is_refused():
+    scene = SceneLabels("s", torch.zeros(3, 19), torch.ones(3).bool(), torch.full((3,), 0.5), torch.tensor([1, 2, 3]))
+    with pytest.raises(ValueError, match=r"nothing can be scored with \d+ classes: no Gaussian of s .*--min-opacity"):
+        evaluate_scannet([scene], min_opacity=1)
+
+
 def write_labels(path, labels, name="label"):
     vertices = np.zeros(len(labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), (name, "u2")])
     vertices[name] = labels

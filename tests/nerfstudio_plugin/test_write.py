@@ -280,14 +280,15 @@ def test_what_a_killed_lift_left_is_cleaned_and_a_running_one_is_not(copied: Pat
     field = lifted_field(source)
     place = run_directory(source.runs_dir, source.name, "now")
     cache = cache_folder(place) / "features"
+    dead, live = (f".normlift-{name * 4}" for name in ("dead", "beef"))
     for folder in (place.parent, cache):
-        (folder / ".normlift-dead" / "now").mkdir(parents=True)
-        (folder / ".normlift-live" / "now").mkdir(parents=True)
-    held = [atomic.hold(folder / ".normlift-live") for folder in (place.parent, cache)]
+        (folder / dead / "now").mkdir(parents=True)
+        (folder / live / "now").mkdir(parents=True)
+    held = [atomic.hold(folder / live) for folder in (place.parent, cache)]
     try:
         write_run(source, field, place)
         left = [sorted(path.name for path in folder.glob(".normlift-*")) for folder in (place.parent, cache)]
-        assert left == [[".normlift-live"]] * 2
+        assert left == [[live]] * 2
     finally:
         for descriptor in held:
             atomic.release(descriptor)

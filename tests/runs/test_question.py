@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from safetensors.torch import save_file
 
 from normlift_ns import InputError
+from normlift_ns.core.disk.manifest import read_manifest, write_manifest
 from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.question import Question
 from normlift_ns.runs.question import load_question, save_question
+from normlift_ns.text_encoders import encoder_digest
 from tests.hostile import EXAMPLES, damaged, fuzz, hostile_json, no_files, survives
 
 WHOLE = Question(
@@ -97,6 +100,27 @@ def test_facts_have_their_types_and_ranges(changes: dict[str, object], message: 
     store(tmp_path, {**FACTS, **changes})
     with pytest.raises(InputError, match=rf"queries\.safetensors is damaged \(.*{message}.*--save True"):
         load_question(tmp_path)
+
+
+def test_a_question_of_another_run_is_refused(tmp_path: Path) -> None:
+    manifest = {"num_gaussians": 1, "means_fingerprint": "", "form": "float16", "schema_version": 1, "dimension": 3}
+    for name, weights in (("a", "first"), ("b", "second"), ("c", None)):
+        features = {} if weights is None else {"encoder": {"kind": "open_clip", "pretrained": weights}}
+        write_manifest(tmp_path / name, {**manifest, "features": features}, {})
+    first = encoder_digest(read_manifest(tmp_path / "a")[0])
+    path = save_question(tmp_path / "a", replace(WHOLE, encoder=first))
+    assert load_question(tmp_path / "a") is not None
+    for name in ("b", "c"):
+        shutil.copy(path, tmp_path / name)
+    with pytest.raises(InputError, match=r"queries\.safetensors is damaged .*read by another encoder"):
+        load_question(tmp_path / "b")
+    assert load_question(tmp_path / "c") is not None  # nobody knows
+    save_question(tmp_path / "b", WHOLE)  # of a click
+    assert load_question(tmp_path / "b") is not None
+    (tmp_path / "a" / "manifest.json").unlink()
+    write_manifest(tmp_path / "a", {**manifest, "dimension": 4}, {})
+    with pytest.raises(InputError, match="its vectors have 3 numbers, the features of the run 4"):
+        load_question(tmp_path / "a")
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,25 @@ def test_photographs_of_another_scene_are_refused(scene) -> None:
     assert "the training was stopped early" in warning
 
 
+def test_one_wrong_photograph_of_three_is_named(scene) -> None:
+    last = len(scene.train) - 1
+    for place in (0, last // 2, last):
+        name = scene.train[place].name
+        other = scene.train[(place + 1) % len(scene.train)].image
+
+        def black(view: View, name: str = name) -> View:
+            return view._replace(image=0 * view.image) if view.name == name else view
+
+        def exchanged(view: View, name: str = name, other: torch.Tensor = other) -> View:
+            return view._replace(image=other) if view.name == name else view
+
+        for change in (black, exchanged):
+            match = match_photographs(Changed(scene, change))
+            assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
+            warning = judge(match, own_cameras=True)
+            assert warning is not None and f"dB on {name}, one of three photographs" in warning
+
+
 def test_masked_pixels_do_not_count(scene) -> None:
     def hidden(view: View) -> View:
         image, mask = view.image.clone(), torch.ones(view.image.shape[:2], dtype=torch.bool)

@@ -34,7 +34,7 @@ def hold(folder: Path) -> int | None:
         return None
     import fcntl  # noqa: PLC0415 (Windows has none)
 
-    descriptor = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # a pipe would make it wait for ever
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -36,6 +36,7 @@ class _Facts(msgspec.Struct):
     encoder: dict[str, str | None] | None = None
     features: dict[str, Any] = {}
     cameras: list[float] | None = None
+    cameras_held_out: list[float] | None = None
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:

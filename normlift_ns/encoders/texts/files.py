@@ -65,6 +65,11 @@ class TextVectors:
         """
         return tuple(self._vectors)
 
+    @property
+    def dimension(self) -> int | None:
+        """D; None in an empty file. Raises as `names`."""
+        return next((len(vector) for vector in self._vectors.values()), None)
+
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """One unit row per prompt.
 
