@@ -21,18 +21,17 @@ from normlift_ns.selection import Selection
 class Answer:
     """What a field answers to Q texts. `answer["fox"]` is what it says of one of them; see `Finding`.
 
-        >>> import torch
-        >>> from normlift_ns import Evidence, SemanticField, lift
-        >>> from normlift_ns.question import Question
-    from normlift_ns.selection import Selection
-        >>> from normlift_ns.asking import answer
-        >>> from normlift_ns.core.evidence import Entries
-        >>> seen = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
-        >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-        >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
-        >>> found = answer(field, means, Question(("fox", "shield"), torch.eye(2)))
-        >>> found["fox"].mask.tolist(), found["shield"].relevancy.tolist(), found["shield"].centroid
-        ([True, False, False], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    >>> import torch
+    >>> from normlift_ns import Evidence, SemanticField, lift
+    >>> from normlift_ns.question import Question
+    >>> from normlift_ns.asking import answer
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
+    >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
+    >>> found = answer(field, means, Question(("fox", "shield"), torch.eye(2)))
+    >>> found["fox"].mask.tolist(), found["shield"].relevancy.tolist(), found["shield"].centroid
+    ([True, False, False], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
     """
 
     question: Question
@@ -83,20 +82,19 @@ class Answer:
 class Finding:
     """What a field says of one text. Places are in the scene's own units; None where nothing is selected.
 
-        Means are weighted by W_j, what the views saw of each Gaussian.
+    Means are weighted by W_j, what the views saw of each Gaussian.
 
-        >>> import torch
-        >>> from normlift_ns import Evidence, SemanticField, lift
-        >>> from normlift_ns.question import Question
-    from normlift_ns.selection import Selection
-        >>> from normlift_ns.asking import answer
-        >>> from normlift_ns.core.evidence import Entries
-        >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 2]), torch.tensor([3.0, 1.0, 1.0]), (2,))
-        >>> means = torch.tensor([[0.0, 0, 0], [4, 0, 0], [9, 9, 9]])
-        >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
-        >>> fox = answer(field, means, Question(("fox",), torch.tensor([[1.0, 0]])))["fox"]
-        >>> fox.mask.tolist(), [round(x, 3) for x in fox.centroid], fox.peak, fox.mean_reliability
-        ([True, True, False], [1.0, 0.0, 0.0], 1.0, 0.5)
+    >>> import torch
+    >>> from normlift_ns import Evidence, SemanticField, lift
+    >>> from normlift_ns.question import Question
+    >>> from normlift_ns.asking import answer
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 2]), torch.tensor([3.0, 1.0, 1.0]), (2,))
+    >>> means = torch.tensor([[0.0, 0, 0], [4, 0, 0], [9, 9, 9]])
+    >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
+    >>> fox = answer(field, means, Question(("fox",), torch.tensor([[1.0, 0]])))["fox"]
+    >>> fox.mask.tolist(), [round(x, 3) for x in fox.centroid], fox.peak, fox.mean_reliability
+    ([True, True, False], [1.0, 0.0, 0.0], 1.0, 0.5)
     """
 
     answer: Answer
