@@ -75,6 +75,7 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
     """The encoder of texts that fits the field.
 
     Args:
+        device: where a network runs, as `choose_device` takes it.
         cache: folder in which to keep vectors of texts that a network has read.
     Raises:
         ValueError: the manifest names none that this version knows, or other files of weights or text vectors are in
@@ -99,9 +100,10 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
         raise InputError(f"unknown encoder {options.encoder!r}; it is one of {', '.join(get_args(EncoderName))}")
 
     def network() -> Any:
-        from normlift_ns.encoders.build import make_texts  # noqa: PLC0415 (needs torch)
+        from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (needs torch)
+        from normlift_ns.encoders.build import make_texts  # noqa: PLC0415
 
-        return make_texts(options, device)
+        return make_texts(options, choose_device(device))
 
     return ClipTexts(options.encoder_model, options.encoder_pretrained, options.text_template, network, cache)
 

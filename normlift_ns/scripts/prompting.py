@@ -91,11 +91,16 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
 
 def show(rows: list[dict[str, Any]], question: Question) -> None:
     """Prints the table of an answer."""
-    table = Table(title=f"Selected: {question.rule} > {question.threshold:g}")
+    CONSOLE.print(table(rows, f"{question.rule} > {question.threshold:g}"))
+
+
+def table(rows: list[dict[str, Any]], rule: str) -> Table:
+    """The numbers of every text."""
+    made = Table(title=f"Selected: {rule}")
     for name in ("text", "Gaussians", "centroid", "extent", "peak relevancy", "mean reliability"):
-        table.add_column(name, justify="left" if name == "text" else "right")
+        made.add_column(name, justify="left" if name == "text" else "right")
     for row in rows:
         vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
         numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
-        table.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers)
-    CONSOLE.print(table)
+        made.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers)
+    return made

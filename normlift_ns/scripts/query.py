@@ -143,6 +143,8 @@ class NormLiftQuery:
         for name in ("json", "output_path", "render_dir", "save"):
             if ways != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} stores the answer to --text; leave it out with {ways[0]}")
+        if len(self.render_views) > 0 and self.render_dir is None:
+            raise InputError("--render-views has no effect without --render-dir; give the folder for the pictures")
         if self.interactive and not sys.stdin.isatty():
             raise InputError(
                 "--interactive needs a terminal to read from; to ask the lines of a file, use --stdin True"

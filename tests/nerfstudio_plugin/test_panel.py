@@ -44,7 +44,7 @@ class Words:
     def __init__(self) -> None:
         self.asked: list[list[str]] = []
 
-    def text(self, prompts: Any) -> torch.Tensor:
+    def rows(self, prompts: Any) -> torch.Tensor:
         self.asked.append(list(prompts))
         unknown = [p for p in prompts if p.split()[0] not in NAMES]
         if unknown:
@@ -254,10 +254,10 @@ class Slow(Words):
         super().__init__()
         self.reading, self.go_on = Event(), Event()
 
-    def text(self, prompts: Any) -> torch.Tensor:
+    def rows(self, prompts: Any) -> torch.Tensor:
         self.reading.set()
         assert self.go_on.wait(20)
-        return super().text(prompts)
+        return super().rows(prompts)
 
 
 @pytest.fixture

@@ -94,12 +94,14 @@ def test_a_query_replaces_nothing_unasked(output, lifted, tmp_path, monkeypatch,
     flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place)
     with monkeypatch.context() as patch:
         patch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
-        for views in ((), ("--render-views", "0002", "images/0003.png")):
+        named = ("--render-views", "0002", "images/0003.png") if output == "--render-dir" else ()
+        for views in ((), named):
             assert run_entry(patch, query.entrypoint, *flags, *views) == 1
             shown = said(capsys)
             assert f"{existing.name} exists; give another {output}, or --overwrite True." in shown
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
-    asked = (*flags, "--render-views", "0003", "--overwrite", True)
+    views = ("--render-views", "0003") if output == "--render-dir" else ()
+    asked = (*flags, *views, "--overwrite", True)
     assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
     assert existing.stat().st_size > 100
     assert len(list(tmp_path.iterdir())) == (2 if output == "--render-dir" else 1)
@@ -316,11 +318,15 @@ def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
     assert 0 < field.manifest["statistics"]["zero_evidence_share"] < 0.5
 
 
-def test_pictures_of_an_unknown_view_are_refused(lifted, monkeypatch, capsys):
-    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999")
+def test_pictures_of_an_unknown_view_are_refused(lifted, tmp_path, monkeypatch, capsys):
+    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999", "--json", tmp_path / "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
+    assert "--render-views has no effect without --render-dir" in said(capsys)
+    flags = (*flags, "--render-dir", tmp_path / "pictures")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     shown = said(capsys)
     assert "no training image '9999'; there are 12, from '0000' to '0011'" in shown
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_query_of_a_run_without_semantics_says_what_to_do(trained, monkeypatch, capsys):

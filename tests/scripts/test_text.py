@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from normlift_ns.errors import visible
-from normlift_ns.scripts import evaluate, export, lift, query, shared
+from normlift_ns.scripts import evaluate, export, lift, prompting, query, shared
 
 HOSTILE = [
     "[/red]",
@@ -53,7 +53,7 @@ def summary(text: str) -> Any:
 
 
 TABLES: dict[str, Callable[[str], Any]] = {
-    "query": lambda text: query._table([{"text": text, **NUMBERS}], "lerf > 0.5"),
+    "query": lambda text: prompting.table([{"text": text, **NUMBERS}], "lerf > 0.5"),
     "export": lambda text: export._table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
     "export nothing": lambda text: export._table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
     "eval rows": lambda text: evaluate.rows_table([{"class": text, "iou": 0.5}], "ablation"),
@@ -83,10 +83,10 @@ def test_tables_show_texts_as_they_are(name, text, stock):
 @pytest.mark.parametrize("text", HOSTILE)
 def test_lines_are_texts_too(text, capsys):
     shared.say(f"Written: {text}/{'long/' * 60}end")
-    shared._say_error(f"{text} does not exist")
+    shared.say_error(f"{text} does not exist")
     shown = capsys.readouterr()
     assert shown.out == f"Written: {visible(text)}/{'long/' * 60}end\n"
-    assert shown.err == "\n".join(map(visible, text.split("\n"))) + " does not exist\n"
+    assert shown.err == f"{visible(text)} does not exist\n"
 
 
 @pytest.mark.parametrize("text", HOSTILE[:5])

@@ -33,11 +33,13 @@ def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: 
     >>> tensor_digest(table, {}) == tensor_digest(table, {}, "key") or tensor_digest(table, {}) == tensor_digest({}, {})
     False
     """
-    parts = (
-        (name, str(x.dtype), x.shape, x.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-        for name, x in sorted(tensors.items())
-    )
+    parts = ((name, str(x.dtype), x.shape, _bytes(x) if x.numel() > 0 else b"") for name, x in sorted(tensors.items()))
     return digest_of(parts, facts, key)
+
+
+def _bytes(tensor: Tensor) -> memoryview:
+    flat = tensor.detach().cpu().reshape(-1).contiguous()
+    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single number may have any stride
 
 
 def save_tensors(
