@@ -23,7 +23,7 @@ def _torch() -> Backend:
 def _numba() -> Backend:
     from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
 
-    return TileBackend("numba", numba, on="cpu")
+    return numba
 
 
 def _gsplat() -> Backend:
