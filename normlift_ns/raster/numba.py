@@ -70,7 +70,13 @@ def _tiles(projected: Projected, camera: Camera, settings: RasterSettings) -> tu
     limits = tuple(number(x) for x in (settings.max_alpha, settings.min_alpha, settings.min_transmittance))
     radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
     lists = kernels.assign(
-        *arrays, radii.contiguous().numpy(), camera.width, camera.height, settings.tile_size, limits[1], numba.get_num_threads()
+        *arrays,
+        radii.contiguous().numpy(),
+        camera.width,
+        camera.height,
+        settings.tile_size,
+        limits[1],
+        numba.get_num_threads(),
     )
     return arrays, limits, lists
 

@@ -14,11 +14,17 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
+from normlift_ns.core.evidence import UNLABELED
+
 LANES = 16
 _REACH_MARGIN = 1e-2
 """Added to the exponent at which alpha falls below min_alpha, so that rounding in a Gaussian's reach never costs a
 pixel.
 """
+_MANY_LABELS = 4
+"""Labels of a tile beyond which sums are better taken pixel by pixel."""
+_FEW_LABELS = 32
+"""Labels of a Gaussian that are kept sorted while they are met."""
 _ROUNDINGS = 4
 """Bound of the rounding error of an exponent, in units of the precision times a dx^2 + c dy^2."""
 
@@ -31,6 +37,8 @@ _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
 _P3, _P4, _P5, _ONE = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1), _F(1)
 
 kernel = numba.njit(cache=True, error_model="numpy")
+fused_kernel = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+"""A product and a sum may be rounded once, as they are on a GPU."""
 parallel_kernel = numba.njit(cache=True, error_model="numpy", parallel=True)
 
 
@@ -39,7 +47,7 @@ def exp(x: float) -> float:
     return math.exp(x)
 
 
-@overload(exp, jit_options={"error_model": "numpy"})
+@overload(exp, jit_options={"error_model": "numpy", "fastmath": {"contract"}})
 def _compiled_exp(x):  # pragma: no cover (compiled)
     """e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomials of Cephes' expf and of Taylor."""
 
@@ -192,8 +200,8 @@ def assign(means2d, conics, opacities, radii, width, height, size, min_alpha, th
 
 @kernel
 def _tile_labels(labels, box, local, distinct):  # pragma: no cover (compiled)
-    """Numbers the labels of a tile 0, 1, ... in order of appearance; fills local[row, pixel] and distinct[number],
-    returns how many.
+    """Numbers the labels of a tile 0, 1, ... in order of appearance; fills local[row, chunk, lane] and
+    distinct[number], returns how many.
     """
     top, left, bottom, right = box
     count, number = 0, 0
@@ -206,8 +214,20 @@ def _tile_labels(labels, box, local, distinct):  # pragma: no cover (compiled)
             if number == count:
                 distinct[count] = labels[y, x]
                 count += 1
-            local[y - top, x - left] = number
+            local[y - top, (x - left) // LANES, (x - left) % LANES] = number
     return count
+
+
+@kernel
+def _label_ranges(local, box, ranges):  # pragma: no cover (compiled)
+    """Least and greatest number of the labels of each row of a tile."""
+    top, left, bottom, right = box
+    for row in range(bottom - top):
+        low = high = local[row, 0, 0]
+        for x in range(right - left):
+            number = local[row, x // LANES, x % LANES]
+            low, high = min(low, number), max(high, number)
+        ranges[row, 0], ranges[row, 1] = low, high
 
 
 @kernel
@@ -224,7 +244,8 @@ def count_labels(labels, size):  # pragma: no cover (compiled)
     counts = np.empty(((height + size - 1) // size) * ((width + size - 1) // size), np.int64)
     for tile in numba.prange(counts.size):
         box = _tile_box(tile, height, width, size)
-        counts[tile] = _tile_labels(labels, box, np.empty((size, size), np.int32), np.empty(size * size, np.int32))
+        local = np.empty((size, (size + LANES - 1) // LANES, LANES), np.int32)
+        counts[tile] = _tile_labels(labels, box, local, np.empty(size * size, np.int32))
     return counts
 
 
@@ -239,15 +260,14 @@ def _open(box, transmittance):  # pragma: no cover (compiled)
 
 
 @kernel
-def _first_open(transmittance, place):  # pragma: no cover (compiled)
-    """The first place from the given one on that is not closed; the number of places if all are."""
-    pixels = transmittance.reshape(-1)
+def _first_open(pixels, place):  # pragma: no cover (compiled)
+    """The first place from the given one on whose transmittance is not closed; the number of places if all are."""
     while place < pixels.size and not pixels[place] > 0:
         place += 1
     return place
 
 
-@kernel
+@fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
     """Composites one Gaussian over a tile: weights[row, chunk, lane] = A_ij, 0 where it is not drawn.
 
@@ -262,18 +282,20 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
     a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
     number = means2d.dtype.type
     half, one, none = number(0.5), number(1), number(0)
+    half_a, half_c = half * a, half * c
     down = (shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3])
     above, below = _extent(down, left + 0.5 - u, right - 0.5 - u)
     first = math.ceil(min(max(v + above - 0.5 - top, 0.0), bottom - top))
     stop = math.floor(min(max(v + below - 0.5 - top, -1.0), bottom - top - 1)) + 1
     for row in range(first, stop):
         dy = v - (number(top + row) + half)
+        linear, constant = b * dy, half_c * dy * dy
         for chunk in range(transmittance.shape[1]):
             x = number(left + chunk * LANES) + half
             for lane in range(LANES):
                 before = transmittance[row, chunk, lane]
                 dx = u - (x + number(lane))
-                sigma = half * (a * dx * dx + c * dy * dy) + b * dx * dy
+                sigma = (half_a * dx + linear) * dx + constant
                 alpha = opacity * exp(-sigma)
                 alpha = alpha if alpha < max_alpha else max_alpha
                 after = before * (one - alpha)
@@ -285,45 +307,62 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
 
 
 @kernel
-def _row_labels(local, rows, columns, row_label):  # pragma: no cover (compiled)
-    """The number of the label of each row of a tile; -1 where it has several."""
-    for row in range(rows):
-        row_label[row] = local[row, 0]
-        for x in range(columns):
-            if local[row, x] != local[row, 0]:
-                row_label[row] = -1
+def _met_labels(ranges, first, stop):  # pragma: no cover (compiled)
+    """The least number of a label in the given rows, and the one behind the greatest."""
+    least, most = ranges[first, 0], ranges[first, 1]
+    for row in range(first + 1, stop):
+        least, most = min(least, ranges[row, 0]), max(most, ranges[row, 1])
+    return least, most + 1
 
 
 @kernel
-def _add_up(weights, first, stop, local, row_label, power, lanes, sums):  # pragma: no cover (compiled)
-    """Adds A_ij ** power of the given rows to sums[number of the label], by way of lanes[number, lane]."""
+def _sum_by_lane(weights, local, number, first, stop, power, lanes):  # pragma: no cover (compiled)
+    """Sum of A_ij ** power over the pixels with one label in the given rows; `lanes` is 0 before and after."""
     for row in range(first, stop):
-        number = row_label[row]
-        if number >= 0:
-            for chunk in range(weights.shape[1]):
-                if power == 1:
-                    for lane in range(LANES):
-                        lanes[number, lane] += weights[row, chunk, lane]
-                else:
-                    for lane in range(LANES):
-                        weight = np.float64(weights[row, chunk, lane])
-                        lanes[number, lane] += weight * weight if power == 2 else (1.0 if weight > 0 else 0.0)
-        else:
-            for x in range(local.shape[1]):
-                weight = np.float64(weights[row, x // LANES, x % LANES])
+        for chunk in range(weights.shape[1]):
+            if power == 1:
+                for lane in range(LANES):
+                    weight = np.float64(weights[row, chunk, lane])
+                    lanes[lane] += weight if local[row, chunk, lane] == number else 0.0
+            else:
+                for lane in range(LANES):
+                    weight = np.float64(weights[row, chunk, lane])
+                    weight = weight * weight if power == 2 else (1.0 if weight > 0 else 0.0)
+                    lanes[lane] += weight if local[row, chunk, lane] == number else 0.0
+    total = 0.0
+    for lane in range(LANES):
+        total += lanes[lane]
+        lanes[lane] = 0
+    return total
+
+
+@kernel
+def _sum_by_pixel(weights, local, first, stop, power, sums):  # pragma: no cover (compiled)
+    """The same for all labels at once, added to sums[number]."""
+    for row in range(first, stop):
+        for chunk in range(weights.shape[1]):
+            for lane in range(LANES):
+                weight = np.float64(weights[row, chunk, lane])
                 if weight > 0:
-                    sums[local[row, x]] += weight if power == 1 else weight**power
-    for number in range(len(sums)):
-        for width in (8, 4, 2, 1):
-            for lane in range(width):
-                lanes[number, lane] += lanes[number, width + lane]
-        sums[number] += lanes[number, 0]
-        lanes[number] = 0
+                    sums[local[row, chunk, lane]] += weight if power == 1 else weight**power
 
 
 @parallel_kernel
 def fill(  # pragma: no cover (compiled)
-    offsets, members, means2d, conics, opacities, shapes, gaussian, labels, power, size, limits, first_slot, used, slots,
+    offsets,
+    members,
+    means2d,
+    conics,
+    opacities,
+    shapes,
+    gaussian,
+    labels,
+    power,
+    size,
+    limits,
+    first_slot,
+    used,
+    slots,
     threads,
 ):
     """One slot per (tile list entry, label of the tile) with weight, (Gaussian, label, sum of A_ij ** power): those of
@@ -335,33 +374,39 @@ def fill(  # pragma: no cover (compiled)
         tile = _interleaved(position, tiles, threads)
         if tile >= tiles or offsets[tile] == offsets[tile + 1]:
             continue
-        local, row_label, distinct = (
-            np.empty((size, size), np.int32),
-            np.empty(size, np.int32),
-            np.empty(size * size, np.int32),
+        local, ranges = np.zeros((size, wide, LANES), np.int32), np.empty((size, 2), np.int32)
+        distinct = np.empty(size * size, np.int32)
+        transmittance, weights = (
+            np.empty((size, wide, LANES), means2d.dtype),
+            np.empty((size, wide, LANES), means2d.dtype),
         )
-        transmittance, weights = np.empty((size, wide, LANES), means2d.dtype), np.empty((size, wide, LANES), means2d.dtype)
         box = _tile_box(tile, labels.shape[0], labels.shape[1], size)
         count = _tile_labels(labels, box, local, distinct)
-        _row_labels(local, box[2] - box[0], box[3] - box[1], row_label)
+        _label_ranges(local, box, ranges)
         _open(box, transmittance)
-        sums, lanes = np.zeros(count), np.zeros((count, LANES))
-        slot, place = first_slot[tile], 0
+        sums, lanes = np.zeros(count), np.zeros(LANES)
+        many = count > _MANY_LABELS  # whatever rows a Gaussian reaches, so that they do not change its sums
+        pixels, slot, place = transmittance.reshape(-1), first_slot[tile], 0
         for entry in range(offsets[tile], offsets[tile + 1]):
-            place = _first_open(transmittance, place)
-            if place == transmittance.size:
+            place = _first_open(pixels, place)
+            if place == pixels.size:
                 break
             g = members[entry]
             first, stop = _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits)
             if first >= stop:
                 continue
-            _add_up(weights, first, stop, local, row_label, power, lanes, sums)
-            for number in range(count):
-                if sums[number] > 0 and distinct[number] >= -1:  # not of masked pixels
+            least, behind = _met_labels(ranges, first, stop)
+            if many:
+                _sum_by_pixel(weights, local, first, stop, power, sums)
+            for number in range(least, behind):
+                if many:
+                    total, sums[number] = sums[number], 0.0
+                else:
+                    total = _sum_by_lane(weights, local, number, first, stop, power, lanes)
+                if total > 0 and distinct[number] >= UNLABELED:
                     slot_gaussian[slot], slot_label[slot] = gaussian[g], distinct[number]
-                    slot_weight[slot] = sums[number]
+                    slot_weight[slot] = total
                     slot += 1
-                sums[number] = 0
         used[tile] = slot - first_slot[tile]
 
 
@@ -379,28 +424,33 @@ def merge(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no co
     total = 0
     for g in range(num_gaussians + 1):
         total, end[g] = total + end[g], total
-    order = np.empty(total, np.int64)
+    columns, weights = np.empty(total, np.int32), np.empty(total)
     for tile in range(len(used)):
         for slot in range(first_slot[tile], first_slot[tile] + used[tile]):
-            order[end[slot_gaussian[slot]]] = slot
-            end[slot_gaussian[slot]] += 1
-    rows, columns, weights = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total)
-    sums, touched = np.zeros(num_columns), np.empty(num_columns, np.int32)
+            place = end[slot_gaussian[slot]]
+            columns[place], weights[place] = slot_label[slot] + 1, slot_weight[slot]
+            end[slot_gaussian[slot]] = place + 1
+    rows, sums, touched = np.empty(total, np.int32), np.zeros(num_columns), np.empty(num_columns, np.int32)
     written, start = 0, 0
     for g in range(num_gaussians):
         count = 0
         for i in range(start, end[g]):
-            column = slot_label[order[i]] + 1
+            column = columns[i]
             if sums[column] == 0:
-                touched[count] = column
+                place = count
+                while place > 0 and count < _FEW_LABELS and touched[place - 1] > column:
+                    touched[place] = touched[place - 1]
+                    place -= 1
+                touched[place] = column
                 count += 1
-            sums[column] += slot_weight[order[i]]
+            sums[column] += weights[i]
         start = end[g]
-        if count > 1:
+        if count > _FEW_LABELS:
             touched[:count].sort()
         for i in range(count):
-            rows[written], columns[written], weights[written] = g, touched[i], sums[touched[i]]
-            sums[touched[i]] = 0
+            column = touched[i]
+            rows[written], columns[written], weights[written] = g, column, sums[column]
+            sums[column] = 0
             written += 1
     return rows[:written], columns[:written], weights[:written]
 
@@ -415,14 +465,17 @@ def draw(  # pragma: no cover (compiled)
         tile = _interleaved(position, tiles, threads)
         if tile >= tiles:
             continue
-        transmittance, weights = np.empty((size, wide, LANES), means2d.dtype), np.empty((size, wide, LANES), means2d.dtype)
+        transmittance, weights = (
+            np.empty((size, wide, LANES), means2d.dtype),
+            np.empty((size, wide, LANES), means2d.dtype),
+        )
         box = _tile_box(tile, image.shape[0], image.shape[1], size)
         top, left, bottom, right = box
         _open(box, transmittance)
-        place = 0
+        pixels, place = transmittance.reshape(-1), 0
         for entry in range(offsets[tile], offsets[tile + 1]):
-            place = _first_open(transmittance, place)
-            if place == transmittance.size:
+            place = _first_open(pixels, place)
+            if place == pixels.size:
                 break
             g = members[entry]
             first, stop = _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits)
