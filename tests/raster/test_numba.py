@@ -176,7 +176,9 @@ def test_a_second_process_compiles_nothing_even_beside_code_that_cannot_be_writt
     environment = {**os.environ, "PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment.pop("NUMBA_CACHE_DIR", None)
     runs = [
-        subprocess.run([sys.executable, "-c", CHILD], env=environment, capture_output=True, text=True, check=True)
+        subprocess.run(
+            [sys.executable, "-c", CHILD], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
         for _ in range(2)
     ]
     (first, path), (second, _) = (run.stdout.split("\n")[:2] for run in runs)
