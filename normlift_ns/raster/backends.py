@@ -17,7 +17,7 @@ BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
 def _torch() -> Backend:
     from normlift_ns.raster import reference  # noqa: PLC0415 (each backend loads where it is used)
 
-    return TileBackend("torch", reference)
+    return TileBackend(reference)
 
 
 def _numba() -> Backend:
