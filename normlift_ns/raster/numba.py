@@ -19,6 +19,8 @@ from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import Projected, project
 from normlift_ns.raster.settings import RasterSettings
 
+_Three = tuple[Any, Any, Any]
+
 
 def check(job: Job, *, pictures: bool) -> None:
     """Raises ValueError for a scene that is not on the CPU."""
@@ -33,13 +35,13 @@ def views_evidence(job: Job, batch: Batch) -> Entries:
     """Entries of one view; bitwise the same on every run."""
     (camera,), (labels,), (count,) = batch
     projected = project(job.world, camera, job.settings, job.antialiased)
-    arrays, limits, (offsets, *lists) = _tiles(projected, camera, job.settings)
+    arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     size, label_map = job.settings.tile_size, labels.int().numpy()
     most = np.diff(offsets) * kernels.count_labels(label_map, size)
     first_slot, used = np.cumsum(most) - most, np.zeros(len(most), np.int64)
     slots = tuple(np.empty(most.sum(), dtype) for dtype in (np.int32, np.int32, np.float64))  # touched where used
     kernels.fill(
-        *(offsets, lists[0], *arrays, lists[1], projected.gaussian.numpy(), label_map),
+        *(offsets, members, *arrays, shapes, projected.gaussian.numpy(), label_map),
         *(job.weight_power, size, limits, first_slot, used, slots, numba.get_num_threads()),
     )
     found = kernels.merge(first_slot, used, slots, len(job.scene), count + 1)
@@ -63,22 +65,21 @@ def composite(
     return torch.from_numpy(image), torch.from_numpy(alpha)
 
 
-def _tiles(projected: Projected, camera: Camera, settings: RasterSettings) -> tuple[Any, Any, Any]:
-    """What the kernels read: means, conics and opacities; limits of alpha and transmittance; the lists of the tiles."""
-    arrays = tuple(x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities))
-    number = arrays[0].dtype.type
-    limits = tuple(number(x) for x in (settings.max_alpha, settings.min_alpha, settings.min_transmittance))
-    radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
-    lists = kernels.assign(
-        *arrays,
-        radii.contiguous().numpy(),
-        camera.width,
-        camera.height,
-        settings.tile_size,
-        limits[1],
-        numba.get_num_threads(),
+def _tiles(projected: Projected, camera: Camera, settings: RasterSettings) -> tuple[_Three, _Three, _Three]:
+    """What the kernels read: means, conics and opacities; limits of alpha and transmittance; offsets and members of the
+    tiles, and shapes of the Gaussians.
+    """
+    means, conics, opacities = (
+        x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities)
     )
-    return arrays, limits, lists
+    number = means.dtype.type
+    max_alpha, min_alpha, least = settings.max_alpha, settings.min_alpha, settings.min_transmittance
+    radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
+    sizes = (camera.width, camera.height, settings.tile_size)
+    lists = kernels.assign(
+        means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
+    )
+    return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(least)), lists
 
 
 def warm(*dtypes: torch.dtype) -> Thread:
@@ -97,7 +98,7 @@ def warm(*dtypes: torch.dtype) -> Thread:
     return thread
 
 
-def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, tuple[Any, ...]]]:
+def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
     """Every kernel that is called from here, with the types of its arguments."""
     number = numba.float64 if dtype == torch.float64 else numba.float32
     whole, wholes, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]

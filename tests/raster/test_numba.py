@@ -82,8 +82,8 @@ def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed):
     most = np.diff(offsets) * kernels.count_labels(labels.numpy(), 16)
     first, used = np.cumsum(most) - most, np.zeros(len(most), np.int64)
     slots = tuple(np.empty(most.sum(), t) for t in (np.int32, np.int32, np.float64))
-    image = (projected.gaussian.numpy(), labels.numpy(), 1, 16, limits, first, used, slots, 3)
-    kernels.fill(offsets, members, *arrays, everywhere, *image)
+    regions = (projected.gaussian.numpy(), labels.numpy(), 1, 16)
+    kernels.fill(offsets, members, *arrays, everywhere, *regions, limits, first, used, slots, 3)
     expected = kernels.merge(first, used, slots, 300, 7)
     found = backend.views_evidence(job, Batch([camera], [labels], [6]))
     for got, exact in zip(found[:3], expected):
