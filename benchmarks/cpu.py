@@ -8,15 +8,33 @@ from __future__ import annotations
 
 import argparse
 import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.captures import SHARED, trained_scene, training_cameras
 from benchmarks.report import RESULTS, Report, stopwatch
-from normlift_ns import Camera, RefineConfig, lift, nearest_neighbors, rasterize_evidence, refine
+from normlift_ns import (
+    Camera,
+    GaussianScene,
+    RasterSettings,
+    RefineConfig,
+    lift,
+    nearest_neighbors,
+    rasterize_evidence,
+    refine,
+)
 from normlift_ns.core.sparse import sum_duplicates
+from normlift_ns.raster import numba as compiled
+from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.projection import assign_tiles, project
 from normlift_ns.stages import peak_gib
 
 CELL = 60
@@ -48,6 +66,52 @@ def relative_difference(a, b) -> float:
     return float(sum_duplicates(*joined)[2].norm() / b.weight.norm())
 
 
+WARM = """
+import time
+import torch
+start = time.process_time()
+from normlift_ns.raster import numba
+print(time.process_time() - start)
+for kernel, signature in numba.kernel_signatures(torch.float32):
+    start = time.process_time()
+    kernel.compile(signature)
+    print(kernel.__name__, time.process_time() - start, sum(kernel.stats.cache_misses.values()))
+"""
+
+
+def warming() -> dict[str, float]:
+    """CPU seconds of a new process to import numba, and to load each kernel from the cache."""
+    child = subprocess.run([sys.executable, "-c", WARM], capture_output=True, text=True, check=True)
+    first, *kernels = child.stdout.split("\n")[:-1]
+    rows = [line.split() for line in kernels]
+    if any(misses != "0" for _, _, misses in rows):
+        raise RuntimeError(f"kernels were compiled again: {child.stdout}")
+    return {"import": float(first), **{name: float(seconds) for name, seconds, _ in rows}}
+
+
+def stages(scene: GaussianScene, camera: Camera, labels: torch.Tensor) -> tuple[dict[str, float], float]:
+    """CPU milliseconds of each stage of one view, and the share of the pairs of `assign_tiles` that is kept."""
+    job = Job(scene, False, RasterSettings(), torch.float32)
+    batch = Batch([camera], [labels], [int(labels.max()) + 1])
+    projected = project(job.world, camera, job.settings, job.antialiased)
+    tasks: dict[str, Callable[[], Any]] = {
+        "project": lambda: project(job.world, camera, job.settings, job.antialiased),
+        "lists": lambda: compiled._tiles(projected, camera, job.settings),
+        "view": lambda: compiled.views_evidence(job, batch),
+    }
+    spent: dict[str, list[float]] = {name: [] for name in tasks}
+    for _ in range(5):
+        for name, task in tasks.items():
+            start = time.process_time()
+            task()
+            spent[name].append(1e3 * (time.process_time() - start))
+    kept = len(compiled._tiles(projected, camera, job.settings)[2][1])
+    share = kept / len(assign_tiles(projected, camera.width, camera.height, job.settings.tile_size).members)
+    milliseconds = {name: median(values) for name, values in spent.items()}
+    milliseconds["sums"] = milliseconds["view"] - milliseconds["project"] - milliseconds["lists"]
+    return milliseconds, share
+
+
 def main(quick: bool, output: Path) -> None:
     report = Report("cpu")
     scene, cameras = trained_scene("fox"), training_cameras("fox")
@@ -55,8 +119,10 @@ def main(quick: bool, output: Path) -> None:
     labels = [grid_labels(camera) for camera in cameras]
     rasterize_evidence(scene, cameras[:1], labels[:1])  # compiles, or reads what was compiled before
 
+    start = time.process_time()
     with stopwatch() as watch:
         evidence = rasterize_evidence(scene, cameras, labels)
+    evidence_cpu = time.process_time() - start
     peak = peak_gib() or math.nan
     with stopwatch() as lift_watch:
         features = clip_like_table(evidence.num_regions)
@@ -82,6 +148,13 @@ def main(quick: bool, output: Path) -> None:
     exact_source = refine(scene.means, exact.directions(), exact.scalars.reliability, config, neighbors=neighbors)
 
     report.add("fox_evidence_s", watch.seconds, "s", evidence_error)
+    report.add("fox_evidence_cpu_s", evidence_cpu, "s of CPU", evidence_error)
+    milliseconds, kept = stages(scene, cameras[len(cameras) // 2], labels[len(cameras) // 2])
+    for name, value in milliseconds.items():
+        report.add(f"fox_{name}_cpu_ms", value, "ms of CPU, one view")
+    report.add("fox_kept_pairs", kept, "of (Gaussian, tile) pairs")
+    for name, seconds in warming().items():
+        report.add(f"warm_{name}_cpu_s", seconds, "s of CPU")
     report.add("fox_evidence_peak_gib", peak, "GiB")
     report.add("fox_evidence_rel_error", evidence_error, "relative Frobenius norm")
     report.add("fox_evidence_pairs_per_s", pairs / watch.seconds, "pixel-Gaussian pairs/s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,13 +182,12 @@ def _vote(
     gaussians: GaussianScene, lifted: Lifted, config: RefineConfig, stages: Stages
 ) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
     """Whose direction every Gaussian takes, and the shares of Gaussians that change theirs and that nobody supports."""
-    with stages("neighbors") as step:
-        neighbors = nearest_neighbors(gaussians.means, config.k)
-        step()
-    with stages("vote") as step:
-        reliability = lifted.scalars.reliability
-        copied = refine(gaussians.means, lifted.directions, reliability, config, neighbors=neighbors)
-        step()
+    means, reliability, n = gaussians.means, lifted.scalars.reliability, len(gaussians)
+    with stages("neighbors", n):
+        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.tell, "neighbors"))
+    with stages("vote", n):
+        told = partial(stages.tell, "vote")
+        copied = refine(means, lifted.directions, reliability, config, neighbors=neighbors, progress=told)
     changed = copied != torch.arange(len(copied), device=copied.device)
     lost = unsupported(neighbors, reliability)
     return copied, {"refined_share": float(changed.float().mean()), "unsupported_share": float(lost.float().mean())}

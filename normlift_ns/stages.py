@@ -47,6 +47,10 @@ class Stages:
             torch.cuda.synchronize()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
+    def tell(self, stage: str, done: int, total: int) -> None:
+        """Passes on how far a stage is that counts its steps itself."""
+        self._report(stage, done, total)
+
 
 def cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
     """Seconds of the stages so far and in all, and the most memory of this process, where the system tells that, and

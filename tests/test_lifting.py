@@ -18,7 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, View
+from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RefineConfig, View
 from normlift_ns.encoders import LangSplat, RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import LabelFiles
@@ -282,3 +282,18 @@ print(subprocess.run([sys.executable, "-c", {child!r}], capture_output=True, tex
 """
     done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True, check=True)
     assert 0.05 < float(done.stdout) < 1.5  # 3 GiB in its parent
+
+
+def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):
+    """A stage that counts its own steps starts at none and ends with all of them."""
+    monkeypatch.setattr("normlift_ns.core.neighbors._BLOCK", 10)
+    told: list[tuple[str, int, int]] = []
+    made, given = scene("a.png"), LiftOptions(refine=True, vote=RefineConfig(k=4))
+    source = files(tmp_path / "maps", FULL)
+    lift_scene(made, source, given, tmp_path / "cache", encoder={}, report=lambda *step: told.append(step))
+    for stage in ("neighbors", "vote"):
+        steps = [done for name, done, total in told if name == stage and total == N]
+        assert steps[0] == 0
+        assert steps[-1] == N
+        assert steps == sorted(steps)
+    assert len([step for step in told if step[0] == "neighbors"]) == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,13 @@ MOST_NEIGHBORS = 1024
 """Memory grows with their number times that of the Gaussians, and a vote compares every two of them."""
 _MOST_UNSURE = 1000
 """Gaussians whose neighbours a GPU finds by looking at all others; with more of them the CPU's tree is faster."""
+_BLOCK = 2**14
+"""Places that are searched from at a time on the CPU."""
+_MOST_RANKED = 2**22
+"""Candidates that are ranked at a time."""
+
+Progress = Callable[[int, int], None]
+"""Called after every block of Gaussians with (Gaussians done, Gaussians)."""
 
 
 class Neighbors(NamedTuple):
@@ -40,7 +48,7 @@ class Neighbors(NamedTuple):
     """Distance to the nearest Gaussian that is not at the same place; inf if there is none."""
 
 
-def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
+def nearest_neighbors(means: Float[Tensor, "n 3"], k: int, *, progress: Progress | None = None) -> Neighbors:
     """The K nearest neighbours in 3D, N_K(i) of the paper, self excluded, exact.
 
     On the CPU by a k-d tree over the distinct places: any number of Gaussians may share one, while a tree over all of
@@ -48,6 +56,8 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     answer; where it cannot (more ties than it keeps candidates) all distances are looked at, or the CPU answers.
     A Gaussian whose mean is not finite has no neighbours and is nobody's neighbour.
 
+    Args:
+        progress: called after every block of Gaussians with (Gaussians done, Gaussians).
     Raises:
         ValueError: k < 1, or more than `MOST_NEIGHBORS`.
 
@@ -59,11 +69,14 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     """
     if check_number("k", k, int) > MOST_NEIGHBORS:
         raise InputError(f"k must be at most {MOST_NEIGHBORS:,}, got {k:,}: all neighbours are held in memory at once")
-    found = _on_gpu(means.detach(), k) if kernels_apply(means) else None
-    return _on_cpu(means, k) if found is None else found
+    found = _on_gpu(means.detach(), k, progress) if kernels_apply(means) else None
+    found = _on_cpu(means, k, progress) if found is None else found
+    if progress is not None:
+        progress(len(means), len(means))
+    return found
 
 
-def _on_gpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors | None:
+def _on_gpu(means: Float[Tensor, "n 3"], k: int, progress: Progress | None) -> Neighbors | None:
     """None where the kernel does not apply, or cannot be sure."""
     from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
 
@@ -71,7 +84,13 @@ def _on_gpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors | None:
     if means.dtype != torch.float32 or k > nearest.MOST_NEIGHBORS or finite.numel() == 0:
         return None
     points = means if finite.numel() == len(means) else means[finite]
-    found = nearest.nearest(points, k)
+
+    def tell(done: int) -> None:
+        torch.cuda.synchronize(means.device)  # what was launched is not yet done
+        if progress is not None and done < len(means):
+            progress(done, len(means))
+
+    found = nearest.nearest(points, k, done=None if progress is None else tell)
     unsure = (~found.certain).nonzero().squeeze(1)
     if unsure.numel() > _MOST_UNSURE:
         return None
@@ -88,7 +107,7 @@ def _on_gpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors | None:
     return Neighbors(index, distance, spacing)
 
 
-def _on_cpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
+def _on_cpu(means: Float[Tensor, "n 3"], k: int, progress: Progress | None = None) -> Neighbors:
     n = means.shape[0]
     points = means.detach().cpu().double().numpy()
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -96,41 +115,46 @@ def _on_cpu(means: Float[Tensor, "n 3"], k: int) -> Neighbors:
     if finite.size > 1:
         places, place_of = np.unique(points[finite], axis=0, return_inverse=True)
         place_of = place_of.reshape(-1)
-        tree = KDTree(places)
+        tree, member = KDTree(places), _members(place_of, k + 1)
         which: Any = range(1, min(k + 2, len(places)) + 1)  # a sequence, so that one neighbour is still a column
-        reach, near = map(np.asarray, tree.query(places, k=which, workers=-1))
-        ranked, ranked_distance = _rank_gaussians(tree, place_of, near, reach, k + 1)
-        ranked, ranked_distance = ranked[place_of], ranked_distance[place_of]
+        blocks = []
+        for first in range(0, len(places), _BLOCK):
+            reach, near = map(np.asarray, tree.query(places[first : first + _BLOCK], k=which, workers=-1))
+            elsewhere = reach[:, 1] if len(places) > 1 else np.full(len(reach), np.inf)
+            blocks.append((*_rank_gaussians(tree, member, first, near, reach, k + 1), elsewhere))
+            if progress is not None and first + _BLOCK < len(places):
+                progress((first + _BLOCK) * n // len(places), n)
+        ranked, ranked_distance, nearest = (np.concatenate(parts)[place_of] for parts in zip(*blocks))
         # Leave out self; it is missing from the list only where k + 1 others share its place.
         later = np.cumsum(ranked == np.arange(finite.size)[:, None], axis=1)[:, :k] > 0
         chosen = np.where(later, ranked[:, 1:], ranked[:, :k])
         index[finite] = np.where(chosen < 0, -1, finite[chosen])
         distance[finite] = np.where(later, ranked_distance[:, 1:], ranked_distance[:, :k])
-        if len(places) > 1:
-            spacing[finite] = reach[place_of, 1]
+        spacing[finite] = nearest
     return Neighbors(*(torch.from_numpy(x).to(means.device) for x in (index, distance, spacing)))
 
 
-def _rank_gaussians(
-    tree: KDTree, place_of: np.ndarray, near: np.ndarray, reach: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """For every place its `count` nearest Gaussians (-1 where there are fewer) and their distances, sorted by
-    (distance, index).
-    """
+def _members(place_of: np.ndarray, most: int) -> np.ndarray:
+    """The first Gaussians of every place, at most so many, by index; -1 where there are fewer: [places, slots]."""
     by_place = np.argsort(place_of, kind="stable")
     population = np.bincount(place_of)
     first = np.cumsum(population) - population
-    slot = np.arange(min(count, population.max()))
-    member = np.where(
-        slot < population[:, None], by_place[np.minimum(first[:, None] + slot, len(place_of) - 1)], -1
-    )  # [P, c]
+    slot = np.arange(min(most, population.max()))
+    return np.where(slot < population[:, None], by_place[np.minimum(first[:, None] + slot, len(place_of) - 1)], -1)
+
+
+def _rank_gaussians(
+    tree: KDTree, member: np.ndarray, first: int, near: np.ndarray, reach: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """For every place from the first one on its `count` nearest Gaussians (-1 where there are fewer) and their
+    distances, sorted by (distance, index).
+    """
+    slots = member.shape[1]
 
     def rank(near: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         gaussian = member[near].reshape(len(near), -1)
-        distance = np.where(gaussian < 0, np.inf, np.repeat(reach, slot.size, axis=1))
-        unsorted = (
-            np.flatnonzero((np.diff(distance, axis=1) <= 0).any(axis=1)) if slot.size == 1 else np.arange(len(near))
-        )
+        distance = np.where(gaussian < 0, np.inf, np.repeat(reach, slots, axis=1))
+        unsorted = np.flatnonzero((np.diff(distance, axis=1) <= 0).any(axis=1)) if slots == 1 else np.arange(len(near))
         order = np.lexsort((gaussian[unsorted], distance[unsorted]), axis=1)
         gaussian[unsorted] = np.take_along_axis(gaussian[unsorted], order, 1)
         distance[unsorted] = np.take_along_axis(distance[unsorted], order, 1)
@@ -138,13 +162,14 @@ def _rank_gaussians(
         gaussian = np.pad(gaussian[:, :count], ((0, 0), (0, short)), constant_values=-1)
         return gaussian, np.pad(distance[:, :count], ((0, 0), (0, short)), constant_values=np.inf)
 
-    step = max(1, 2**22 // (near.shape[1] * slot.size))
+    step = max(1, _MOST_RANKED // (near.shape[1] * slots))
     blocks = [rank(near[i : i + step], reach[i : i + step]) for i in range(0, len(near), step)]
     ranked, distance = (np.concatenate(parts) for parts in zip(*blocks))
     if near.shape[1] > count:  # places that tie across the end of the list: the tree kept any of them
-        for place in np.flatnonzero(reach[:, count - 1] == reach[:, count]):
-            around = np.array(tree.query_ball_point(tree.data[place], reach[place, count] * (1 + 1e-12)))
-            far = np.linalg.norm(tree.data[around] - tree.data[place], axis=1)
-            far = np.where(np.isclose(far, reach[place, count], rtol=1e-12, atol=0), reach[place, count], far)
-            ranked[place : place + 1], distance[place : place + 1] = rank(around[None], far[None])
+        for row in np.flatnonzero(reach[:, count - 1] == reach[:, count]):
+            place = tree.data[first + row]
+            around = np.array(tree.query_ball_point(place, reach[row, count] * (1 + 1e-12)))
+            far = np.linalg.norm(tree.data[around] - place, axis=1)
+            far = np.where(np.isclose(far, reach[row, count], rtol=1e-12, atol=0), reach[row, count], far)
+            ranked[row : row + 1], distance[row : row + 1] = rank(around[None], far[None])
     return ranked, distance

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.gpu import in_parts, kernels_apply
-from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
@@ -31,6 +31,7 @@ def refine(
     config: RefineConfig | None = None,
     *,
     neighbors: Neighbors | None = None,
+    progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
     """Mode voting among neighbours (eq. 9 and 10 of the paper): the refined direction of i is directions[source[i]].
 
@@ -50,6 +51,7 @@ def refine(
         reliability: R in 0..1.
         neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes; by default those of
             `possible(config, n)`.
+        progress: called after every block of Gaussians with (Gaussians done, Gaussians).
     Raises:
         ValueError: shapes that disagree, neighbours of another K.
 
@@ -93,8 +95,12 @@ def refine(
         else:
             _vote(voters, neighbors, rows, row_of, reliability, source, config, width)
 
+    done = n - len(order)
     for voters in order.split(_BLOCK[means.device.type == "cuda"] if given is None else max(1, n)):
         in_parts(vote, voters, "refine on the CPU")
+        done += len(voters)
+        if progress is not None:
+            progress(done, n)
     return source
 
 

@@ -8,6 +8,7 @@ as the last one that was, the query is reported as uncertain.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -186,12 +187,13 @@ def _rank(
         tl.store(out_certain + me, certain.to(tl.int8))
 
 
-def nearest(points: Float32[Tensor, "n 3"], k: int) -> Found:
+def nearest(points: Float32[Tensor, "n 3"], k: int, *, done: Callable[[int], None] | None = None) -> Found:
     """The K nearest other points of each point.
 
     Args:
         points: finite.
         k: 1..MOST_NEIGHBORS.
+        done: called with the number of points whose search has been launched.
     """
     tree, n, device = build_tree(points), len(points), points.device
     leaves, wanted = len(tree.index) // LEAF, k + SPARE
@@ -212,6 +214,8 @@ def nearest(points: Float32[Tensor, "n 3"], k: int) -> Found:
         _rank[(stride,)](
             tree.points, tree.index, candidates, *found, first * LEAF, stride, wanted, k, SLOTS=SLOTS, num_warps=1
         )
+        if done is not None:
+            done((first + most) * n // leaves)
     return found._replace(certain=found.certain.bool())
 
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.errors import InputError
 from normlift_ns.raster.projection import Projected, Tiles, World, assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
@@ -50,7 +49,9 @@ class Batch(NamedTuple):
 
 
 class Backend(Protocol):
-    """One way to rasterize. `raster.gsplat` and `raster.triton` are backends as they stand, as modules."""
+    """One way to rasterize. `raster.numba`, `raster.gsplat` and `raster.triton` are backends as they stand, as
+    modules.
+    """
 
     def check(self, job: Job, *, pictures: bool) -> None:
         """Raises ValueError, with what to use instead, where the backend cannot do the job.
@@ -75,19 +76,11 @@ class Backend(Protocol):
 class TileBackend:
     """A backend that goes through projected Gaussians and tile lists, one view at a time, in any precision."""
 
-    name: str
     kernels: Any
     """Module with `view_evidence` and `composite`."""
-    on: str | None = None
-    """The only type of device that it works on; None: any."""
 
-    def check(self, job: Job, *, pictures: bool) -> None:  # noqa: D102 (as in the protocol)
-        device = job.scene.means.device
-        if self.on is not None and device.type != self.on:
-            raise InputError(
-                f'backend "{self.name}" needs a scene on the {self.on.upper()}, this one is on {device}; move it, or '
-                'use backend="torch"'
-            )
+    def check(self, job: Job, *, pictures: bool) -> None:
+        """Nothing to refuse: any device will do."""
 
     def views_evidence(self, job: Job, batch: Batch) -> Entries:  # noqa: D102 (as in the protocol)
         (camera,), (labels,), (count,) = batch

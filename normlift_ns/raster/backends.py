@@ -17,13 +17,13 @@ BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
 def _torch() -> Backend:
     from normlift_ns.raster import reference  # noqa: PLC0415 (each backend loads where it is used)
 
-    return TileBackend("torch", reference)
+    return TileBackend(reference)
 
 
 def _numba() -> Backend:
     from normlift_ns.raster import numba  # noqa: PLC0415 (importing numba takes a second)
 
-    return TileBackend("numba", numba, on="cpu")
+    return numba
 
 
 def _gsplat() -> Backend:

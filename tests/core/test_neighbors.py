@@ -84,3 +84,13 @@ def test_many_coincident_points_stay_cheap():
 def test_k_must_be_positive():
     with pytest.raises(ValueError, match="k must be at least 1, got 0"):
         nearest_neighbors(torch.zeros(3, 3), 0)
+
+
+def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
+    means, told = SCENES["grid, several at a place"], []
+    whole = nearest_neighbors(means, 7)
+    monkeypatch.setattr("normlift_ns.core.neighbors._BLOCK", 5)
+    found = nearest_neighbors(means, 7, progress=lambda *step: told.append(step))
+    assert all(torch.equal(a, b) for a, b in zip(found, whole))
+    places = len(means.unique(dim=0))
+    assert told == [(first * 90 // places, 90) for first in range(5, places, 5)] + [(90, 90)]

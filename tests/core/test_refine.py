@@ -238,3 +238,15 @@ def test_directions_given_block_by_block_change_nothing(monkeypatch):
     assert torch.equal(refine(means, some, reliability, config), whole)
     assert len(asked) == 8
     assert max(asked) < 300
+
+
+def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
+    means, u, r = scene(1)
+    told: list[tuple[int, int]] = []
+    whole = refine(means, u, r, RefineConfig(k=12))
+    monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (7, 7))
+    found = refine(means, lambda rows: u[rows], r, RefineConfig(k=12), progress=lambda *step: told.append(step))
+    assert torch.equal(found, whole)
+    assert len(told) == 9
+    assert told[-1] == (60, 60)
+    assert told == sorted(told)

@@ -3,7 +3,7 @@
 import numba
 import pytest
 
-from normlift_ns.raster.numba import _compiled
+from normlift_ns.raster.numba_kernels import _compiled
 
 
 def test_without_a_place_for_a_cache_kernels_are_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:

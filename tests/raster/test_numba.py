@@ -1,0 +1,186 @@
+"""The compiled CPU rasterizer: what its shortcuts leave out is nothing, and its kernels come from the cache."""
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import normlift_ns
+from normlift_ns import Camera, GaussianScene, RasterSettings, rasterize_evidence, render
+from normlift_ns.raster import numba as backend
+from normlift_ns.raster import numba_kernels as kernels
+from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.projection import assign_tiles, project
+from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
+
+DTYPES = [torch.float32, torch.float64]
+SETTINGS = RasterSettings()
+
+
+def shapes_of_all_kinds(n: int, seed: int, dtype: torch.dtype) -> GaussianScene:
+    """Needles, pancakes, points and sheets larger than the image, of any opacity."""
+    g = generator(seed)
+    random = random_scene(n, seed=seed, dtype=torch.float64)
+    scales = 10 ** (4 * torch.rand(n, 3, generator=g, dtype=torch.float64) - 3)
+    opacities = 10 ** (-3 * torch.rand(n, generator=g, dtype=torch.float64))
+    return GaussianScene(*(x.to(dtype) for x in (random.means, random.quats, scales, opacities)))
+
+
+def listed(scene: GaussianScene, camera: Camera, dtype: torch.dtype, rules: RasterSettings):
+    job = Job(scene, False, rules, dtype)
+    projected = project(job.world, camera, rules, antialiased=False)
+    return job, projected, backend._tiles(projected, camera, rules)
+
+
+@settings(deadline=None, max_examples=12)
+@given(seed=st.integers(0, 2**31), dtype=st.sampled_from(DTYPES), size=st.sampled_from([5, 16, 20]))
+def test_culling_leaves_out_what_no_pixel_feels(seed, dtype, size):
+    """The lists are those of `assign_tiles`, in its order, but for Gaussians without alpha >= min_alpha in the tile."""
+    rules = replace(SETTINGS, tile_size=size)
+    camera = orbit_camera(0.4, width=75, height=53)
+    _, projected, (_, _, (offsets, members, _)) = listed(shapes_of_all_kinds(120, seed, dtype), camera, dtype, rules)
+    tiles = assign_tiles(projected, camera.width, camera.height, size)
+    a, b, c = projected.conics.unbind(1)
+    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    dx = projected.means2d[:, 0, None, None] - (x.to(dtype) + 0.5)
+    dy = projected.means2d[:, 1, None, None] - (y.to(dtype) + 0.5)
+    a, b, c, opacity = (t[:, None, None] for t in (a, b, c, projected.opacities))
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    felt = (sigma >= 0) & (opacity * torch.exp(-sigma) >= rules.min_alpha)
+    columns = -(-camera.width // size)
+    for tile, (start, stop) in enumerate(zip(offsets[:-1].tolist(), offsets[1:].tolist())):
+        whole = tiles.members[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()
+        kept = torch.from_numpy(members[start:stop]).long()
+        top, left = tile // columns * size, tile % columns * size
+        needed = whole[felt[whole, top : top + size, left : left + size].flatten(1).any(1)]
+        assert torch.equal(kept, whole[torch.isin(whole, kept)])
+        assert torch.isin(needed, kept).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("seed", range(3))
+def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed):
+    camera = orbit_camera(0.4, width=75, height=53)
+    labels = random_labels(camera, 6, seed=seed)
+    job, projected, (arrays, limits, (_, culled, shapes)) = listed(
+        shapes_of_all_kinds(300, seed, dtype), camera, dtype, SETTINGS
+    )
+    tiles = assign_tiles(projected, camera.width, camera.height, 16)
+    assert len(culled) < 0.9 * len(tiles.members)
+    offsets, members = tiles.offsets.numpy(), tiles.members.numpy()
+    everywhere = np.zeros_like(shapes)
+    everywhere[:, 2] = np.inf  # every row of a tile
+    most = np.diff(offsets) * kernels.count_labels(labels.numpy(), 16)
+    first, used = np.cumsum(most) - most, np.zeros(len(most), np.int64)
+    slots = tuple(np.empty(most.sum(), t) for t in (np.int32, np.int32, np.float64))
+    regions = (projected.gaussian.numpy(), labels.numpy(), 1, 16)
+    kernels.fill(offsets, members, *arrays, everywhere, *regions, limits, first, used, slots, 3)
+    expected = kernels.merge(first, used, slots, 300, 7)
+    found = backend.views_evidence(job, Batch([camera], [labels], [6]))
+    for got, exact in zip(found[:3], expected):
+        assert torch.equal(got, torch.from_numpy(exact).to(got.dtype))
+    assert len(found.weight) > 300
+
+
+@pytest.mark.parametrize("power", [0, 1, 2])
+@pytest.mark.parametrize("regions", [1, 3, 40])
+@pytest.mark.parametrize("size", [5, 16, 20])
+def test_equals_the_reference_whatever_the_tile_and_the_labels(power, regions, size):
+    scene, camera = shapes_of_all_kinds(80, 5, torch.float64), orbit_camera(0.4, width=45, height=38)
+    labels = [random_labels(camera, regions)]
+    rules = replace(SETTINGS, tile_size=size)
+    found, expected = (
+        dense(
+            rasterize_evidence(
+                scene, [camera], labels, num_regions=[regions], weight_power=power, settings=rules, backend=name
+            ).rows,
+            regions,
+        )
+        for name in ("numba", "torch")
+    )
+    assert (found - expected).abs().max() < 1e-12 * expected.max()
+    pictures = [
+        render(scene, camera, torch.rand(80, 3, generator=generator(1)), settings=rules, backend=name)
+        for name in ("numba", "torch")
+    ]
+    for got, exact in zip(*pictures):
+        assert (got - exact).abs().max() < 1e-6
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    scene, camera = random_scene(200, seed=3, dtype=torch.float32, size=0.4), orbit_camera(0.3, width=70, height=50)
+    labels, before = [random_labels(camera, 5)], numba.get_num_threads()
+    try:
+        found = []
+        for threads in {1, before}:
+            numba.set_num_threads(threads)
+            found.append(rasterize_evidence(scene, [camera], labels, backend="numba").rows.weight)
+    finally:
+        numba.set_num_threads(before)
+    assert all(torch.equal(found[0], other) for other in found)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(np.float32, 1e-7), (np.float64, 4e-16)])
+def test_exp_is_exact_to_the_last_bits(dtype, bound):
+    """Against a wider format, in the range that a pixel can feel and beyond."""
+
+    @numba.njit
+    def many(values):
+        return np.array([kernels.exp(x) for x in values])
+
+    for low in (-1e-3, -6.0, -80.0):
+        x = np.random.default_rng(0).uniform(low, 0, 300_000).astype(dtype)
+        found, exact = many(x), np.exp(x.astype(np.longdouble))
+        assert found.dtype == dtype
+        assert np.abs(found / exact - 1).max() < bound
+    assert many(np.array([0.0, -1e30, -np.inf], dtype)).tolist()[0] == 1
+    assert many(np.array([-1e30, -np.inf], dtype)).max() < 1e-37
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_what_is_warmed_is_what_is_called(dtype):
+    """A call after `warm` finds every kernel with its types: it adds no signature."""
+    backend.warm(dtype).join()
+    before = {kernel: list(kernel.signatures) for kernel, _ in backend.kernel_signatures(dtype)}
+    scene, camera = random_scene(20, dtype=dtype, size=0.4), orbit_camera(0.0)
+    rasterize_evidence(scene, [camera], [random_labels(camera, 3)], backend="numba")
+    render(scene, camera, torch.ones(20, 1, dtype=dtype), backend="numba")
+    assert {kernel: list(kernel.signatures) for kernel in before} == before
+
+
+CHILD = """
+import torch
+from normlift_ns.raster import numba as backend
+backend.warm(torch.float32).join()
+kernels = [kernel for kernel, _ in backend.kernel_signatures(torch.float32)]
+print(sum(sum(k.stats.cache_hits.values()) for k in kernels), sum(sum(k.stats.cache_misses.values()) for k in kernels))
+print(kernels[0].stats.cache_path)
+"""
+
+
+@pytest.mark.slow
+def test_a_second_process_compiles_nothing_even_beside_code_that_cannot_be_written(tmp_path):
+    """Where no folder for bytecode can be made beside the code, numba keeps its cache in the user's folder."""
+    package = tmp_path / "installed" / "normlift_ns"
+    shutil.copytree(Path(normlift_ns.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "raster" / "__pycache__").write_bytes(b"")
+    environment = {**os.environ, "PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", CHILD], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
+        for _ in range(2)
+    ]
+    (first, path), (second, _) = (run.stdout.split("\n")[:2] for run in runs)
+    assert [first, second] == ["0 5", "5 0"]
+    assert Path(path).is_relative_to(tmp_path / "cache")
