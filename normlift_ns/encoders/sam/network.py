@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import torch
@@ -79,8 +79,16 @@ class SamNetwork:
         return self._prompts(lambda batch: self.decode(embedding, batch), scaled)
 
     def decode(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]) -> Answers:
-        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input."""
-        return self._decoder(embedding, points.to(self._device))
+        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input. What is too large
+        for float16 is answered in float32."""
+        masks, ious = self._decoder(embedding, points.to(self._device))
+        if self._dtype == torch.float16 and not bool(ious.isfinite().all()):
+            return self._exact(embedding, points.to(self._device))
+        return masks, ious
+
+    @cached_property
+    def _exact(self) -> MaskDecoder:
+        return MaskDecoder(self._model, torch.float32)
 
     def enlarge(self, logits: Float[Tensor, "n y x"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
         """Logits at the size of the image, in float32, bilinear: first to the size of the input, then, without its
