@@ -1,4 +1,4 @@
-"""SAM's network in other precisions, compiled and not, against transformers' own code in float32."""
+"""SAM's network in other precisions, compiled and not, against transformers' own code in float64."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     path = tmp_path_factory.mktemp("sam") / "sam.pth"
-    write_sam(path, seed=1, gain=2)
+    write_sam(path, seed=1)
     return path
 
 
@@ -31,28 +31,48 @@ def embedding(checkpoint):
 
 @pytest.fixture(scope="module")
 def expected(checkpoint, embedding):
-    """The answers of transformers."""
+    """The answers of transformers in float64."""
+    return by_transformers(str(checkpoint), embedding, torch.float64)
+
+
+def by_transformers(path: str, embedding: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     with torch.no_grad():
-        found = load_sam(str(checkpoint))(
-            image_embeddings=embedding, input_points=POINTS[None, :, None], multimask_output=True
-        )
+        found = load_sam(path).to(dtype)(image_embeddings=embedding.to(dtype), input_points=POINTS[None, :, None])
     return found.pred_masks[0], found.iou_scores[0]
 
 
-def close(found, expected, bound: float) -> None:
+def errors(found, expected) -> tuple[float, float]:
+    """Of logits, as a share of the largest, and of predicted IoU; the largest."""
     scale = float(expected[0].abs().max())
-    torch.testing.assert_close(found[0].cpu().float(), expected[0], rtol=0, atol=bound * scale)
-    torch.testing.assert_close(found[1].cpu(), expected[1], rtol=0, atol=bound)
+    (logits, ious), (exact, scores) = found, expected
+    return float((logits.cpu().double() - exact).abs().max()) / scale, float((ious.cpu().double() - scores).abs().max())
 
 
-@pytest.mark.parametrize(("precision", "bound"), [("float32", 1e-5), ("float16", 1e-2), ("bfloat16", 8e-2)])
+def close(found, expected, bound: float) -> None:
+    assert max(errors(found, expected)) < bound
+
+
+@pytest.mark.parametrize(("precision", "bound"), [("float32", 2e-6), ("float16", 8e-3), ("bfloat16", 4e-2)])
 def test_answers_in_each_precision(checkpoint, embedding, expected, precision, bound):
     found = SamNetwork.load(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
     close(found, expected, bound)
     assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
     assert float(expected[0].std(dim=0).mean()) > 0.01 * float(expected[0].abs().max())  # masks depend on their point
-    agree = ((found[0].float() > 0) == (expected[0] > 0)).float().mean()
-    assert float(agree) > 1 - 2 * bound
+    agree = ((found[0] > 0) == (expected[0] > 0)).float().mean()
+    assert float(agree) > 1 - bound / 4
+
+
+@pytest.mark.parametrize("precision", ["float32", "float16", "bfloat16"])
+def test_errors_are_no_larger_than_those_of_transformers(tmp_path, embedding, precision):
+    """Where weights make rounding grow a hundredfold; in half precision transformers runs under autocast."""
+    path = tmp_path / "sam.pth"
+    write_sam(path, seed=1, gain=2)
+    expected = by_transformers(str(path), embedding, torch.float64)
+    found = SamNetwork.load(str(path), "cpu", precision).decode(embedding, POINTS)
+    with torch.autocast("cpu", getattr(torch, precision), enabled=precision != "float32"):
+        theirs = by_transformers(str(path), embedding, torch.float32)
+    here, there = (float((x[0].double() - expected[0]).square().mean().sqrt()) for x in (found, theirs))
+    assert 0 < here < (1.5 if precision == "float32" else 0.8) * there
 
 
 def test_a_compiled_decoder_gets_batches_of_one_size(checkpoint, embedding, expected, monkeypatch):
@@ -70,18 +90,16 @@ def test_a_compiled_decoder_gets_batches_of_one_size(checkpoint, embedding, expe
     monkeypatch.setattr(decoder_module.torch, "compile", compile_nothing)
     network = SamNetwork(load_sam(str(checkpoint)), "cpu", "float32", compiled=True)
     parts = list(network.prompt(embedding, POINTS, (SIDE, SIDE)))
-    close(tuple(map(torch.cat, zip(*parts))), expected, 1e-5)
+    close(tuple(map(torch.cat, zip(*parts))), expected, 2e-6)
     assert asked == [16, 16] and [len(part[1]) for part in parts] == [16, 5]
 
 
-def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding, expected):
+def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
     network = SamNetwork.load(str(checkpoint), "cpu", "float16")
     huge = 1e6 * embedding  # beyond float16
-    with torch.no_grad():
-        large = load_sam(str(checkpoint))(image_embeddings=huge, input_points=POINTS[None, :, None])
     masks, ious = network.decode(huge, POINTS)
-    assert bool(large.iou_scores.isfinite().all()) and masks.dtype == torch.float32
-    close((masks, ious), (large.pred_masks[0], large.iou_scores[0]), 1e-4)
+    assert masks.dtype == torch.float32
+    close((masks, ious), by_transformers(str(checkpoint), huge, torch.float64), 1e-4)
 
 
 def test_precision_is_part_of_the_identity(checkpoint):
@@ -102,7 +120,7 @@ def test_the_option_reaches_the_network(checkpoint):
 
 @needs_cuda
 @pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize(("precision", "bound"), [("float32", 1e-4), ("float16", 1e-2), ("bfloat16", 8e-2)])
+@pytest.mark.parametrize(("precision", "bound"), [("float32", 1e-4), ("float16", 8e-3), ("bfloat16", 4e-2)])
 def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected, precision, bound, compiled):
     network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision, compiled)
     close(network.decode(embedding.cuda(), POINTS), expected, bound)
