@@ -128,7 +128,14 @@ def small_sam(size: Size) -> Any:
         window_size=8,
     )
     prompt = transformers.SamPromptEncoderConfig(image_size=size.side, patch_size=8)
-    return transformers.SamModel(transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt))
+    model = transformers.SamModel(transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt))
+    for module in model.modules():  # as Meta begins; transformers' own beginnings are nearly 0
+        if hasattr(module, "reset_parameters"):
+            module.reset_parameters()
+    with torch.no_grad():
+        model.shared_image_embedding.positional_embedding.normal_()
+        model.prompt_encoder.shared_embedding.positional_embedding = model.shared_image_embedding.positional_embedding
+    return model
 
 
 def losses(logits: Tensor, ious: Tensor, truth: Tensor) -> Tensor:
@@ -157,7 +164,7 @@ def train(model: Any, size: Size, device: str) -> list[float]:
         where = torch.randint(0, size.side, (2, size.batch, size.prompts), generator=g, device=device)
         truth = torch.stack([made.truth(i, where[0, i], where[1, i]) for i in range(size.batch)]).float()
         pixels = network.pixels(list(photographed(made.colours, g)))
-        with torch.autocast(device, torch.bfloat16, enabled=device != "cpu"):
+        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=device != "cpu"):
             found = model(pixel_values=pixels, input_points=where.flip(0).permute(1, 2, 0)[:, :, None].float())
         low = avg_pool2d(truth.flatten(0, 1), size.side // found.pred_masks.shape[-1]).unflatten(0, truth.shape[:2])
         loss = losses(found.pred_masks.float(), found.iou_scores.float(), low)
@@ -165,7 +172,7 @@ def train(model: Any, size: Size, device: str) -> list[float]:
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
-        values.append(float(loss))
+        values.append(float(loss.detach()))
         share = (time.perf_counter() - start) / size.seconds
     model.eval().requires_grad_(False)
     return values

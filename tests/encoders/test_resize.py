@@ -1,4 +1,4 @@
-"""Pillow's bilinear resize: to the bit, but where Pillow 13 begins with the columns, which moves pixels by one at most."""
+"""Pillow's bilinear resize, to the bit; where Pillow 13 begins with the columns, to one grey value."""
 
 import numpy as np
 import torch
