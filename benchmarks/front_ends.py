@@ -237,9 +237,13 @@ def add_networks(
     report: Report, model: Any, pixels: Tensor, points: Tensor, device: str, exact: Exact, variants: bool
 ) -> None:
     """Times of the network in other precisions and, where asked for, compiled."""
-    kinds: list[tuple[SamPrecision, bool]] = [("float32", False)]
-    if variants:
-        kinds += [("float16", False), ("bfloat16", False), ("float16", True), ("bfloat16", True)]
+    others: list[tuple[SamPrecision, bool]] = [
+        ("float16", False),
+        ("bfloat16", False),
+        ("float16", True),
+        ("bfloat16", True),
+    ]
+    kinds: list[tuple[SamPrecision, bool]] = [("float32", False), *(others if variants else [])]
     for precision, compiled in kinds:
         network = SamNetwork(model, device, precision, compiled)
         name = f"sam_{'compiled_' * compiled}{precision}"

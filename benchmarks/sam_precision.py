@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import torch
 import transformers
 from torch import Tensor
+from torch.nn import Conv2d, ConvTranspose2d, Embedding, Linear
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits
 
 from benchmarks.report import RESULTS, Report
@@ -130,7 +131,7 @@ def small_sam(size: Size) -> Any:
     prompt = transformers.SamPromptEncoderConfig(image_size=size.side, patch_size=8)
     model = transformers.SamModel(transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt))
     for module in model.modules():  # as Meta begins; transformers' own beginnings are nearly 0
-        if hasattr(module, "reset_parameters"):
+        if isinstance(module, Linear | Conv2d | ConvTranspose2d | Embedding):
             module.reset_parameters()
     with torch.no_grad():
         model.shared_image_embedding.positional_embedding.normal_()

@@ -33,7 +33,8 @@ def test_equals_masks_that_are_made(dtype, side, scaled, size):
     logits[-1] = -5.0  # an empty mask
     logits[-2] = 5.0  # a full one
     rows, columns = (taps(side // 4, side, s, n) for s, n in zip(scaled, size))
-    inner, outer, boxes = measure_masks(*(x.to(DEVICE) for x in (logits, *rows, *columns)), 1.0)
+    low, *weights = (x.to(DEVICE) for x in (logits, *rows, *columns))
+    inner, outer, boxes = measure_masks(low, *weights, offset=1.0)
     large = enlarged(logits, side, scaled, size)
     expected = measured(large, 1.0)
     close = CLOSE * float(large.abs().max())

@@ -51,8 +51,7 @@ class Measured(NamedTuple):
 def measured(logits: Float[Tensor, "m h w"], offset: float) -> Measured:
     """How large masks are at two thresholds of the logits, 0 plus and minus the offset, and where they lie."""
     inner, outer = ((logits > bound).flatten(1).view(torch.uint8) for bound in (offset, -offset))
-    sizes = (mask.sum(dim=1, dtype=torch.int32) for mask in (inner, outer))
-    return Measured(*sizes, boxes_of(logits > 0))
+    return Measured(inner.sum(dim=1, dtype=torch.int32), outer.sum(dim=1, dtype=torch.int32), boxes_of(logits > 0))
 
 
 def mask_nms(
