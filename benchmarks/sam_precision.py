@@ -201,7 +201,8 @@ class Cut(NamedTuple):
 
 
 def cut(model: Any, image: Tensor, precision: SamPrecision, size: Size, device: str) -> Cut:
-    rules = MaskRules(points_per_side=size.points, region_area=20, edge=6)
+    suppression = Suppression(score=0.4)
+    rules = MaskRules(size.points, predicted_iou=0.6, stability=0.8, region_area=20, edge=6, suppression=suppression)
     if size == SMALL:  # whose masks are poor
         loose = Suppression(score=-1.0)
         rules = MaskRules(size.points, predicted_iou=-9.0, stability=0.01, region_area=2, edge=1, suppression=loose)
