@@ -1,16 +1,23 @@
 """What seeing the images costs: SAM's network, the rules on its masks, CLIP on their crops, CLIP's patches.
 
 All networks have random weights. Masks are injected: cells of a power diagram, whose areas spread as those of objects
-do, each grown over its neighbours; for the suppression three in ten are replaced by near copies of others.
+do, each grown over its neighbours; for the suppression three in ten are replaced by near copies of others. Images are
+looked at once before anything is timed, but for `cold_50_s`: 50 images in a process of its own, whose caches of
+compiled kernels are empty.
 
-    python -m benchmarks.front_ends            SAM ViT-H and CLIP ViT-B-16, images of 988 x 731
-    python -m benchmarks.front_ends --quick    small networks and images, which runs anywhere
+    python -m benchmarks.front_ends               SAM ViT-H and CLIP ViT-B-16, images of 988 x 731
+    python -m benchmarks.front_ends --quick       small networks and images, which runs anywhere
+    python -m benchmarks.front_ends --variants    also other precisions, compiled networks, and where kernels spend time
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
+import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -27,14 +34,17 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.report import RESULTS, Report
+from normlift_ns.encoders import source as source_module
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import PatchFeatures
 from normlift_ns.encoders.sam import masks as sam_module
+from normlift_ns.encoders.sam import network as network_module
 from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
 from normlift_ns.encoders.sam.network import SamNetwork
 from normlift_ns.encoders.sam.rules import Suppression, mask_nms, stack_masks
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.source import RegionFeatures
+from normlift_ns.options import SamPrecision
 
 _REPEATS = 3
 
@@ -51,9 +61,11 @@ class Size:
     clip: str = "ViT-B-16"
     vision: tuple[int, int, int, int] = (1280, 32, 16, 1024)
     """Width, layers, heads and input side of SAM's image encoder."""
+    cold: int = 50
+    """Images of the process that begins without compiled kernels."""
 
 
-SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128))
+SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128), 2)
 SMALL_CLIP = {
     "embed_dim": 24,
     "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
@@ -162,16 +174,26 @@ def disagreements(masks: Tensor, scores: Tensor) -> float:
 
 
 class Injected(SamNetwork):
-    """The network, whose answers are then replaced by blobs of three sizes around the points."""
+    """The network, whose answers are then replaced by blobs of three sizes around the points. The blobs are made once,
+    so that making them costs no time."""
 
     side = 1024
+    kept: dict[tuple[float, ...], tuple[Tensor, Tensor]]
 
     def decode(self, embedding: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         logits, _ = super().decode(embedding, points)
-        p = points.to(logits.device)[:, None, None, None, :] / self.side
-        line = (torch.arange(logits.shape[-1], device=logits.device) + 0.5) / logits.shape[-1]
+        self.kept = getattr(self, "kept", {})
+        key = (len(points), *points[:1].flatten().tolist(), *points[-1:].flatten().tolist())
+        if key not in self.kept:
+            blobs, ious = self.blobs(points.to(logits.device), logits.shape[-1])
+            self.kept[key] = blobs.to(logits.dtype), ious
+        return self.kept[key]
+
+    def blobs(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        p = points[:, None, None, None, :] / self.side
+        line = (torch.arange(count, device=points.device) + 0.5) / count
         y, x = torch.meshgrid(line, line, indexing="ij")
-        radius = torch.tensor([0.04, 0.08, 0.16], device=logits.device)[:, None, None]
+        radius = torch.tensor([0.04, 0.08, 0.16], device=points.device)[:, None, None]
         radius = radius * (1 + 0.5 * torch.sin(9 * p[..., 0] + 5 * p[..., 1]))
         waves = torch.sin(90 * x + 17 * p[..., 0]) * torch.sin(70 * y + 23 * p[..., 1])
         away = ((x - p[..., 0]) ** 2 + (y - p[..., 1]) ** 2).sqrt()
@@ -179,44 +201,207 @@ class Injected(SamNetwork):
         return 600 * (radius - away) + 12 * waves, 0.8 + 0.2 * torch.sin(phase)
 
 
-def main(quick: bool, output: Path, device: str) -> None:
+@dataclass(frozen=True)
+class Exact:
+    """Answers in float64, to some prompts on the first crop."""
+
+    embedding: Tensor
+    points: Tensor
+    logits: Tensor
+
+    @classmethod
+    def of(cls, model: Any, pixels: Tensor, points: Tensor) -> Exact:
+        model = copy.deepcopy(model).double()
+        with torch.no_grad():
+            embedding = model.get_image_embeddings(pixels[:1].double())
+            found = model(image_embeddings=embedding, input_points=points[None, :, None].to(pixels.device).double())
+        return cls(embedding, points, found.pred_masks[0])
+
+    def encoder_error(self, network: SamNetwork, pixels: Tensor) -> float:
+        """Length of the error of an embedding over its length."""
+        return float((network.embed(pixels[:1])[0] - self.embedding).norm() / self.embedding.norm())
+
+    def decoder_error(self, network: SamNetwork) -> float:
+        """The same of logits, for the exact embedding."""
+        found = SamNetwork.decode(network, self.embedding.float(), self.points)[0]
+        return float((found.double() - self.logits).norm() / self.logits.norm())
+
+
+def decode_all(network: SamNetwork, embeddings: list[Tensor], points: Tensor) -> None:
+    for embedding in embeddings:
+        for batch in points.split(256):
+            SamNetwork.decode(network, embedding, batch)
+
+
+def add_networks(
+    report: Report, model: Any, pixels: Tensor, points: Tensor, device: str, exact: Exact, variants: bool
+) -> None:
+    """Times of the network in other precisions and, where asked for, compiled."""
+    others: list[tuple[SamPrecision, bool]] = [
+        ("float16", False),
+        ("bfloat16", False),
+        ("float16", True),
+        ("bfloat16", True),
+    ]
+    kinds: list[tuple[SamPrecision, bool]] = [("float32", False), *(others if variants else [])]
+    for precision, compiled in kinds:
+        network = SamNetwork(model, device, precision, compiled)
+        name = f"sam_{'compiled_' * compiled}{precision}"
+        if not compiled:
+            unit, error = f"s/image, {len(pixels)} crops", exact.encoder_error(network, pixels)
+            report.add(f"{name}_encoder_s", seconds(lambda network=network: network.embed(pixels), device), unit, error)
+        embeddings, unit = network.embed(pixels), f"s/image, {len(pixels) * len(points)} prompts"
+        with going_on(name, compiled):
+            start = time.perf_counter()
+            error = exact.decoder_error(network)
+            report.add(f"{name}_first_s", time.perf_counter() - start, "first call, compilation included")
+            time_s = seconds(lambda network=network, e=embeddings: decode_all(network, e, points), device)
+            report.add(f"{name}_decoder_s", time_s, unit, error)
+    if variants:
+        for name, half, compiled in (("half", True, False), ("compiled", False, True), ("compiled_half", True, True)):
+            with going_on(name, compiled):
+                add_encoder(report, model, pixels, device, exact, name, half, compiled)
+
+
+@contextmanager
+def going_on(name: str, foreign: bool) -> Iterator[None]:
+    """Compilers raise whatever they like where they do not work; the rest of the benchmark does without them."""
+    try:
+        yield
+    except Exception as error:
+        if not foreign:
+            raise
+        print(f"{name} does not work here: {error}")
+
+
+def add_encoder(
+    report: Report, model: Any, pixels: Tensor, device: str, exact: Exact, name: str, half: bool, compiled: bool
+) -> None:
+    """Time of the image encoder with weights and residuals in float16 or without, compiled or not."""
+    encoder = copy.deepcopy(model.vision_encoder)
+    encoder = encoder.half() if half else encoder
+    run = torch.compile(encoder, dynamic=False) if compiled else encoder
+
+    @torch.no_grad()
+    def embed() -> Tensor:
+        with torch.autocast(torch.device(device).type, torch.float16, enabled=not half):
+            return run(pixels.half() if half else pixels)[0].float()
+
+    start = time.perf_counter()
+    error = float((embed()[:1] - exact.embedding).norm() / exact.embedding.norm())
+    report.add(f"sam_encoder_{name}_first_s", time.perf_counter() - start, "first call")
+    report.add(f"sam_encoder_{name}_s", seconds(embed, device), f"s/image, {len(pixels)} crops", error)
+
+
+def changed_pixels(found: Tensor, exact: Tensor) -> float:
+    """Share of pixels outside of the region of an exact label map that shares most with their own."""
+    pairs = torch.stack([found.flatten(), exact.flatten()]).long().cpu() + 1
+    shared = torch.zeros(*(int(line.max()) + 1 for line in pairs))
+    shared.index_put_(tuple(pairs), torch.ones(pairs.shape[1]), accumulate=True)
+    return 1 - float(shared.amax(dim=1).sum()) / pairs.shape[1]
+
+
+@contextmanager
+def plain() -> Iterator[None]:
+    """Masks are made before they are measured."""
+    kernels_apply = network_module.kernels_apply
+    network_module.kernels_apply = lambda tensor: False
+    try:
+        yield
+    finally:
+        network_module.kernels_apply = kernels_apply
+
+
+def injected_sam(
+    size: Size, model: Any, device: str, precision: SamPrecision = "auto", compiled: bool = False
+) -> SamMasks:
+    Injected.side = size.vision[3]
+    sam = SamMasks("nobody/nothing", rules=MaskRules(points_per_side=size.points), device=device, precision=precision)
+    vars(sam)["network"] = Injected(model, device, precision, compiled)
+    return sam
+
+
+def cold(size: Size, device: str, compiled: bool) -> None:
+    """Prints the seconds of some images, the first of this process; networks are there."""
+    g = torch.Generator().manual_seed(0)
+    model = random_sam(size, device)
+    with tempfile.TemporaryDirectory() as folder:
+        encoder = random_clip(size, Path(folder), device)
+        _ = encoder.network
+    source = RegionFeatures(injected_sam(size, model, device, compiled=compiled), encoder)
+    shape = (size.cold, size.height, size.width, 3)
+    images = torch.randint(0, 256, shape, generator=g, dtype=torch.uint8)
+    start, first = time.perf_counter(), 0.0
+    for i, _ in enumerate(source.views((image, f"{i}") for i, image in enumerate(images))):
+        first = time.perf_counter() - start if i == 0 else first
+    print(json.dumps([time.perf_counter() - start, first]))
+
+
+def cold_seconds(quick: bool, device: str, compiled: bool = False) -> tuple[float, float]:
+    """Of a process of its own without compiled kernels: of all images, and until the first is done."""
+    with tempfile.TemporaryDirectory() as folder:
+        caches = {name: f"{folder}/{name}" for name in ("TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR")}
+        command = [sys.executable, "-m", "benchmarks.front_ends", "--cold", "--device", device]
+        command += ["--quick"] * quick + ["--compiled"] * compiled
+        done = subprocess.run(command, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(done.stderr)
+    every, first = json.loads(done.stdout.splitlines()[-1])
+    return every, first
+
+
+def print_profile(function: Callable[[], object], device: str) -> None:
+    """Where kernels spend the time of one call."""
+    kinds = [torch.profiler.ProfilerActivity.CPU]
+    kinds += [torch.profiler.ProfilerActivity.CUDA] * device.startswith("cuda")
+    with torch.profiler.profile(activities=kinds) as profile:
+        function()
+    by = "self_device_time_total" if device.startswith("cuda") else "self_cpu_time_total"
+    print(profile.key_averages().table(sort_by=by, row_limit=30, max_name_column_width=70))
+
+
+STEPS = {
+    "pixels": (SamNetwork, "pixels"),
+    "embed": (SamNetwork, "embed"),
+    "candidates": (SamMasks, "_candidates"),  # the mask decoder and measuring included
+    "decode": (SamNetwork, "decode"),
+    "measure": (SamNetwork, "measure"),
+    "distinct": (sam_module, "_distinct"),
+    "whole": (SamMasks, "_whole"),
+    "clean": (sam_module, "clean_masks"),
+    "nms": (sam_module, "mask_nms"),
+    "stack": (sam_module, "stack_masks"),
+}
+
+
+def main(quick: bool, output: Path, device: str, variants: bool) -> None:
     size = SMALL if quick else Size()
     report, g = Report("front_ends"), torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (size.height, size.width, 3), generator=g, dtype=torch.uint8)
-    Injected.side = size.vision[3]
-    network = Injected(random_sam(size, device), device)
+    model = random_sam(size, device).requires_grad_(False)
+    sam = injected_sam(size, model, device)
+    network = sam.network
 
     crops = crop_boxes(size.height, size.width, MaskRules().crop_overlap)
-    pixels = network.pixels([image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]).to(device)
+    pixels = network.pixels([image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops])
     embeddings, points = network.embed(pixels), point_grid(size.points).float() * size.vision[3]
+    exact_answers = Exact.of(model, pixels, points[:: max(1, len(points) // 8)])
 
-    def answer() -> None:
-        for embedding in embeddings:
-            for batch in points.split(256):
-                SamNetwork.decode(network, embedding, batch)
-
-    encoder_s, decoder_s = seconds(lambda: network.embed(pixels), device), seconds(answer, device)
+    encoder_s = seconds(lambda: network.embed(pixels), device)
+    decoder_s = seconds(lambda: decode_all(network, embeddings, points), device)
     sam_s = encoder_s + decoder_s
-    report.add("sam_encoder_s", encoder_s, f"s/image, {len(crops)} crops")
-    report.add("sam_decoder_s", decoder_s, f"s/image, {len(crops) * len(points)} prompts")
+    report.add("sam_encoder_s", encoder_s, f"s/image, {len(crops)} crops", exact_answers.encoder_error(network, pixels))
+    unit = f"s/image, {len(crops) * len(points)} prompts"
+    report.add("sam_decoder_s", decoder_s, unit, exact_answers.decoder_error(network))
     report.add("sam_network_rate", 1 / sam_s, "images/s, network alone")
-    sam = SamMasks("nobody/nothing", rules=MaskRules(points_per_side=size.points), device=device)
-    vars(sam)["network"] = network
+    add_networks(report, model, pixels, points, device, exact_answers, variants)
     found = sam.masks(image)
     labels_s = seconds(lambda: sam.labels(image, ""), device)
     report.add("sam_labels_s", labels_s, "s/image, four levels of injected masks, rules included")
     for level in LEVELS:
         report.add(f"sam_masks_{level}", len(found[level]), "masks")
     report.add("sam_rules_share", (labels_s - sam_s) / sam_s, "of the network's time")
-    steps = {
-        "pixels": (SamNetwork, "pixels"),
-        "candidates": (SamMasks, "_candidates"),  # the mask decoder included
-        "whole": (SamMasks, "_whole"),
-        "clean": (sam_module, "clean_masks"),
-        "nms": (sam_module, "mask_nms"),
-        "stack": (sam_module, "stack_masks"),
-    }
-    for step, (owner, name) in steps.items():
+    for step, (owner, name) in STEPS.items():
         with stopwatch(owner, name, device) as times:
             sam.labels(image, "")
         report.add(f"sam_labels_{step}_s", sum(times), f"of these, calls of {name}")
@@ -237,11 +422,35 @@ def main(quick: bool, output: Path, device: str) -> None:
         report.add(f"nms_{count}_s", nms_s, "s/level", disagreements(copies, scores))
         report.add(f"clean_{count}_s", clean_s, "s/level")
         report.add(f"encode_{count}_s", encode_s, f"s/level, {len(labels)} deep", off)
-        share, bar = (nms_s + encode_s) / sam_s, "; must be below 0.1" * (count == 300)
-        report.add(f"share_{count}", share, f"NMS + encoding over SAM's network, one level{bar}")
+        share = (nms_s + encode_s) / sam_s
+        report.add(f"share_{count}", share, "NMS + encoding over SAM's network, one level")
         report.add(f"share_clean_{count}", share + clean_s / sam_s, "the same with repair of small regions")
-    view_s = seconds(lambda: RegionFeatures(sam, encoder).view(image, ""), device)
-    report.add("view_s", view_s, f"s/image, all of it: network, rules, CLIP on {len(found['l'])} masks of level l")
+    source = RegionFeatures(sam, encoder)
+    with plain():
+        whole = injected_sam(size, model, device, "float32").labels(image, "")
+    off = changed_pixels(sam.labels(image, "")[-1, 0], whole[-1, 0])
+    what = f"network, rules, CLIP on {len(found['l'])} masks of level l"
+    view_s = seconds(lambda: source.view(image, ""), device)
+    report.add("view_s", view_s, f"s/image, all of it: {what}", off)
+    for step, (owner, name) in {
+        "labels": (SamMasks, "labels"),
+        "partition": (source_module, "joint_partition"),
+        "clip": (OpenClipEncoder, "_image_rows"),
+    }.items():
+        with stopwatch(owner, name, device) as times:
+            source.view(image, "")
+        report.add(f"view_{step}_s", sum(times), f"of these, calls of {name}")
+    cold_s, first_s = cold_seconds(quick, device)
+    report.add(
+        f"cold_{size.cold}_s", cold_s, f"s for {size.cold} images, without compiled kernels, of a new process", off
+    )
+    report.add("cold_first_s", first_s, "s of these for the first")
+    if variants:
+        with going_on("compiled decoder", True):
+            report.add(
+                f"cold_{size.cold}_compiled_s", cold_seconds(quick, device, True)[0], "the same, decoder compiled"
+            )
+        print_profile(lambda: source.view(image, ""), device)
     patches = PatchFeatures(encoder, size.patches)
     near = PatchFeatures(exact, size.patches).features(image, "")
     off = (1 - (normalize(patches.features(image, ""), dim=1) * near).sum(dim=1)).abs().max()
@@ -254,7 +463,13 @@ def main(quick: bool, output: Path, device: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small networks and images")
+    parser.add_argument("--variants", action="store_true", help="other precisions, compiled networks, a profile")
+    parser.add_argument("--cold", action="store_true", help="only some images in this process, which are timed")
+    parser.add_argument("--compiled", action="store_true", help="these with a compiled decoder")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()
-    main(arguments.quick, arguments.output, arguments.device)
+    if arguments.cold:
+        cold(SMALL if arguments.quick else Size(), arguments.device, arguments.compiled)
+    else:
+        main(arguments.quick, arguments.output, arguments.device, arguments.variants)

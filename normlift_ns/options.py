@@ -25,6 +25,7 @@ Unlabeled = Literal["ignore", "dilute"]
 EncoderName = Literal["open_clip", "colour"]
 RegionsName = Literal["auto", "sam", "patches", "superpixel", "grid", "files"]
 FeaturesName = Literal["none", "langsplat"]
+SamPrecision = Literal["auto", "float32", "float16", "bfloat16"]
 Fill = Literal["black", "white"]
 Missing = Literal["error", "skip"]
 
@@ -79,6 +80,8 @@ class SourceOptions:
     sam_model: str | None = None
     """Weights of SAM: a folder in the format of transformers, a file published by Meta, or a name to download. By
     default facebook/sam-vit-huge, as LangSplat uses."""
+    sam_precision: SamPrecision = "auto"
+    """Precision of SAM's network. auto: float16 on a GPU, float32 elsewhere."""
     regions_dir: Path | None = None
     """Folder with one label map per image, PNG or NPY with the same stem."""
     regions_background: int = 0

@@ -55,10 +55,33 @@ def test_quick_front_ends_benchmark(tmp_path):
     print(done.stdout)
     metrics = {metric["key"]: metric for metric in json.loads((tmp_path / "front_ends.json").read_text())["metrics"]}
     keys = {"nms_10_s", "clean_10_s", "encode_10_s", "share_10", "share_clean_10", "patches_s", "view_s"}
-    assert keys | {"sam_network_rate", "sam_labels_s", "sam_labels_clean_s"} <= set(metrics)
+    assert keys | {"sam_network_rate", "sam_labels_s", "sam_labels_clean_s", "cold_2_s"} <= set(metrics)
     assert all(metrics[f"sam_masks_{level}"]["value"] > 0 for level in ("default", "s", "m", "l"))
     assert metrics["nms_10_s"]["error"] == 0
     assert metrics["encode_10_s"]["error"] < 1e-5 and metrics["patches_s"]["error"] < 1e-5
+    assert metrics["sam_encoder_s"]["error"] < 1e-5 and metrics["sam_decoder_s"]["error"] < 1e-4
+    assert metrics["view_s"]["error"] == 0 == metrics["cold_2_s"]["error"]
+
+
+@pytest.mark.slow
+def test_quick_precision_benchmark(tmp_path):
+    """Masks of a network that learned nothing, the same way through."""
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.sam_precision",
+        "--quick",
+        "--device",
+        "cpu",
+        "--output",
+        str(tmp_path),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    metrics = {metric["key"]: metric for metric in json.loads((tmp_path / "sam_precision.json").read_text())["metrics"]}
+    for kind in ("float16", "bfloat16", "noise"):
+        assert {f"{kind}_truth_iou", f"{kind}_miou", f"{kind}_changed_survivors"} <= set(metrics)
+        assert 0.8 < metrics[f"{kind}_mask_iou"]["value"] < 1
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.json")), ids=lambda path: path.name)

@@ -116,7 +116,7 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
     """
     kind = resolve_regions(options, device)
     if kind != "sam":
-        _refuse(options.sam_model, "--sam-model", kind, "sam")
+        _refuse_sam(options, kind)
     if kind == "files":
         if options.regions_dir is None:
             raise InputError(
@@ -127,7 +127,7 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
     _refuse(options.regions_dir, "--regions-dir", kind, "files")
     if kind == "sam":
         level: Any = options.level or "l"
-        return SamMasks(options.sam_model or DEFAULT_SAM, level, device)
+        return SamMasks(options.sam_model or DEFAULT_SAM, level, device, options.sam_precision)
     _refuse(options.level, "--level", kind, "files or sam")
     count = 256 if options.region_count is None else options.region_count
     if kind == "patches":
@@ -136,7 +136,7 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
 
 
 def _make_patches(options: SourceOptions, device: str) -> PatchFeatures:
-    _refuse(options.sam_model, "--sam-model", "patches", "sam")
+    _refuse_sam(options, "patches")
     _refuse(options.regions_dir, "--regions-dir", "patches", "files")
     _refuse(options.level, "--level", "patches", "files or sam")
     if options.encoder != "open_clip":
@@ -148,6 +148,11 @@ def _make_clip(options: SourceOptions, device: str) -> OpenClipEncoder:
     return OpenClipEncoder(
         options.encoder_model, options.encoder_pretrained, options.crop_fill, device, options.text_template
     )
+
+
+def _refuse_sam(options: SourceOptions, kind: str) -> None:
+    _refuse(options.sam_model, "--sam-model", kind, "sam")
+    _refuse(options.sam_precision if options.sam_precision != "auto" else None, "--sam-precision", kind, "sam")
 
 
 def _refuse(value: object, flag: str, kind: str, meant: str) -> None:

@@ -75,7 +75,8 @@ class CachedRegions:
         found = _read(path, "labels", lambda labels: _are_labels(labels, image))
         if found is None:
             found = self.regions.labels(image, name)
-            _write(path, "labels", found.to(torch.int16) if int(found.max()) < 2**15 else found)
+            found = (found.to(torch.int16) if int(found.max()) < 2**15 else found).cpu()
+            _write(path, "labels", found)
         return found.int()
 
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:

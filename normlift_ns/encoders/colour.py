@@ -18,6 +18,7 @@ class ColourEncoder(ColourTexts):
     """Mean CIELAB colours against colour names; formulas in `texts.colours`. Needs neither weights nor a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        labels = labels.cpu()
         depth, y, x = (labels >= 0).nonzero(as_tuple=True)
         lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()
         pixels = torch.bincount(region)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
@@ -144,7 +144,7 @@ class Regions(Protocol):
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Region of every pixel in every level that there is, chosen or not; in each, ids 0..R-1 without gaps, -1 for
-        none. A rule without levels returns one.
+        none. A rule without levels returns one. They may be on any device.
 
         Where regions overlap, the one that counts is on top, at depth 0; those beneath are seen by the encoder only. A
         rule without overlaps returns depth 1.
@@ -211,7 +211,7 @@ class RegionFeatures:
                 maps = self._maps(image.cpu(), name)
                 chosen = list(self.regions.chosen or (0,))
                 cells, regions = joint_partition(maps[:, 0])
-                cut.append((cells, regions[chosen]))
+                cut.append((cells.cpu(), regions[chosen].cpu()))
                 for level in chosen:
                     yield image.cpu(), maps[level]
 
@@ -277,16 +277,29 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
         The cell of every pixel, ids 0..C-1 without gaps, -1 where no level has a label; and the region of every cell in
         every level, -1 for none. With one level without gaps in its ids, cells are its regions.
     """
-    key = torch.zeros(maps.shape[1:], dtype=torch.int64)
+    key = torch.zeros_like(maps[0], dtype=torch.int64)
+    most = 1
     for labels in maps:
-        key = key * (int(labels.max()) + 2) + labels + 1
+        count = int(labels.max()) + 2
+        key, most = key * count + labels + 1, most * count
         if len(maps) > 2:  # so that the product of the numbers of regions stays in 64 bits
-            key = key.unique(return_inverse=True)[1]
-    _, cells = key.unique(return_inverse=True)
-    nothing = bool((maps == -1).all(dim=0).any())  # their key, 0, is the least
-    cells = cells - int(nothing)
-    regions = torch.empty(len(maps), int(cells.max()) + 1, dtype=torch.int32)
+            key, most = _numbered(key, most)
+    cells, count = _numbered(key, most)
+    nothing = int((maps == -1).all(dim=0).any())  # their key, 0, is the least
+    cells = cells - nothing
+    regions = torch.empty(len(maps), count - nothing, dtype=torch.int32, device=maps.device)
     labelled = cells >= 0
     for level, labels in enumerate(maps):
         regions[level, cells[labelled]] = labels[labelled]
     return cells.int(), regions
+
+
+def _numbered(key: Int64[Tensor, "h w"], most: int) -> tuple[Int64[Tensor, "h w"], int]:
+    """Numbers 0..C-1 in the order of the keys, which are in 0..most-1; and C."""
+    if most > 8 * key.numel():
+        values, number = key.unique(return_inverse=True)
+        return number, len(values)
+    there = torch.zeros(most, dtype=torch.bool, device=key.device)
+    there[key] = True
+    number = there.cumsum(0)
+    return number[key] - 1, int(number[-1])

@@ -142,9 +142,13 @@ def test_a_gpu_finds_what_the_cpu_finds(weights, monkeypatch):
         map(torch.cat, zip(*network.prompt(exact.to(device), points, (160, 120))))
         for network, device in zip(networks, ("cpu", "cuda"))
     )
-    torch.testing.assert_close(there.cpu(), logits, rtol=0, atol=5e-3 * float(logits.abs().max()))  # TF32
+    torch.testing.assert_close(there.cpu().float(), logits, rtol=0, atol=8e-3 * float(logits.abs().max()))  # float16
     torch.testing.assert_close(scores.cpu(), ious, rtol=0, atol=1e-3)
-    monkeypatch.setattr(SamNetwork, "decode", lambda self, _, points: tuple(x.to(self._device) for x in blobs(points)))
+
+    def decode(network, _, points):
+        return tuple(x.to(network._device) for x in blobs(points.cpu()))
+
+    monkeypatch.setattr(SamNetwork, "decode", decode)
     rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, region_area=15)
     cpu, gpu = (SamMasks(path, device=device, rules=rules).masks(image) for device in ("cpu", "cuda"))
     for level in LEVELS:

@@ -138,8 +138,34 @@ def test_chunks_change_nothing(monkeypatch):
     expected = clean_masks(masks, 40)
     assert expected[1].all() and not torch.equal(expected[0], masks)
     for chunk in (1, 3 * 60 * 45):
-        monkeypatch.setattr(small_regions, "_CHUNK", chunk)
+        monkeypatch.setitem(small_regions._CHUNK, "cpu", chunk)
         assert all(map(torch.equal, clean_masks(masks, 40), expected))
     monkeypatch.undo()
     turned = clean_masks(masks.permute(0, 2, 1), 40)  # another order in memory
     assert torch.equal(turned[0], expected[0].permute(0, 2, 1)) and torch.equal(turned[1], expected[1])
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data(), nodes=st.integers(1, 40))
+def test_components_are_the_same_on_any_device(data, nodes):
+    """Also their numbers' order, which decides between pieces of one size."""
+    node = st.integers(0, nodes - 1)
+    pairs = data.draw(st.lists(st.tuples(node, node), max_size=60))
+    edges = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2).T
+    expected = small_regions._joined_by_scipy(nodes, edges)
+    found = small_regions._joined_by_torch(nodes, edges)
+    assert torch.equal(found.unique(return_inverse=True)[1], expected)
+    assert bool((found[found] == found).all()) and bool((found <= torch.arange(nodes)).all())
+
+
+def test_a_long_chain_is_one_component():
+    order = torch.from_numpy(np.random.default_rng(0).permutation(3000))
+    found = small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]]))
+    assert bool((found == 0).all())
+
+
+def test_the_components_of_a_gpu_give_the_same_masks(monkeypatch):
+    masks = torch.from_numpy(ndimage.uniform_filter(np.random.default_rng(1).random((9, 70, 55)), (0, 3, 3)) > 0.5)
+    expected = clean_masks(masks, 12)
+    monkeypatch.setattr(small_regions, "_joined_by_scipy", small_regions._joined_by_torch)
+    assert all(map(torch.equal, clean_masks(masks, 12), expected))

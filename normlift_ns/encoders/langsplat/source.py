@@ -248,7 +248,7 @@ def write_langsplat(
     """
     levels: list[tuple[Tensor, Tensor]] = []
     if isinstance(source, RegionFeatures):
-        maps = source.regions.labels(image, name)
+        maps = source.regions.labels(image, name).cpu()
         if len(maps) == len(LEVELS):
             levels = [(labels[0], source.encoder.encode(image, labels)) for labels in maps]
     if len(levels) == 0:

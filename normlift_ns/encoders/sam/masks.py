@@ -28,12 +28,12 @@ from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import pad
 
-from normlift_ns.encoders.sam.network import SamNetwork
+from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
 from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.sam.weights import check_sam, sam_identity
 from normlift_ns.errors import InputError
-from normlift_ns.options import DEFAULT_SAM
+from normlift_ns.options import DEFAULT_SAM, SamPrecision
 
 Level = Literal["default", "s", "m", "l"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -88,11 +88,10 @@ class _Candidates(NamedTuple):
 
 @dataclass(frozen=True)
 class SamMasks:
-    """Regions that SAM finds, one level of them. The weights are loaded at the first use; on a GPU the image encoder
-    runs in half precision, the rest in float32.
+    """Regions that SAM finds, one level of them. The weights are loaded at the first use.
 
     Raises:
-        ValueError: an unknown level; transformers is not installed; a name that is none.
+        ValueError: an unknown level or precision; transformers is not installed; a name that is none.
         FileNotFoundError: a checkpoint that does not exist.
     """
 
@@ -101,18 +100,24 @@ class SamMasks:
     level: Level = "l"
     """s, m, l: SAM's subparts, parts, wholes. default: all three together."""
     device: str = "cpu"
-    """Where the network runs, and the rules."""
+    """Where the network runs, and the rules; where its label maps are."""
+    precision: SamPrecision = "auto"
+    """Of the network. auto: float16 on a GPU, float32 elsewhere."""
     rules: MaskRules = field(default_factory=MaskRules)
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
             raise InputError(f"SAM has the levels {', '.join(LEVELS)}; got {self.level!r}: choose with --level")
+        if self.precision not in get_args(SamPrecision):
+            known = ", ".join(get_args(SamPrecision))
+            raise InputError(f"unknown precision of SAM {self.precision!r}; --sam-precision is one of {known}")
         check_sam(self.checkpoint)
 
     @property
     def identity(self) -> dict[str, Any]:
         """Files count by their content, wherever they lie."""
-        return {"kind": "sam", "checkpoint": self._checkpoint, "rules": asdict(self.rules)}
+        precision = resolve_precision(self.precision, self.device)
+        return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -122,8 +127,8 @@ class SamMasks:
         return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
-        """As in `Regions`: default, s, m, l; raises as `masks`."""
-        maps = [stack_masks(masks).cpu() for masks in self.masks(image).values()]
+        """As in `Regions`: default, s, m, l; on the device. Raises as `masks`."""
+        maps = [stack_masks(masks) for masks in self.masks(image).values()]
         depth = max(len(each) for each in maps)
         return torch.stack([pad(each, (0, 0, 0, 0, 0, depth - len(each)), value=-1) for each in maps])
 
@@ -141,7 +146,8 @@ class SamMasks:
         rules = self.rules
         size = image.shape[0], image.shape[1]
         crops = crop_boxes(*size, rules.crop_overlap)
-        cuts = [image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
+        there = image.to(self.device)
+        cuts = [there[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
         embeddings = self.network.embed(self.network.pixels(cuts))
         parts: list[_Candidates] = []
         for i, embedding in enumerate(embeddings):
@@ -173,14 +179,9 @@ class SamMasks:
             channel.append(which)
             predicted.append(ious[point, which])
 
-        def measure(batch: Tensor) -> tuple[Tensor, Tensor]:
-            large = network.enlarge(batch, within)
-            return stability(large, rules.stability_offset), boxes_of(large > 0)
-
         every = torch.cat(logits)
-        measured = [(every.new_zeros(0), every.new_zeros(0, 4).long()), *network.masks(measure, every)]
-        stable, boxes = map(torch.cat, zip(*measured))
-        boxes = boxes + torch.tensor([x0, y0, x0, y0], device=boxes.device)
+        measured = network.measure(every, within, rules.stability_offset)
+        boxes, stable = measured.boxes + torch.tensor([x0, y0, x0, y0], device=every.device), measured.stability
         whole = torch.full_like(stable, number).long()
         found = _Candidates(every, torch.cat(channel), torch.cat(predicted), stable, boxes, whole)
         good = (stable >= rules.stability) & (stable > 0) & ~cut_off(boxes, crop, size, rules.edge)
@@ -204,7 +205,7 @@ class SamMasks:
     @cached_property
     def network(self) -> SamNetwork:
         """The network with its weights, loaded at the first use; raises as `masks`."""
-        return SamNetwork.load(self.checkpoint, self.device)
+        return SamNetwork.load(self.checkpoint, self.device, self.precision)
 
 
 def point_grid(side: int) -> Float[Tensor, "p 2"]:
@@ -224,12 +225,6 @@ def crop_boxes(height: int, width: int, overlap: float) -> list[Box]:
     w, h = math.ceil((shared + width) / 2), math.ceil((shared + height) / 2)
     corners = product((0, w - shared), (0, h - shared))
     return [(0, 0, width, height), *((x, y, min(x + w, width), min(y + h, height)) for x, y in corners)]
-
-
-def stability(logits: Float[Tensor, "n h w"], offset: float) -> Float[Tensor, " n"]:
-    """IoU of the masks at two thresholds of the logits, 0 plus and minus the offset; NaN where both are empty."""
-    inner, outer = ((logits > bound).flatten(1).view(torch.uint8) for bound in (offset, -offset))
-    return inner.sum(dim=1, dtype=torch.int32) / outer.sum(dim=1, dtype=torch.int32)
 
 
 def cut_off(boxes: Int64[Tensor, "n 4"], crop: Box, size: tuple[int, int], edge: int) -> Bool[Tensor, " n"]:

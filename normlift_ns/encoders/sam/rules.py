@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
+from torch.nn.functional import pad
 
-_CHUNK = 2**26
+_CHUNK = {"cuda": 2**29, "cpu": 2**26}
 """Elements of the largest temporary array."""
+_ADDS_IN_FLOAT32 = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 8)
+"""Whether torch.mm of half-precision matrices can return its float32 sums."""
 _FORCED = 3
 """Masks that stay, best first, where none is scored well enough."""
 
@@ -27,6 +31,28 @@ class Suppression:
     """One mask lies inside another if it covers less than this share of it, ..."""
     inner: float = 0.85
     """... and at least this share of itself lies there. Such a mask goes, whatever its score."""
+
+
+class Measured(NamedTuple):
+    """Of each mask."""
+
+    inner: Int32[Tensor, " m"]
+    """Pixels above the offset."""
+    outer: Int32[Tensor, " m"]
+    """Pixels above minus the offset."""
+    boxes: Int64[Tensor, "m 4"]
+    """As `boxes_of` returns them."""
+
+    @property
+    def stability(self) -> Float[Tensor, " m"]:
+        """IoU of the masks at both thresholds; NaN where both are empty."""
+        return self.inner / self.outer
+
+
+def measured(logits: Float[Tensor, "m h w"], offset: float) -> Measured:
+    """How large masks are at two thresholds of the logits, 0 plus and minus the offset, and where they lie."""
+    inner, outer = ((logits > bound).flatten(1).view(torch.uint8) for bound in (offset, -offset))
+    return Measured(inner.sum(dim=1, dtype=torch.int32), outer.sum(dim=1, dtype=torch.int32), boxes_of(logits > 0))
 
 
 def mask_nms(
@@ -93,11 +119,19 @@ def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
     for columns in _column_chunks(flat):
-        part = flat[:, columns].float()
-        both += part @ part.T
+        both += _counted(flat[:, columns])
     return both
 
 
+def _counted(part: Bool[Tensor, "m p"]) -> Float[Tensor, "m m"]:
+    """Products of all rows, added up in float32; on a GPU in tensor cores, where this version of torch lets them."""
+    if part.is_cuda and _ADDS_IN_FLOAT32:
+        half = pad(part.half(), (0, -part.shape[1] % 8))  # rows begin where tensor cores like it
+        return torch.mm(half, half.T, out_dtype=torch.float32)
+    whole = part.float()
+    return whole @ whole.T
+
+
 def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
-    step = min(2**24, max(1, _CHUNK // max(1, len(flat))))
+    step = min(2**24, max(1, _CHUNK[flat.device.type] // max(1, len(flat))))
     return (slice(start, start + step) for start in range(0, flat.shape[1], step))

@@ -3,7 +3,7 @@
 A mask is held as its edges: the places, row by row, at which it changes, the borders of the image included. There is an
 even number of them in each row; the first and second of them enclose a run of pixels, the third and fourth the next.
 Pixels are looked at once, to find the edges, and touched again only where they change. Components are those of a graph
-of runs, which alone goes to the CPU.
+of runs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-_CHUNK = 2**25
+_CHUNK = {"cuda": 2**29, "cpu": 2**25}
 """Pixels looked at together."""
 
 
@@ -31,7 +31,7 @@ def clean_masks(masks: Bool[Tensor, "m h w"], least: int) -> tuple[Bool[Tensor, 
     """
     cleaned = masks.clone(memory_format=torch.contiguous_format)
     changed = torch.zeros(len(masks), dtype=torch.bool, device=masks.device)
-    step = max(1, _CHUNK // masks[0].numel()) if len(masks) > 0 else 1
+    step = max(1, _CHUNK[masks.device.type] // masks[0].numel()) if len(masks) > 0 else 1
     for part, different in zip(cleaned.split(step), changed.split(step)):
         grid = _Grid(*part.shape)
         edges = grid.edges(part)
@@ -122,12 +122,37 @@ def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
     short = stop - start < least
     matters = short[lower] | short[upper]
     node = short.cumsum(0) * short
-    nodes, pairs = 1 + int(short.sum()), torch.stack([node[lower[matters]], node[upper[matters]]]).cpu().numpy()
-    graph = coo_array((np.ones(pairs.shape[1], dtype=bool), tuple(pairs)), shape=(nodes, nodes))
-    pieces, found = connected_components(graph, directed=False)
-    piece = torch.from_numpy(found).to(edges.device).long()[node]
-    area = stop.new_zeros(pieces).index_add(0, piece, stop - start)
+    pairs = torch.stack([node[lower[matters]], node[upper[matters]]])
+    nodes = 1 + int(short.sum())
+    piece = (_joined_by_torch if edges.is_cuda else _joined_by_scipy)(nodes, pairs)[node]
+    area = stop.new_zeros(nodes).index_add(0, piece, stop - start)
     return _Runs(start, stop, piece, area[piece])
+
+
+def _joined_by_scipy(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
+    """The component of every node of a graph, in the order of their first nodes."""
+    ones = np.ones(pairs.shape[1], dtype=bool)
+    graph = coo_array((ones, tuple(pairs.numpy())), shape=(nodes, nodes))
+    return torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+
+
+def _joined_by_torch(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
+    """The same on any device: a component has the number of its first node.
+
+    Every node points to one that is not after it, at first to itself. In each round what nodes point to, and the nodes
+    themselves, are turned to the least that a neighbour's pointer points to, until none of them changes.
+    """
+    one, other = pairs
+    to = torch.arange(nodes, device=pairs.device)
+    while True:
+        beyond = to[to]
+        least = torch.minimum(beyond[one], beyond[other])
+        turned = beyond.clone()
+        for index in (to[one], to[other], one, other):
+            turned.scatter_reduce_(0, index, least, "amin")
+        if torch.equal(turned, to):
+            return to
+        to = turned
 
 
 def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:

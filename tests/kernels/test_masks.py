@@ -1,0 +1,61 @@
+"""Counts and boxes of masks that are never made, against those of masks that are."""
+
+import pytest
+import torch
+from torch.nn.functional import interpolate
+
+from normlift_ns.encoders.sam.network import taps
+from normlift_ns.encoders.sam.rules import measured
+from normlift_ns.kernels.masks import measure_masks
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+CLOSE = 1e-5
+"""Of the largest logit: nearer to a threshold rounding decides."""
+
+
+def smooth(count: int, side: int) -> torch.Tensor:
+    coarse = torch.randn(count, 1, 6, 6, generator=torch.Generator().manual_seed(0))
+    return 8 * interpolate(coarse, (side, side), mode="bicubic")[:, 0] + torch.linspace(-9, 7, count)[:, None, None]
+
+
+def enlarged(logits: torch.Tensor, side: int, scaled: tuple[int, int], size: tuple[int, int]) -> torch.Tensor:
+    whole = interpolate(logits[:, None].double(), (side, side), mode="bilinear", align_corners=False)
+    return interpolate(whole[:, :, : scaled[0], : scaled[1]], size, mode="bilinear", align_corners=False)[:, 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+@pytest.mark.parametrize(
+    ("side", "scaled", "size"),
+    [(64, (64, 41), (150, 97)), (64, (33, 64), (20, 39)), (128, (128, 128), (128, 128)), (64, (1, 64), (1, 70))],
+)
+def test_equals_masks_that_are_made(dtype, side, scaled, size):
+    logits = smooth(9, side // 4).to(dtype)
+    logits[-1] = -5.0  # an empty mask
+    logits[-2] = 5.0  # a full one
+    rows, columns = (taps(side // 4, side, s, n) for s, n in zip(scaled, size))
+    low, *weights = (x.to(DEVICE) for x in (logits, *rows, *columns))
+    inner, outer, boxes = measure_masks(low, *weights, offset=1.0)
+    large = enlarged(logits, side, scaled, size)
+    expected = measured(large, 1.0)
+    close = CLOSE * float(large.abs().max())
+    for found, exact, bound in ((inner, expected.inner, 1.0), (outer, expected.outer, -1.0)):
+        undecided = ((large - bound).abs() < close).flatten(1).sum(dim=1)
+        assert bool(((found.cpu() - exact).abs() <= undecided).all())
+        assert int(undecided.sum()) < 0.01 * large.numel()
+    decided = ~(large.abs() < close).flatten(1).any(dim=1)
+    assert int(decided.sum()) >= 7
+    assert torch.equal(boxes.cpu()[decided], expected.boxes[decided])
+    assert boxes[-1].tolist() == [0, 0, 0, 0] and inner[-1] == outer[-1] == 0
+    assert boxes[-2].tolist() == [0, 0, size[1] - 1, size[0] - 1] and inner[-2] == size[0] * size[1]
+    assert 0 < int(expected.inner[3]) < int(expected.outer[3]) or min(size) == 1
+
+
+@pytest.mark.parametrize(("count", "side", "scaled", "size"), [(8, 32, 20, 31), (256, 1024, 757, 731), (3, 12, 12, 5)])
+def test_three_logits_make_a_pixel(count, side, scaled, size):
+    first, weights = taps(count, side, scaled, size)
+    line = torch.randn(count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    whole = interpolate(line[None, None], side, mode="linear", align_corners=False)[:, :, :scaled]
+    expected = interpolate(whole, size, mode="linear", align_corners=False)[0, 0]
+    found = (line[first[:, None] + torch.arange(3)] * weights).sum(dim=1)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    assert int(first.min()) >= 0 and int(first.max()) <= count - 3
