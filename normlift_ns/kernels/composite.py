@@ -9,8 +9,7 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from normlift_ns.kernels.lists import Grid, Lists
-from normlift_ns.kernels.projection import SPLAT
-from normlift_ns.kernels.regions import UNROLL, Limits, blend, cell_pixels
+from normlift_ns.kernels.regions import UNROLL, Limits, blend, cell_pixels, load_splat
 
 _CHANNELS = 8
 """Most channels of one program; more of them take further programs, which compute the weights again."""
@@ -20,7 +19,7 @@ _CHANNELS = 8
 def _composite(
     splats, members, offsets, seen, values, image, out_alpha, width, height, channels, cells_across,
     max_alpha, min_alpha, min_transmittance,
-    CELL_W: tl.constexpr, CELL_H: tl.constexpr, SPLAT: tl.constexpr, UNROLL: tl.constexpr, CHANNELS: tl.constexpr,
+    CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr, CHANNELS: tl.constexpr,
 ):  # fmt: skip
     cell = tl.program_id(0)
     channel = tl.program_id(1) * CHANNELS + tl.arange(0, CHANNELS)[None, None, :]
@@ -37,11 +36,9 @@ def _composite(
         for _ in tl.static_range(UNROLL):
             more = i < stop
             m = tl.load(members + i, mask=more, other=0).to(tl.int64)
-            row = splats + SPLAT * m
-            u, v, a = tl.load(row), tl.load(row + 1), tl.load(row + 2)
-            b, c, o = tl.load(row + 3), tl.load(row + 4), tl.load(row + 5, mask=more, other=0.0)
+            u, v, a, c, b, o = load_splat(splats, m, more)
             gaussian = tl.load(seen + m)
-            weight, T = blend(u, v, a, b, c, o, px, py, T, max_alpha, min_alpha, min_transmittance)
+            weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
             value = tl.load(values + gaussian * channels + channel, mask=channel < channels, other=0.0)
             color += weight[:, :, None] * value
             shown += weight
@@ -73,8 +70,8 @@ def composite(
         return image, alpha
     block = min(_CHANNELS, triton.next_power_of_2(max(1, channels)))
     _composite[(grid.cells, max(1, triton.cdiv(channels, block)))](
-        splats, lists.members, lists.offsets, seen, values.contiguous(), image, alpha, grid.width, grid.height,
-        channels, grid.across, *limits, CELL_W=grid.cell_width, CELL_H=grid.cell_height, SPLAT=SPLAT, UNROLL=UNROLL,
-        CHANNELS=block, num_warps=1,
+        splats.view(torch.int64), lists.members, lists.offsets, seen, values.contiguous(), image, alpha,
+        grid.width, grid.height, channels, grid.across, *limits, CELL_W=grid.cell_width, CELL_H=grid.cell_height,
+        UNROLL=UNROLL, CHANNELS=block, num_warps=1,
     )  # fmt: skip
     return image, alpha

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Int32, Int64
+from jaxtyping import Int32
 from torch import Tensor
 
 from normlift_ns.kernels.projection import SPLAT, Splats
@@ -57,7 +57,7 @@ class Grid(NamedTuple):
 class Lists(NamedTuple):
     """Splats by cell, nearest first: members[offsets[c]:offsets[c + 1]], all cells of the first view, of the second…"""
 
-    offsets: Int64[Tensor, " cells_plus_1"]
+    offsets: Int32[Tensor, " cells_plus_1"]
     members: Int32[Tensor, " pairs"]
     """Rows of the splats."""
 
@@ -86,9 +86,9 @@ def _pairs(
     y1 = tl.where(there, y1, y0)
 
     # {a dx^2 + 2 b dx dy + c dy^2 <= reach}: an ellipse that holds every pixel with alpha >= min_alpha.
-    a = tl.load(row + 2, mask=there, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
-    b = tl.load(row + 3, mask=there, other=0.0).to(tl.float64)
-    c = tl.load(row + 4, mask=there, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
+    a = 2.0 * tl.load(row + 2, mask=there, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
+    c = 2.0 * tl.load(row + 3, mask=there, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
+    b = tl.load(row + 4, mask=there, other=0.0).to(tl.float64)
     opacity = tl.load(row + 5, mask=there, other=1.0)
     reach = 2.0 * (tl.log(opacity / min_alpha).to(tl.float64) + _REACH_MARGIN)
     u, v = u.to(tl.float64), v.to(tl.float64)
@@ -168,4 +168,4 @@ def list_cells(seen: Splats, views: int, grid: Grid, min_alpha: float, *, cull: 
         )  # fmt: skip
     cell, by_cell = cell.sort(stable=True)
     bounds = torch.arange(nowhere + 1, dtype=kind, device=device)
-    return Lists(torch.searchsorted(cell, bounds), member[by_cell])
+    return Lists(torch.searchsorted(cell, bounds, out_int32=True), member[by_cell])

@@ -17,7 +17,8 @@ from torch import Tensor
 CAMERA = 16
 """Numbers of a camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
 SPLAT = 8
-"""Numbers of a splat: centre u, v in pixels, inverse covariance xx, xy, yy, opacity, half sides of its rectangle."""
+"""Numbers of a splat: centre u, v in pixels, half of xx and of yy of the inverse covariance and its xy, opacity, half
+sides of the rectangle. A splat is read as four pairs."""
 _BLOCK = 128
 _ENORMOUS = tl.constexpr(2.0**60)
 """Covariance in square pixels above which determinants are computed in larger units."""
@@ -208,9 +209,9 @@ def _project_seen(
     row = out_splat + SPLAT * e
     tl.store(row, u, mask=there)
     tl.store(row + 1, v, mask=there)
-    tl.store(row + 2, a, mask=there)
-    tl.store(row + 3, b, mask=there)
-    tl.store(row + 4, c, mask=there)
+    tl.store(row + 2, 0.5 * a, mask=there)
+    tl.store(row + 3, 0.5 * c, mask=there)
+    tl.store(row + 4, b, mask=there)
     tl.store(row + 5, opacity, mask=there)
     tl.store(row + 6, half_width, mask=there)
     tl.store(row + 7, half_height, mask=there)

@@ -17,7 +17,6 @@ from jaxtyping import Float32, Int, Int32
 from torch import Tensor
 
 from normlift_ns.kernels.lists import Grid, Lists
-from normlift_ns.kernels.projection import SPLAT
 
 UNROLL = 4
 """Splats between two looks at whether a cell is finished."""
@@ -52,15 +51,31 @@ def cell_pixels(cell, cells_across, CELL_W: tl.constexpr, CELL_H: tl.constexpr):
 
 
 @triton.jit
-def blend(u, v, a, b, c, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
+def _two_floats(pair):
+    """The float32 numbers that stand in the low and in the high half of an int64."""
+    return pair.to(tl.int32).to(tl.float32, bitcast=True), (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def load_splat(splats, m, there):
+    """u, v, half of xx, half of yy, xy, opacity of a splat; of none: opacity 0."""
+    row = splats + 4 * m.to(tl.int64)
+    u, v = _two_floats(tl.load(row, mask=there, other=0))
+    a, c = _two_floats(tl.load(row + 1, mask=there, other=0))
+    b, opacity = _two_floats(tl.load(row + 2, mask=there, other=0))
+    return u, v, a, c, b, opacity
+
+
+@triton.jit
+def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
     """(A_ij, transmittance behind) of one splat in all pixels; a finished pixel has transmittance 0."""
     dx, dy = u - px, v - py
-    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = tl.minimum(opacity * tl.exp(-sigma), max_alpha)
-    alpha = tl.where((sigma >= 0) & (alpha >= min_alpha), alpha, 0.0)
+    sigma = (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
+    felt = (sigma >= 0) & (alpha >= min_alpha)
     after = T * (1.0 - alpha)
     goes_on = after > min_transmittance
-    return tl.where(goes_on, alpha * T, 0.0), tl.where(goes_on, after, 0.0)
+    return tl.where(felt & goes_on, alpha * T, 0.0), tl.where(felt, tl.where(goes_on, after, 0.0), T)
 
 
 @triton.jit
@@ -90,12 +105,12 @@ def _number_labels(
 def _sum_regions(
     splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
     first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
-    POWER: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, SPLAT: tl.constexpr, UNROLL: tl.constexpr,
+    POWER: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr,
 ):  # fmt: skip
     cell = first_cell + tl.program_id(0).to(tl.int64)
     start, stop = tl.load(offsets + cell), tl.load(offsets + cell + 1)
     count = tl.load(counts + cell)
-    first = tl.load(base + cell) - first_slot
+    first = (tl.load(base + cell) - first_slot).to(tl.int32)
     slot = first
     if (start < stop) & (count > 0):
         y, x = cell_pixels((cell % cells).to(tl.int32), cells_across, CELL_W, CELL_H)
@@ -108,24 +123,15 @@ def _sum_regions(
         alive = 1
         # Numbers of the next splat are on their way while the present one is computed.
         m = tl.load(members + i)
-        row = splats + SPLAT * m.to(tl.int64)
-        u, v, a = tl.load(row), tl.load(row + 1), tl.load(row + 2)
-        b, c, o = tl.load(row + 3), tl.load(row + 4), tl.load(row + 5)
+        u, v, a, c, b, o = load_splat(splats, m, i < stop)
         later = tl.load(members + i + 1, mask=i + 1 < stop, other=0)
         while (i < stop) & (alive > 0):
             for _ in tl.static_range(UNROLL):
                 next_m = later
-                more = i + 1 < stop
                 later = tl.load(members + i + 2, mask=i + 2 < stop, other=0)
-                row = splats + SPLAT * next_m.to(tl.int64)
-                next_u = tl.load(row, mask=more, other=0.0)
-                next_v = tl.load(row + 1, mask=more, other=0.0)
-                next_a = tl.load(row + 2, mask=more, other=0.0)
-                next_b = tl.load(row + 3, mask=more, other=0.0)
-                next_c = tl.load(row + 4, mask=more, other=0.0)
-                next_o = tl.load(row + 5, mask=more, other=0.0)
+                next_u, next_v, next_a, next_c, next_b, next_o = load_splat(splats, next_m, i + 1 < stop)
 
-                weight, T = blend(u, v, a, b, c, o, px, py, T, max_alpha, min_alpha, min_transmittance)
+                weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
                 if POWER == 2:
                     weight = weight * weight
                 if POWER == 0:
@@ -146,7 +152,7 @@ def _sum_regions(
                                 tl.store(out_key + slot, place + label)
                                 slot += 1
                 i += 1
-                m, u, v, a, b, c, o = next_m, next_u, next_v, next_a, next_b, next_c, next_o
+                m, u, v, a, c, b, o = next_m, next_u, next_v, next_a, next_c, next_b, next_o
             alive = tl.max(tl.where(T > 0, 1, 0))
     tl.store(out_used + cell - first_cell, slot - first)
 
@@ -188,7 +194,7 @@ def region_sums(
     _number_labels[(cells,)](
         labels, local, table, counts, grid.width, grid.height, grid.across, grid.cells, **shape
     )  # fmt: skip
-    slots = torch.cat([counts.new_zeros(1), counts * lists.offsets.diff()]).cumsum(0)  # the first of each cell
+    slots = torch.cat([counts.new_zeros(1), counts * lists.offsets.diff().long()]).cumsum(0)  # the first of each cell
     kind = torch.int32 if len(splats) * columns < 2**31 else torch.int64  # of half the width: half the work to sort
     parts = [RegionSums(torch.zeros(0, dtype=kind, device=device), torch.zeros(0, device=device))]
     for first, last, low, high in _chunks(slots):
@@ -196,9 +202,9 @@ def region_sums(
         weight = torch.empty(high - low, device=device)
         used = torch.empty(last - first, dtype=torch.int32, device=device)
         _sum_regions[(last - first,)](
-            splats, lists.members, lists.offsets, local, table, counts, slots, key, weight, used,
+            splats.view(torch.int64), lists.members, lists.offsets, local, table, counts, slots, key, weight, used,
             first, low, columns, grid.across, grid.cells, *limits,
-            POWER=weight_power, SPLAT=SPLAT, UNROLL=UNROLL, **shape,
+            POWER=weight_power, UNROLL=UNROLL, **shape,
         )  # fmt: skip
         ends = used.cumsum(0)
         total = int(ends[-1])

@@ -130,7 +130,7 @@ def check(job: Job, *, pictures: bool = False) -> None:
     other = [name for name in names if getattr(job.settings, name) != getattr(compiled, name)]
     if len(other) > 0:
         raise InputError(
-            f"gsplat {_gsplat_version()} has compiled another {', '.join(other)} than the scene is drawn with; use "
+            f"gsplat {installed_version()} has compiled another {', '.join(other)} than the scene is drawn with; use "
             'backend="triton" or "torch", which know all rules'
         )
 
@@ -141,11 +141,16 @@ def installed_rules() -> RasterSettings:
     Raises:
         ValueError: none is installed, or a version of which nothing is known.
     """
-    return RasterSettings.of_gsplat(_gsplat_version())
+    return RasterSettings.of_gsplat(installed_version())
 
 
 @cache
-def _gsplat_version() -> str:
+def installed_version() -> str:
+    """Of gsplat.
+
+    Raises:
+        ValueError: none is installed.
+    """
     try:
         return version("gsplat")
     except PackageNotFoundError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby, islice, zip_longest
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, UInt8
@@ -117,6 +117,18 @@ def rasterize_evidence(
                 if progress is not None:
                     progress(done, total)
     return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
+
+
+def backend_of(
+    scene: GaussianScene, backend: BackendName, *, settings: RasterSettings, dtype: torch.dtype, weight_power: int
+) -> BackendName:
+    """The name of the backend that `rasterize_evidence` would use.
+
+    Raises:
+        ValueError: none of that name, or it cannot do the job; says what to use instead.
+    """
+    job = _job(scene, "classic", settings, dtype, weight_power)
+    return cast(BackendName, choose_backend(backend, job, pictures=False)[0])
 
 
 def render(

@@ -53,9 +53,9 @@ def test_lists_are_those_of_the_reference(kind, antialiased, rules, monkeypatch)
 
 def felt(grid, splat, camera, min_alpha):
     """Cells with a pixel whose alpha is at least `min_alpha`, in float64, but for a last digit of float32."""
-    u, v, a, b, c, opacity = splat.double()[:6]
+    u, v, a, c, b, opacity = splat.double()[:6]
     x, y = torch.arange(camera.width).double() + 0.5 - u, (torch.arange(camera.height).double() + 0.5 - v)[:, None]
-    alpha = opacity * torch.exp(-(0.5 * (a * x * x + c * y * y) + b * x * y))
+    alpha = opacity * torch.exp(-(a * x * x + c * y * y + b * x * y))
     row, column = (alpha >= min_alpha * (1 + 1e-6)).nonzero(as_tuple=True)
     return set((row // grid.cell_height * grid.across + column // grid.cell_width).tolist())
 

@@ -78,7 +78,7 @@ def on_gpu(monkeypatch, unchecked):
     ],
 )
 def test_gsplat_draws_what_its_compiled_code_can(on_gpu, installed, rules, changed, monkeypatch):
-    monkeypatch.setattr(gsplat, "_gsplat_version", lambda: installed)
+    monkeypatch.setattr(gsplat, "installed_version", lambda: installed)
     wanted = Job(on_gpu, False, RasterSettings.of_gsplat(rules), torch.float32)
     if changed is None:
         gsplat.check(wanted)
@@ -97,7 +97,7 @@ def test_other_constants_are_refused_where_they_are_compiled(on_gpu):
 
 
 def test_a_missing_or_unknown_gsplat_is_said(monkeypatch):
-    gsplat._gsplat_version.cache_clear()
+    gsplat.installed_version.cache_clear()
 
     def missing(name):
         raise PackageNotFoundError(name)
@@ -108,7 +108,7 @@ def test_a_missing_or_unknown_gsplat_is_said(monkeypatch):
     monkeypatch.setattr(gsplat, "version", lambda name: "7.1.0")
     with pytest.raises(ValueError, match=r"nothing is known of the rules of gsplat 7.1.0; known are 1.4, 1.5, 1.6"):
         gsplat.installed_rules()
-    gsplat._gsplat_version.cache_clear()
+    gsplat.installed_version.cache_clear()
 
 
 def test_a_full_gpu_is_answered_by_smaller_parts():
@@ -210,7 +210,7 @@ def test_weights_are_those_of_the_installed_gsplat(name, mode, rules):
         for backend in ("triton", "gsplat")
     ]
     difference = relative_difference(found[0].rows, found[1].rows)
-    print(f"{name} {mode} {rules}: {difference:.1e} to gsplat {gsplat._gsplat_version()}")
+    print(f"{name} {mode} {rules}: {difference:.1e} to gsplat {gsplat.installed_version()}")
     assert difference <= 1e-5
 
 
