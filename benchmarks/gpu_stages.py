@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torch._C._autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.cpu import relative_difference
@@ -82,8 +83,8 @@ def kernels(run: Callable[[], Any], most: int = 14) -> dict[str, float]:
         run()
         torch.cuda.synchronize()
     total: dict[str, float] = defaultdict(float)
-    for event in found.events():
-        if event.device_type == torch.autograd.DeviceType.CUDA:
+    for event in found.events() or ():
+        if event.device_type == DeviceType.CUDA:
             total[event.name[:70]] += event.self_device_time_total / 1e3
     longest = dict(sorted(total.items(), key=lambda x: -x[1])[:most])
     return {"all kernels": sum(total.values()), **longest}

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float32, Int32
@@ -61,7 +61,7 @@ def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
     device, (width, height) = scene.means.device, (cameras[0].width, cameras[0].height)
     poses = torch.stack([camera.world_to_camera.float() for camera in cameras]).to(device)
     intrinsics = torch.stack([camera.K.float() for camera in cameras]).to(device)
-    rectangle = {"opacities": scene.opacities} if settings.per_axis else {}
+    rectangle: dict[str, Any] = {"opacities": scene.opacities} if settings.per_axis else {}
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         scene.means, None, scene.quats, scene.scales, poses, intrinsics, width, height,
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,

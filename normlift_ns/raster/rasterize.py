@@ -102,7 +102,7 @@ def rasterize_evidence(
             device = scene.means.device
             ends = torch.stack([torch.stack(x.aminmax()).to(device, torch.int64) for _, x, _ in flight]).tolist()
             checked = [
-                (camera, there, _check_range(done + i, *ends[i], count))
+                (camera, there, _check_range(done + i, ends[i][0], ends[i][1], count))
                 for i, (camera, there, count) in enumerate(flight)
             ]
 
