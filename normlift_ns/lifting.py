@@ -25,8 +25,9 @@ from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
 from normlift_ns.observing import BLOCK, block_evidence, observe_views, spread
 from normlift_ns.options import BackendName, LiftOptions, RefineConfig
+from normlift_ns.raster.gsplat import rules_named
 from normlift_ns.raster.rasterize import backend_of
-from normlift_ns.raster.settings import RasterSettings, rules_named
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.stages import Report, Stages, cost
 
 _FEW = 0.01

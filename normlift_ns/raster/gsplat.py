@@ -20,6 +20,7 @@ from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
+from normlift_ns.options import KNOWN_RULES
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import camera_depths, project, to_world
 from normlift_ns.raster.settings import RasterSettings
@@ -155,6 +156,22 @@ def installed_version() -> str:
         return version("gsplat")
     except PackageNotFoundError as error:
         raise InputError("gsplat is not installed (pip install gsplat)") from error
+
+
+def rules_named(wanted: str, recorded: str | None) -> str:
+    """The version of gsplat by whose rules a scene is drawn.
+
+    Args:
+        wanted: one of `GsplatRules`.
+        recorded: what is known of the training; None: nothing, which means 1.4, as nerfstudio 1.1.5 trains.
+    Raises:
+        ValueError: "installed" without a gsplat whose rules are known.
+    """
+    if wanted == "auto":
+        return recorded or KNOWN_RULES[0]
+    if wanted != "installed":
+        return wanted
+    return ".".join(installed_version().split(".")[:2])
 
 
 def views_evidence(job: Job, batch: Batch) -> Entries:

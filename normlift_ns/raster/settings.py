@@ -70,21 +70,3 @@ class RasterSettings:
             return RasterSettings()
         rectangle = RasterSettings(per_axis=True, radius_sigmas=3.33)
         return rectangle if rules == "1.5" else replace(rectangle, max_alpha=0.99, min_compensation=0.005)
-
-
-def rules_named(wanted: str, recorded: str | None) -> str:
-    """The version of gsplat by whose rules a scene is drawn.
-
-    Args:
-        wanted: one of `GsplatRules`.
-        recorded: what is known of the training; None: nothing, which means 1.4, as nerfstudio 1.1.5 trains.
-    Raises:
-        ValueError: "installed" without a gsplat whose rules are known.
-    """
-    if wanted == "auto":
-        return recorded or KNOWN_RULES[0]
-    if wanted != "installed":
-        return wanted
-    from normlift_ns.raster.gsplat import installed_version  # noqa: PLC0415 (most scenes need no gsplat)
-
-    return ".".join(installed_version().split(".")[:2])

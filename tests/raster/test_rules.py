@@ -12,7 +12,6 @@ from normlift_ns.options import KNOWN_RULES
 from normlift_ns.raster import gsplat, triton
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import assign_tiles, project, to_world
-from normlift_ns.raster.settings import rules_named
 from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.raster.oracle import compositing_matrix
 from tests.scenes import dense, generator, orbit, random_labels, random_scene
@@ -65,7 +64,7 @@ def test_versions_have_rules(monkeypatch):
     with pytest.raises(ValueError, match=r"nothing is known of the rules of gsplat 0.9; known are 1.4, 1.5, 1.6"):
         RasterSettings.of_gsplat("0.9")
     monkeypatch.setattr(gsplat, "installed_version", lambda: "1.5.3")
-    assert [rules_named(*x) for x in (("auto", None), ("auto", "1.5"), ("1.6", "1.4"), ("installed", "1.4"))] == [
+    assert [gsplat.rules_named(*x) for x in (("auto", None), ("auto", "1.5"), ("1.6", "1.4"), ("installed", "1.4"))] == [
         "1.4", "1.5", "1.6", "1.5",
     ]  # fmt: skip
 
