@@ -64,9 +64,8 @@ def test_versions_have_rules(monkeypatch):
     with pytest.raises(ValueError, match=r"nothing is known of the rules of gsplat 0.9; known are 1.4, 1.5, 1.6"):
         RasterSettings.of_gsplat("0.9")
     monkeypatch.setattr(gsplat, "installed_version", lambda: "1.5.3")
-    assert [gsplat.rules_named(*x) for x in (("auto", None), ("auto", "1.5"), ("1.6", "1.4"), ("installed", "1.4"))] == [
-        "1.4", "1.5", "1.6", "1.5",
-    ]  # fmt: skip
+    asked = (("auto", None), ("auto", "1.5"), ("1.6", "1.4"), ("installed", "1.4"))
+    assert [gsplat.rules_named(*x) for x in asked] == ["1.4", "1.5", "1.6", "1.5"]
 
 
 @pytest.fixture
