@@ -25,6 +25,7 @@ from normlift_ns.options import Rule
 from normlift_ns.question import Question, make_question
 from normlift_ns.ranges import check_bool, check_path
 from normlift_ns.raster.rasterize import render, render_picture
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import FIELD_FOLDER, texts_cache
 from normlift_ns.runs.question import load_question, save_question
 from normlift_ns.runs.splats import export_files, write_splats
@@ -210,14 +211,16 @@ class LiftedRun:
             found: an answer, or what it says of one text.
         """
         camera = view if isinstance(view, Camera) else self.camera(view)
-        picture = render_picture(self.scene, camera)
+        settings = RasterSettings.of_gsplat(str(self.field.manifest.get("gsplat_rules", "1.4")))
+        picture = render_picture(self.scene, camera, settings=settings)
         if found is None:
             return picture
         if not isinstance(found, Answer | Finding):
             raise TypeError(f"render draws an answer, or what it says of one text; got {type(found).__name__}")
         shown, answered = (found.index, found.answer) if isinstance(found, Finding) else (None, found)
         display = make_display(self.field, answered, shown=shown)
-        values, alpha = render(self.scene.gaussians, camera, display.values, rasterize_mode=self.scene.rasterize_mode)
+        how = {"rasterize_mode": self.scene.rasterize_mode, "settings": settings}
+        values, alpha = render(self.scene.gaussians, camera, display.values, **how)
         overlay = draw(display, picture.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
 

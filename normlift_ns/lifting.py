@@ -25,7 +25,10 @@ from normlift_ns.encoders.langsplat.source import refuse_equal_stems, write_lang
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
 from normlift_ns.observing import BLOCK, block_evidence, observe_views, spread
-from normlift_ns.options import LiftOptions, RefineConfig
+from normlift_ns.options import BackendName, LiftOptions, RefineConfig
+from normlift_ns.raster.gsplat import rules_named
+from normlift_ns.raster.rasterize import backend_of
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.stages import Report, Stages, cost
 
 _FEW = 0.01
@@ -38,6 +41,21 @@ class Export(NamedTuple):
     folder: Path
     overwrite: bool
     """Replace files of other content."""
+
+
+class Drawing(NamedTuple):
+    """How the weights of a lift are rasterized."""
+
+    rules: str
+    """Version of gsplat that says what is drawn."""
+    backend: BackendName
+    """What computes it."""
+    dtype: torch.dtype
+
+    @property
+    def settings(self) -> RasterSettings:
+        """The constants of the rules."""
+        return RasterSettings.of_gsplat(self.rules)
 
 
 class LiftResult(NamedTuple):
@@ -75,12 +93,13 @@ def lift_scene(
     stages = Stages(report)
     gaussians, views = scene.gaussians.to(device), scene.train
     options = replace(options, vote=possible(options.vote, len(gaussians))) if options.refine else options
+    drawing = _drawing(scene, gaussians, options)
     names = set(source.available(views.names))
     usable = [index for index, name in enumerate(views.names) if name in names]
     used = [usable[i] for i in spread(len(usable), options.max_views)]
     if export is not None:
         refuse_equal_stems([views.names[index] for index in used])
-    evidence, features = _observe(scene, gaussians, used, source, options, cache, export, stages)
+    evidence, features = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages)
     with stages("lift") as step:
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
         _check_seen(evidence, lifted.scalars, source)
@@ -95,6 +114,8 @@ def lift_scene(
             "cameras_held_out": camera_summary(scene.held_out.cameras),
             "features": source.identity,
             "options": asdict(options),
+            "gsplat_rules": drawing.rules,
+            "backend": drawing.backend,
             "statistics": {**counts, **_statistics(lifted.scalars), **shares},
             "cost": cost(stages.seconds, device),
         }
@@ -102,6 +123,16 @@ def lift_scene(
         built = SemanticField.build(lifted, gaussians.means, copied, provenance=provenance, **rule)
         step()
     return LiftResult(built, stages.seconds)
+
+
+def _drawing(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Drawing:
+    """How to rasterize, refused before anything has been looked at where it cannot be done."""
+    rules = rules_named(options.gsplat_rules, scene.identity.get("gsplat_rules"))
+    dtype = torch.float64 if options.precision == "double" else torch.float32
+    settings = RasterSettings.of_gsplat(rules)
+    power = options.weight_power
+    backend = backend_of(gaussians, options.backend, settings=settings, dtype=dtype, weight_power=power)
+    return Drawing(rules, backend, dtype)
 
 
 def _check_seen(evidence: Evidence, scalars: Scalars, source: FeatureSource) -> None:
@@ -143,12 +174,12 @@ def _observe(
     used: Sequence[int],
     source: FeatureSource,
     options: LiftOptions,
+    drawing: Drawing,
     cache: Path,
     export: Export | None,
     stages: Stages,
 ) -> tuple[Evidence, Float[Tensor, "s d"]]:
     """Evidence and feature table of some training views, block by block, so that an interrupted lift can resume."""
-    dtype = torch.float64 if options.precision == "double" else torch.float32
     seen = cached(source, cache) if options.reuse_evidence else source
     parts, tables = [], []
     for start in range(0, len(used), BLOCK):
@@ -169,13 +200,15 @@ def _observe(
                 block,
                 cache / "evidence",
                 rasterize_mode=scene.rasterize_mode,
+                settings=drawing.settings,
+                backend=drawing.backend,
                 weight_power=options.weight_power,
-                dtype=dtype,
+                dtype=drawing.dtype,
                 reuse=options.reuse_evidence,
                 done=step,
             )
             parts.append(evidence)
-    return Evidence.merge(*parts), torch.cat(tables).to(gaussians.means.device, dtype)
+    return Evidence.merge(*parts), torch.cat(tables).to(gaussians.means.device, drawing.dtype)
 
 
 def _vote(

@@ -20,7 +20,7 @@ from normlift_ns.core.scene import Scene, View
 from normlift_ns.encoders.source import FeatureSource, each_view
 from normlift_ns.encoders.undistorted import check_undistorted
 from normlift_ns.errors import InputError
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import BackendName, RasterizeMode
 from normlift_ns.raster.rasterize import rasterize_evidence, render_picture
 from normlift_ns.raster.settings import RasterSettings
 
@@ -28,7 +28,7 @@ BLOCK = 16
 """Views per file of evidence: what an interrupted run may lose."""
 _SMALLEST = 8
 """Pixels along a side of an image made smaller; fewer show nothing."""
-_KEY = "normlift_ns.block/3"
+_KEY = "normlift_ns.block/4"
 """Part of every key: to be raised when evidence changes for the same input."""
 
 
@@ -116,6 +116,8 @@ def block_evidence(
     folder: Path,
     *,
     rasterize_mode: RasterizeMode,
+    settings: RasterSettings,
+    backend: BackendName,
     weight_power: int,
     dtype: torch.dtype,
     reuse: bool,
@@ -126,8 +128,8 @@ def block_evidence(
     That of its cells, from which it is made, is taken from the folder if it was rasterized before with the same scene,
     cameras and labels, whatever the regions and features were.
     """
-    settings, counts = RasterSettings(), [regions.shape[1] for regions in block.regions]
-    facts = [_KEY, rasterize_mode, weight_power, str(dtype), asdict(settings), counts]
+    counts = [regions.shape[1] for regions in block.regions]
+    facts = [_KEY, rasterize_mode, weight_power, str(dtype), asdict(settings), backend, counts]
     tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, *block.labels]
     tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
     path = folder / f"{_digest(facts, tensors)}.safetensors"
@@ -141,6 +143,7 @@ def block_evidence(
         block.cameras,
         block.labels,
         num_regions=counts,
+        backend=backend,
         rasterize_mode=rasterize_mode,
         weight_power=weight_power,
         settings=settings,

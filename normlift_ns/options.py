@@ -13,6 +13,12 @@ from normlift_ns.ranges import check_options, check_texts
 
 RasterizeMode = Literal["classic", "antialiased"]
 """How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
+BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
+"""What rasterizes; see `normlift_ns.rasterize_evidence`."""
+KNOWN_RULES = ("1.4", "1.5", "1.6")
+"""Versions of gsplat that draw differently."""
+GsplatRules = Literal["auto", "1.4", "1.5", "1.6", "installed"]
+"""By which of them a scene is drawn."""
 Background = Literal["black", "white"]
 """What is behind a splat without a nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
@@ -218,6 +224,13 @@ class LiftOptions:
     within the tolerance."""
     precision: Literal["standard", "double"] = "standard"
     """standard: float32, summed in float64 where digits cancel. double: float64 throughout, slow on a GPU."""
+    backend: BackendName = "auto"
+    """What rasterizes. triton: our own kernels, on a GPU. gsplat: its compiled kernels, on a GPU. numba: compiled for
+    the CPU. torch: any device, slow. auto: the fastest for the device and the precision."""
+    gsplat_rules: GsplatRules = "auto"
+    """Version of gsplat whose rules of drawing count, because they say which weights a scene was trained with.
+    installed: those of the gsplat on this machine. auto: those recorded with the scene, else 1.4. 1.6 is not released
+    yet; its rules may change."""
     reuse_evidence: bool = True
     """Reuse cached 2D features and evidence of earlier lifts where they fit."""
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from normlift_ns import Camera, Evidence, GaussianScene, observing
+from normlift_ns import Camera, Evidence, GaussianScene, RasterSettings, observing
 from normlift_ns.observing import Block, block_evidence
+from normlift_ns.options import BackendName
 from tests.scenes import generator
 
 N = 30
@@ -44,11 +45,12 @@ def rasterized(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def evidence_of(shift: int, folder: Path) -> torch.Tensor:
+def evidence_of(shift: int, folder: Path, rules: str = "1.4", backend: BackendName = "numba") -> torch.Tensor:
+    settings = RasterSettings.of_gsplat(rules)
     done: list[int] = []
     found = block_evidence(
-        scene(), block(shift), folder, rasterize_mode="classic", weight_power=1, dtype=torch.float32, reuse=True,
-        done=lambda: done.append(1),
+        scene(), block(shift), folder, rasterize_mode="classic", settings=settings, backend=backend,
+        weight_power=1, dtype=torch.float32, reuse=True, done=lambda: done.append(1),
     )  # fmt: skip
     assert done == [1]
     return torch.cat([found.rows.offsets.double(), found.rows.column.double(), found.rows.weight.double()])
@@ -65,6 +67,12 @@ def test_swapped_files_are_rasterized_again(rasterized: list[int], tmp_path: Pat
     second.write_bytes(content)
     assert [torch.equal(evidence_of(shift, tmp_path), x) for shift, x in zip((0, 4), expected)] == [True, True]
     assert len(rasterized) == 4
+
+
+def test_other_rules_and_backends_are_rasterized_again(rasterized: list[int], tmp_path: Path) -> None:
+    for rules, backend in (("1.4", "numba"), ("1.6", "numba"), ("1.4", "torch")) * 2:
+        evidence_of(0, tmp_path, rules, backend)
+    assert len(rasterized) == 3
 
 
 def test_damaged_files_are_rasterized_again(rasterized: list[int], tmp_path: Path) -> None:

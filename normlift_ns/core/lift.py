@@ -96,6 +96,8 @@ class Lifted:
         dtype = dtype or self.features.dtype
         n, device = self.evidence.num_gaussians, self.features.device
         gaussians = torch.arange(n, device=device) if gaussians is None else gaussians
+        if _has_kernel(self.features):
+            return self._directions(gaussians, dtype)
         found = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
         first = 0
         for rows in gaussians.split(self._step):

@@ -84,6 +84,17 @@ def _exact_sum(column, weight, table, start, stop, dimension, BLOCK: tl.constexp
 
 
 @triton.jit
+def _store_norms(
+    out_total, out_by_view, out_weight, out_squared, out_views, j, total, by_view, weight, squared, views
+):  # fmt: skip
+    tl.store(out_total + j, total)
+    tl.store(out_by_view + j, by_view)
+    tl.store(out_weight + j, weight)
+    tl.store(out_squared + j, squared)
+    tl.store(out_views + j, views)
+
+
+@triton.jit
 def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
     dimension, cancelled, many, BLOCK: tl.constexpr,
@@ -91,46 +102,49 @@ def _row_norms(
     """One row per program. Where float32 digits have cancelled or worn away, the sum is taken again in float64."""
     j = tl.program_id(0)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
-    d = tl.arange(0, BLOCK)
-    zero = tl.zeros([BLOCK], tl.float32)
-    total, of_view = zero, zero
-    all_weight = tl.zeros([], tl.float64)
-    view_weight, squared, by_view = all_weight, all_weight, all_weight
-    views, first = 0, start
-    view = -1
-    for e in range(start, stop + 1):
-        inside = e < stop
-        s = tl.load(column + e, mask=inside, other=0)
-        next_view = tl.load(column_view + s, mask=inside, other=-2)
-        if (next_view != view) & (view != -1):  # the entries of a view end here
-            norm = view_weight  # of a single unit row
-            if e - first > 1:
-                norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
-                if (norm < cancelled * view_weight) | (e - first > many):
-                    exact = _exact_sum(column, weight, table, first, e, dimension, BLOCK)
-                    norm = tl.sqrt(tl.sum(exact * exact, axis=0))
-            by_view += norm
-            all_weight += view_weight
-            squared += view_weight * view_weight
-            views += tl.where(view_weight > 0, 1, 0)
-            total += of_view
-            of_view = zero
-            view_weight = tl.zeros([], tl.float64)
-            first = e
-        if inside:
-            w = tl.load(weight + e)
-            of_view += w * tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
-            view_weight += w.to(tl.float64)
-        view = next_view
-    norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
-    if (norm < cancelled * all_weight) | (stop - start > many):
-        exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
-        norm = tl.sqrt(tl.sum(exact * exact, axis=0))
-    tl.store(out_total + j, norm)
-    tl.store(out_by_view + j, by_view)
-    tl.store(out_weight + j, all_weight)
-    tl.store(out_squared + j, squared)
-    tl.store(out_views + j, views)
+    if stop - start <= 1:  # no sum of vectors: rows of the table are unit vectors
+        only = tl.load(weight + start, mask=start < stop, other=0.0).to(tl.float64)
+        _store_norms(out_total, out_by_view, out_weight, out_squared, out_views, j, only, only, only, only * only,
+                     tl.where(only > 0, 1, 0))  # fmt: skip
+    else:
+        d = tl.arange(0, BLOCK)
+        zero = tl.zeros([BLOCK], tl.float32)
+        total, of_view = zero, zero
+        all_weight = tl.zeros([], tl.float64)
+        view_weight, squared, by_view = all_weight, all_weight, all_weight
+        views, first = 0, start
+        view = -1
+        for e in range(start, stop + 1):
+            inside = e < stop
+            s = tl.load(column + e, mask=inside, other=0)
+            next_view = tl.load(column_view + s, mask=inside, other=-2)
+            if (next_view != view) & (view != -1):  # the entries of a view end here
+                norm = view_weight  # of a single unit row
+                if e - first > 1:
+                    norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
+                    if (norm < cancelled * view_weight) | (e - first > many):
+                        exact = _exact_sum(column, weight, table, first, e, dimension, BLOCK)
+                        norm = tl.sqrt(tl.sum(exact * exact, axis=0))
+                by_view += norm
+                all_weight += view_weight
+                squared += view_weight * view_weight
+                views += tl.where(view_weight > 0, 1, 0)
+                total += of_view
+                of_view = zero
+                view_weight = tl.zeros([], tl.float64)
+                first = e
+            if inside:
+                w = tl.load(weight + e)
+                of_view += w * tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
+                view_weight += w.to(tl.float64)
+            view = next_view
+        norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
+        if (norm < cancelled * all_weight) | (stop - start > many):
+            exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
+            norm = tl.sqrt(tl.sum(exact * exact, axis=0))
+        _store_norms(
+            out_total, out_by_view, out_weight, out_squared, out_views, j, norm, by_view, all_weight, squared, views
+        )  # fmt: skip
 
 
 def row_norms(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 
 from normlift_ns.core.gpu import has_triton
 from normlift_ns.errors import InputError
+from normlift_ns.options import BackendName
 from normlift_ns.raster.backend import Backend, Job, TileBackend
-
-BackendName = Literal["auto", "torch", "numba", "gsplat", "triton"]
 
 
 def _torch() -> Backend:
@@ -33,6 +32,8 @@ def _gsplat() -> Backend:
 
 
 def _triton() -> Backend:
+    if not has_triton():
+        raise InputError('backend "triton" needs Triton, which comes with PyTorch on Linux; use backend="torch"')
     from normlift_ns.raster import triton  # noqa: PLC0415
 
     return triton
@@ -51,7 +52,7 @@ def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend
         ValueError: an unknown name, or a backend that cannot do the job.
     """
     if name == "auto":
-        name = _fastest(job, pictures)
+        name = _fastest(job)
     if name not in BACKENDS:
         raise InputError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
     backend = BACKENDS[name]()
@@ -59,9 +60,10 @@ def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend
     return name, backend
 
 
-def _fastest(job: Job, pictures: bool) -> str:
-    if job.scene.means.device.type == "cpu":
+def _fastest(job: Job) -> str:
+    means = job.scene.means
+    if means.device.type == "cpu":
         return "numba"
-    if pictures or not job.scene.means.is_cuda or job.dtype != torch.float32 or job.scene.means.dtype != torch.float32:
+    if not means.is_cuda or job.dtype != torch.float32 or means.dtype != torch.float32:
         return "torch"
     return "triton" if has_triton() else "gsplat"

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cache
-from importlib.metadata import version
-from typing import NamedTuple
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float32, Int32
@@ -20,13 +20,16 @@ from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
+from normlift_ns.options import KNOWN_RULES
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import camera_depths, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
 _CHANNELS = 32
-_COMPILED = ("frustum_margin", "min_discriminant", "radius_sigmas", "max_alpha", "min_alpha", "min_transmittance")
+_COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
 """Constants that stand in gsplat's compiled code."""
+_EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
+"""Those too; but squares, which gsplat computes up to 1.4, can be given to its later versions."""
 _LARGE = 100.0
 """Scale in world units up to which no camera (focal length below 400,000 pixels) makes a determinant overflow."""
 _OVERFLOWS = 1e10
@@ -59,18 +62,31 @@ def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
     device, (width, height) = scene.means.device, (cameras[0].width, cameras[0].height)
     poses = torch.stack([camera.world_to_camera.float() for camera in cameras]).to(device)
     intrinsics = torch.stack([camera.K.float() for camera in cameras]).to(device)
+    rectangle: dict[str, Any] = {"opacities": scene.opacities} if settings.per_axis else {}
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         scene.means, None, scene.quats, scene.scales, poses, intrinsics, width, height,
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
-        calc_compensations=job.antialiased,
+        calc_compensations=job.antialiased, **rectangle,
     )  # fmt: skip
-    radii = radii * scene.drawable
+    if radii.ndim == 3 and not settings.per_axis:  # a later gsplat, and a scene of an earlier one
+        radii = torch.where((radii > 0).all(2, keepdim=True), _squares(conics, settings), 0)
+    radii = radii * (scene.drawable if radii.ndim == 2 else scene.drawable[:, None])
     opacities = scene.opacities.expand(len(cameras), -1)
     opacities = opacities * compensations if job.antialiased else opacities.contiguous()
     _project_enormous(job, cameras, radii, means2d, depths, conics, opacities)
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
-    _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down, n_cameras=len(cameras))
+    _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down)
     return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
+
+
+def _squares(conics: Float32[Tensor, "c n 3"], settings: RasterSettings) -> Int32[Tensor, "c n 2"]:
+    """Half sides of the squares that gsplat 1.4 computes from the covariances."""
+    a, b, c = conics.unbind(2)
+    det = 1 / (a * c - b * b)
+    mean = 0.5 * det * (a + c)
+    larger = mean + (mean * mean - det).clamp(min=settings.min_discriminant).sqrt()
+    radius = (settings.radius_sigmas * larger.sqrt()).ceil().nan_to_num(0).clamp(max=_LONGEST_RADIUS)
+    return radius.int()[:, :, None].expand(-1, -1, 2)
 
 
 def _project_enormous(
@@ -91,7 +107,7 @@ def _project_enormous(
     world = to_world(some, torch.float32)
     for view, camera in enumerate(cameras):
         seen = project(world, camera, job.settings, job.antialiased)
-        there = seen.radii > _OVERFLOWS
+        there = seen.radii.amax(dim=1) > _OVERFLOWS
         place = rows[seen.gaussian[there]]
         radii[view, place], means2d[view, place] = _LONGEST_RADIUS, seen.means2d[there]
         conics[view, place] = seen.conics[there]
@@ -101,28 +117,61 @@ def _project_enormous(
 
 
 def check(job: Job, *, pictures: bool = False) -> None:
-    """Raises ValueError for a scene that is not float32 on a GPU, another gsplat than 1.4, or other constants than
-    those that gsplat has compiled."""
+    """Raises ValueError for a scene that is not float32 on a GPU, and for other constants than those that the
+    installed gsplat has compiled."""
     means = job.scene.means
     if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
         raise InputError(
             f"gsplat computes in float32 on a GPU; this scene is {means.dtype} on {means.device}, and wanted is "
             f'{job.dtype}. Move it (scene.to("cuda")), or use backend="torch", which knows every device and precision'
         )
-    if not _gsplat_version().startswith("1.4."):
-        raise InputError(
-            f"gsplat {_gsplat_version()} is installed, but nerfstudio 1.1.5 trains with 1.4.0, and other versions draw "
-            'differently; install it (pip install "gsplat==1.4.0"), or use backend="torch"'
-        )
-    ours = RasterSettings()
-    other = [name for name in _COMPILED if getattr(job.settings, name) != getattr(ours, name)]
+    compiled = installed_rules()
+    ours = compiled.per_axis and not job.settings.per_axis
+    names = _COMPILED if ours else (*_COMPILED, *_EXTENT)
+    other = [name for name in names if getattr(job.settings, name) != getattr(compiled, name)]
     if len(other) > 0:
-        raise InputError(f'gsplat has compiled its {", ".join(other)}; to change them use backend="torch"')
+        raise InputError(
+            f"gsplat {installed_version()} has compiled another {', '.join(other)} than the scene is drawn with; use "
+            'backend="triton" or "torch", which know all rules'
+        )
+
+
+def installed_rules() -> RasterSettings:
+    """The constants of the installed gsplat.
+
+    Raises:
+        ValueError: none is installed, or a version of which nothing is known.
+    """
+    return RasterSettings.of_gsplat(installed_version())
 
 
 @cache
-def _gsplat_version() -> str:
-    return version("gsplat")
+def installed_version() -> str:
+    """Of gsplat.
+
+    Raises:
+        ValueError: none is installed.
+    """
+    try:
+        return version("gsplat")
+    except PackageNotFoundError as error:
+        raise InputError("gsplat is not installed (pip install gsplat)") from error
+
+
+def rules_named(wanted: str, recorded: str | None) -> str:
+    """The version of gsplat by whose rules a scene is drawn.
+
+    Args:
+        wanted: one of `GsplatRules`.
+        recorded: what is known of the training; None: nothing, which means 1.4, as nerfstudio 1.1.5 trains.
+    Raises:
+        ValueError: "installed" without a gsplat whose rules are known.
+    """
+    if wanted == "auto":
+        return recorded or KNOWN_RULES[0]
+    if wanted != "installed":
+        return wanted
+    return ".".join(installed_version().split(".")[:2])
 
 
 def views_evidence(job: Job, batch: Batch) -> Entries:
@@ -173,10 +222,13 @@ def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
     drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
     lists = (settings.tile_size, seen.offsets, seen.members)
-    _, alphas, last = _C.rasterize_to_pixels_fwd(*drawing, *lists)
+    later = hasattr(_C, "rasterize_to_pixels_3dgs_fwd")
+    forward = _C.rasterize_to_pixels_3dgs_fwd if later else _C.rasterize_to_pixels_fwd
+    backward = _C.rasterize_to_pixels_3dgs_bwd if later else _C.rasterize_to_pixels_bwd
+    _, alphas, last = forward(*drawing, *lists)
     column = labels.long() + 1
     for first in range(0, count + 1, _CHANNELS):
         channels = torch.arange(first, first + _CHANNELS, device=column.device)
         one_hot = (column[None, :, :, None] == channels).float()
-        gradients = _C.rasterize_to_pixels_bwd(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
+        gradients = backward(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
         yield first, gradients[3][0]

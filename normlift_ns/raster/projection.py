@@ -1,4 +1,4 @@
-"""From Gaussians and a camera to depth-sorted 2D Gaussians and tile lists, exactly as gsplat 1.4.0 does (utils.cuh,
+"""From Gaussians and a camera to depth-sorted 2D Gaussians and tile lists, exactly as gsplat does (utils.cuh,
 isect_tiles.cu).
 """
 
@@ -35,8 +35,8 @@ class Projected(NamedTuple):
     conics: Float[Tensor, "m 3"]
     """Inverse covariance in square pixels: xx, xy, yy."""
     opacities: Float[Tensor, " m"]
-    radii: Float[Tensor, " m"]
-    """Half side in pixels of the square that selects the tiles; a whole number."""
+    radii: Float[Tensor, "m 2"]
+    """Half width and height in pixels of the rectangle that selects the tiles; whole numbers."""
 
 
 class Tiles(NamedTuple):
@@ -99,13 +99,19 @@ def project(world: World, camera: Camera, settings: RasterSettings, antialiased:
     det = a * c - b * b
     opacities = world.opacities[near]
     if antialiased:
-        opacities = opacities * (det_sharp / det).clamp(min=0).sqrt()
+        opacities = opacities * (det_sharp / det).clamp(min=settings.min_compensation**2).sqrt()
 
-    mean = 0.5 * (a + c)
-    larger = mean + torch.maximum(mean * mean - det, unit * unit * settings.min_discriminant).sqrt()
-    radii = (settings.radius_sigmas * (larger / unit).sqrt()).ceil()
+    if settings.per_axis:
+        # As many standard deviations as alpha >= min_alpha reaches; none is NaN, so that it is not seen.
+        sigmas = (2 * (opacities / settings.min_alpha).log()).sqrt().clamp(max=settings.radius_sigmas)
+        radii = (sigmas[:, None] * (torch.stack([a, c], 1) / unit[:, None]).sqrt()).ceil()
+    else:
+        mean = 0.5 * (a + c)
+        larger = mean + torch.maximum(mean * mean - det, unit * unit * settings.min_discriminant).sqrt()
+        radii = (settings.radius_sigmas * (larger / unit).sqrt()).ceil()[:, None].expand(-1, 2)
     u, v = fx * x / z + cx, fy * y / z + cy
-    seen = (det > 0) & radii.isfinite() & (u + radii > 0) & (u - radii < width) & (v + radii > 0) & (v - radii < height)
+    seen = (det > 0) & (radii.isfinite() & (radii > 0)).all(1)
+    seen &= (u + radii[:, 0] > 0) & (u - radii[:, 0] < width) & (v + radii[:, 1] > 0) & (v - radii[:, 1] < height)
     conics = unit[:, None] * (torch.stack([c, -b, a], 1) / det[:, None])
     seen = (seen & conics.isfinite().all(1)).nonzero().squeeze(1)
     return Projected(
@@ -134,12 +140,12 @@ def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float
 
 
 def assign_tiles(projected: Projected, width: int, height: int, tile_size: int) -> Tiles:
-    """Lists, for every tile, the Gaussians whose square touches it."""
+    """Lists, for every tile, the Gaussians whose rectangle touches it."""
     columns, rows = -(-width // tile_size), -(-height // tile_size)
     u, v = (projected.means2d / tile_size).unbind(1)
-    radius = projected.radii / tile_size
-    x0, x1 = (u - radius).floor().clamp(0, columns).long(), (u + radius).ceil().clamp(0, columns).long()
-    y0, y1 = (v - radius).floor().clamp(0, rows).long(), (v + radius).ceil().clamp(0, rows).long()
+    across, down = (projected.radii / tile_size).unbind(1)
+    x0, x1 = (u - across).floor().clamp(0, columns).long(), (u + across).ceil().clamp(0, columns).long()
+    y0, y1 = (v - down).floor().clamp(0, rows).long(), (v + down).ceil().clamp(0, rows).long()
     wide, count = x1 - x0, (x1 - x0) * (y1 - y0)
     member = torch.repeat_interleave(torch.arange(count.numel(), device=count.device), count)
     step = torch.arange(member.numel(), device=count.device) - (count.cumsum(0) - count)[member]

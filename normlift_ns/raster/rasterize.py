@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby, islice, zip_longest
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, UInt8
@@ -16,18 +16,17 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.gpu import in_parts
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import BackendName, RasterizeMode
 from normlift_ns.raster.backend import Batch, Job
-from normlift_ns.raster.backends import BackendName, choose_backend
+from normlift_ns.raster.backends import choose_backend
 from normlift_ns.raster.settings import RasterSettings
 
 Progress = Callable[[int, int | None], None]
 _IN_FLIGHT = 8
 """Most views at once on a GPU."""
-_FLIGHT_ELEMENTS = 2**24
-"""Views in flight times Gaussians, about: each takes 60 bytes."""
-_SEVERAL_VIEWS = ("gsplat", "triton")
-"""Backends that take several views at once."""
+_FLIGHT_ELEMENTS = {"gsplat": 2**24, "triton": 2**26}
+"""Views in flight times Gaussians, about, of the backends that take several views at once: each takes 60 bytes of
+gsplat, of triton those that are seen take twice as many, and all others one."""
 _ADVICE = "rasterize at a fraction of the resolution (ns-normlift --lift-downscale 2), or on the CPU (--device cpu)"
 
 
@@ -59,12 +58,12 @@ def rasterize_evidence(
         num_regions: regions (columns, feature rows) per view; by default the largest id + 1. Needed where a table has
             rows that no pixel shows.
         backend: "torch" (the reference, any device and precision), "numba" (compiled, CPU), "triton" (fast, GPU,
-            float32), "gsplat" (stock gsplat, GPU, float32, weight_power 1), "auto" (the fastest for the scene's device
-            and the precision).
+            float32), "gsplat" (stock gsplat, GPU, float32, weight_power 1, by the rules of the installed version or
+            older ones), "auto" (the fastest for the scene's device and the precision).
         rasterize_mode: as the scene was trained, splatfacto's `rasterize_mode`.
         weight_power: sums A_ij ** power. 1: the paper. 2: as SFS's code. 0: counts the pixels that a Gaussian
             contributes to.
-        settings: constants of the rasterizer; those of gsplat 1.4.0 by default.
+        settings: constants of the rasterizer; those of gsplat 1.4.0 by default. See `RasterSettings.of_gsplat`.
         dtype: precision of the computation and of the weights; by default the scene's. Sums are always taken in
             float64.
         progress: called after every view with (views done, number of views or None).
@@ -85,7 +84,7 @@ def rasterize_evidence(
         raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     job = _job(scene, rasterize_mode, settings, dtype, weight_power)
     name, chosen = choose_backend(backend, job, pictures=False)
-    in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS // max(1, len(scene)))) if name in _SEVERAL_VIEWS else 1
+    in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS.get(name, 0) // max(1, len(scene))))
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
@@ -98,8 +97,12 @@ def rasterize_evidence(
     done = 0
     with torch.no_grad():
         for flight in _flights(_zip_views(cameras, labels, num_regions), in_flight):
+            for i, (camera, there, _) in enumerate(flight):
+                _check_map(done + i, camera, there)
+            device = scene.means.device
+            ends = torch.stack([torch.stack(x.aminmax()).to(device, torch.int64) for _, x, _ in flight]).tolist()
             checked = [
-                (camera, there, _check_labels(done + i, camera, there, count))
+                (camera, there, _check_range(done + i, ends[i][0], ends[i][1], count))
                 for i, (camera, there, count) in enumerate(flight)
             ]
 
@@ -116,6 +119,18 @@ def rasterize_evidence(
     return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
 
 
+def backend_of(
+    scene: GaussianScene, backend: BackendName, *, settings: RasterSettings, dtype: torch.dtype, weight_power: int
+) -> BackendName:
+    """The name of the backend that `rasterize_evidence` would use.
+
+    Raises:
+        ValueError: none of that name, or it cannot do the job; says what to use instead.
+    """
+    job = _job(scene, "classic", settings, dtype, weight_power)
+    return cast(BackendName, choose_backend(backend, job, pictures=False)[0])
+
+
 def render(
     scene: GaussianScene,
     camera: Camera,
@@ -130,8 +145,7 @@ def render(
 
     Args:
         values: colours, relevancies, reliability, …; not premultiplied.
-        backend: as in `rasterize_evidence`, but "triton", which sums evidence and draws no pictures. "auto" is "numba"
-            on a CPU and "torch" elsewhere.
+        backend: as in `rasterize_evidence`.
     Returns:
         The image without background (add background * (1 - alpha)), and alpha in 0..1.
     Raises:
@@ -207,7 +221,7 @@ def _zip_views(
         yield items[0], items[1], items[2] if num_regions is not None else None
 
 
-def _check_labels(index: int, camera: Camera, labels: Tensor, count: int | None) -> int:
+def _check_map(index: int, camera: Camera, labels: Tensor) -> None:
     if (
         not isinstance(labels, Tensor)
         or labels.dtype.is_floating_point
@@ -220,7 +234,10 @@ def _check_labels(index: int, camera: Camera, labels: Tensor, count: int | None)
             f"labels of view {index} have shape {tuple(labels.shape)}, but its camera is {camera.height} x "
             f"{camera.width} (height x width)"
         )
-    low, high = torch.stack(labels.aminmax()).tolist()
+
+
+def _check_range(index: int, low: int, high: int, count: int | None) -> int:
+    """The number of regions of a view."""
     if low < MASKED:
         raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
     if count is not None and high >= count:

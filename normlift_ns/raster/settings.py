@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from normlift_ns.errors import InputError
+from normlift_ns.options import KNOWN_RULES
 
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Constants of gsplat 1.4.0's kernels, as splatfacto calls them (fully_fused_projection_fwd.cu, isect_tiles.cu,
-    rasterize_to_pixels_fwd.cu).
+    """Constants of gsplat's kernels, as splatfacto calls them; by default those of gsplat 1.4.0
+    (fully_fused_projection_fwd.cu, isect_tiles.cu, rasterize_to_pixels_fwd.cu).
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, RasterSettings, render
@@ -18,6 +21,8 @@ class RasterSettings:
     >>> choices = RasterSettings(), RasterSettings(max_alpha=0.75), RasterSettings(near_plane=2.0)
     >>> [render(scene, camera, torch.ones(1, 1), settings=settings)[1] for settings in choices]
     [tensor([[0.9990]]), tensor([[0.7500]]), tensor([[0.]])]
+    >>> RasterSettings.of_gsplat("1.5").per_axis
+    True
     """
 
     near_plane: float = 0.01
@@ -30,8 +35,13 @@ class RasterSettings:
     """Beyond the image by this share of half its field of view, the Jacobian of the projection is held constant."""
     min_discriminant: float = 0.01
     """Lower bound of b ** 2 - det in the larger eigenvalue of the projected covariance."""
+    min_compensation: float = 0.0
+    """Lower bound of the factor by which antialiasing scales an opacity."""
+    per_axis: bool = False
+    """False: a square around the longer axis selects the tiles of a Gaussian. True, from gsplat 1.5 on: a rectangle
+    around its extent along each axis of the image, not larger than where alpha falls below `min_alpha`."""
     radius_sigmas: float = 3.0
-    """Half side, in standard deviations of the larger axis, of the square that selects the tiles of a Gaussian."""
+    """Half side of that square or, at most, of that rectangle, in standard deviations."""
     tile_size: int = 16
     """Side of a tile in pixels. A Gaussian is drawn in whole tiles only, so this changes the result."""
     max_alpha: float = 0.999
@@ -40,3 +50,23 @@ class RasterSettings:
     """Pixels with a smaller alpha skip the Gaussian."""
     min_transmittance: float = 1e-4
     """A pixel stops before the first Gaussian that would leave this or less transmittance."""
+
+    @staticmethod
+    def of_gsplat(version: str) -> RasterSettings:
+        """The constants of a version of gsplat: 1.4, 1.5, or 1.6, which is not released yet and may change.
+
+        Args:
+            version: two or more numbers with dots, such as "1.5" or "1.5.3".
+        Raises:
+            ValueError: a version of which nothing is known.
+
+        >>> RasterSettings.of_gsplat("1.4.0") == RasterSettings(), RasterSettings.of_gsplat("1.6").max_alpha
+        (True, 0.99)
+        """
+        rules = ".".join(version.split(".")[:2])
+        if rules not in KNOWN_RULES:
+            raise InputError(f"nothing is known of the rules of gsplat {version}; known are {', '.join(KNOWN_RULES)}")
+        if rules == "1.4":
+            return RasterSettings()
+        rectangle = RasterSettings(per_axis=True, radius_sigmas=3.33)
+        return rectangle if rules == "1.5" else replace(rectangle, max_alpha=0.99, min_compensation=0.005)

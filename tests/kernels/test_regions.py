@@ -4,43 +4,25 @@ import pytest
 import torch
 
 from normlift_ns import Evidence, GaussianScene, RasterSettings, rasterize_evidence
-from normlift_ns.core.evidence import MASKED, UNLABELED, Entries
-from normlift_ns.core.sparse import sum_equal_keys
+from normlift_ns.core.evidence import MASKED, UNLABELED
 from normlift_ns.kernels import regions
-from normlift_ns.raster.projection import assign_tiles, project, to_world
+from normlift_ns.raster import triton
+from normlift_ns.raster.backend import Batch, Job
 from tests.scenes import dense, generator, orbit, random_labels, random_scene
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 SETTINGS = RasterSettings()
 
 
+def job(scene, antialiased=False, weight_power=1, settings=SETTINGS):
+    return Job(scene.to(DEVICE), antialiased, settings, torch.float32, weight_power)
+
+
 def kernel_evidence(scene, cameras, labels, counts, weight_power=1):
-    """Evidence by the kernel, all views in flight at once, projected by our own code."""
-    n, columns = len(scene), sum(counts) + len(counts)
-    arrays = [torch.zeros(len(cameras) * n, size) for size in (2, 3)] + [torch.zeros(len(cameras) * n)]
-    members, offsets = [], [torch.zeros(1, dtype=torch.int64)]
-    for view, camera in enumerate(cameras):
-        projected = project(to_world(scene, torch.float32), camera, SETTINGS, False)
-        tiles = assign_tiles(projected, camera.width, camera.height, SETTINGS.tile_size)
-        place = view * n + projected.gaussian
-        for array, values in zip(arrays, (projected.means2d, projected.conics, projected.opacities)):
-            array[place] = values
-        members.append(place[tiles.members.long()].int())
-        offsets.append(tiles.offsets[1:] + offsets[-1][-1])
-    first = torch.tensor([0, *(count + 1 for count in counts)]).cumsum(0)[:-1].int()
-    found = regions.region_sums(
-        *(x.to(DEVICE) for x in (*arrays, torch.cat(members), torch.cat(offsets), torch.stack(labels), first)),
-        columns=columns,
-        tile_size=SETTINGS.tile_size,
-        max_alpha=SETTINGS.max_alpha,
-        min_alpha=SETTINGS.min_alpha,
-        min_transmittance=SETTINGS.min_transmittance,
-        weight_power=weight_power,
-    )
-    key, weight = (x.cpu() for x in sum_equal_keys(*found))
-    gaussian = key // columns
-    entries = Entries(gaussian.int(), (key - gaussian * columns).int(), weight, tuple(counts))
-    return Evidence.from_entries([entries], n, weight_power=weight_power)
+    """Evidence by the kernels, all views in flight at once."""
+    batch = Batch(cameras, [x.to(DEVICE) for x in labels], counts)
+    entries = triton.views_evidence(job(scene, weight_power=weight_power), batch)
+    return Evidence.from_entries([entries], len(scene), weight_power=weight_power).to("cpu")
 
 
 def assert_same(found, expected, regions_in_all, tolerance=2e-6):
@@ -124,5 +106,23 @@ def test_chunks_cover_all_tiles_once():
 
 
 def test_keys_are_as_wide_as_they_must_be():
-    assert regions._key_type(2**31 - 1) == torch.int32
-    assert regions._key_type(2**31) == torch.int64
+    scene, cameras = random_scene(8, seed=2, dtype=torch.float32), orbit(1)
+    labels = torch.stack([random_labels(cameras[0], 4, seed=2)]).to(DEVICE)
+    grid, seen, lists = triton.see(job(scene), cameras)
+    limits = triton._limits(SETTINGS)
+    found = {
+        columns: regions.region_sums(seen.splats, lists, labels, grid, columns=columns, limits=limits, weight_power=1)
+        for columns in (5, 2**30)
+    }
+    assert (found[5].key.dtype, found[2**30].key.dtype) == (torch.int32, torch.int64)
+    assert torch.equal(found[5].weight, found[2**30].weight)
+    assert torch.equal(found[5].key // 5, (found[2**30].key // 2**30).int())
+
+
+def test_any_shape_of_cells_sums_the_same(monkeypatch):
+    scene, cameras = hard_scene(), orbit(2, width=33, height=18)
+    labels = [random_labels(camera, 3, seed=v) for v, camera in enumerate(cameras)]
+    expected = rasterize_evidence(scene, cameras, labels, num_regions=[3, 3], backend="torch")
+    for cell in ((16, 16), (8, 8), (16, 8)):
+        monkeypatch.setattr(triton, "CELL", cell)
+        assert_same(kernel_evidence(scene, cameras, labels, [3, 3]), expected, 6)

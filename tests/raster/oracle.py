@@ -22,8 +22,12 @@ def _rotation(q: list[float]) -> np.ndarray:
     )
 
 
-def compositing_matrix(scene: GaussianScene, camera: Camera, antialiased: bool = False) -> np.ndarray:
-    """A [height, width, N] of one view, float64."""
+def compositing_matrix(
+    scene: GaussianScene, camera: Camera, antialiased: bool = False, rules: str = "1.4"
+) -> np.ndarray:
+    """A [height, width, N] of one view, float64, by the rules of a version of gsplat."""
+    cap = 0.99 if rules == "1.6" else CAP
+    floor = 0.005 if rules == "1.6" else 0.0
     K, pose = camera.K.double().numpy(), camera.world_to_camera.double().numpy()
     width, height = camera.width, camera.height
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -46,25 +50,31 @@ def compositing_matrix(scene: GaussianScene, camera: Camera, antialiased: bool =
         determinant = np.linalg.det(blurred)
         opacity = float(scene.opacities[j])
         if antialiased:
-            opacity *= math.sqrt(max(0.0, np.linalg.det(sharp) / determinant))
+            opacity *= max(floor, math.sqrt(max(0.0, np.linalg.det(sharp) / determinant)))
         half_trace = 0.5 * np.trace(blurred)
         radius = math.ceil(3 * math.sqrt(half_trace + math.sqrt(max(0.01, half_trace**2 - determinant))))
+        across, down = radius, radius
+        if rules != "1.4":  # a rectangle that ends where alpha is 1/255
+            if opacity < SKIP:
+                continue
+            sigmas = min(3.33, math.sqrt(2 * math.log(opacity / SKIP)))
+            across, down = math.ceil(sigmas * math.sqrt(blurred[0, 0])), math.ceil(sigmas * math.sqrt(blurred[1, 1]))
         u, v = fx * x / z + cx, fy * y / z + cy
-        if u + radius <= 0 or u - radius >= width or v + radius <= 0 or v - radius >= height:
+        if u + across <= 0 or u - across >= width or v + down <= 0 or v - down >= height:
             continue
-        splats.append((z, j, u, v, radius, np.linalg.inv(blurred), opacity))
+        splats.append((z, j, u, v, (across, down), np.linalg.inv(blurred), opacity))
     splats.sort(key=lambda splat: (splat[0], splat[1]))
     weights = np.zeros((height, width, len(scene)))
     for row in range(height):
         for column in range(width):
             transmittance = 1.0
-            for _, j, u, v, radius, conic, opacity in splats:
-                if not math.floor((u - radius) / TILE) <= column // TILE < math.ceil((u + radius) / TILE):
+            for _, j, u, v, (across, down), conic, opacity in splats:
+                if not math.floor((u - across) / TILE) <= column // TILE < math.ceil((u + across) / TILE):
                     continue
-                if not math.floor((v - radius) / TILE) <= row // TILE < math.ceil((v + radius) / TILE):
+                if not math.floor((v - down) / TILE) <= row // TILE < math.ceil((v + down) / TILE):
                     continue
                 d = np.array([column + 0.5 - u, row + 0.5 - v])
-                alpha = min(CAP, opacity * math.exp(-0.5 * d @ conic @ d))
+                alpha = min(cap, opacity * math.exp(-0.5 * d @ conic @ d))
                 if alpha < SKIP:
                     continue
                 if transmittance * (1 - alpha) <= STOP:

@@ -14,29 +14,38 @@ pytestmark = [pytest.mark.slow, needs_shared]
 scene_of = cache(trained_scene)
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
-@pytest.mark.parametrize("path", weight_fixtures(), ids=lambda path: path.stem)
-def test_float32_weights_are_those_of_the_cuda_kernels(path, backend, record_property):
-    name, _, mode = path.stem.split("_")
-    scene = scene_of(name)
-    camera, labels, arrays = fixture_view(path)
+def fixture_difference(scene, camera, labels, arrays, backend, mode):
+    """Frobenius norm of the difference to the CUDA kernels' weights and difference of the sums, both relative."""
+    found, expected = _places(scene, camera, labels, arrays, backend, mode)
+    return float((found - expected).norm() / expected.norm()), abs(float(found.sum() / expected.sum()) - 1)
+
+
+def _places(scene, camera, labels, arrays, backend, mode):
     columns = int(labels.max()) + 2
     place = arrays["gaussian"].astype(np.int64) * columns + arrays["region"] + 1
     expected = torch.zeros(len(scene) * columns, dtype=torch.float64)
     expected[torch.from_numpy(place)] = torch.from_numpy(arrays["weight"]).double()
 
-    evidence = rasterize_evidence(scene, [camera], [labels], backend=backend, rasterize_mode=mode)
+    evidence = rasterize_evidence(scene, [camera], [labels], backend=backend, rasterize_mode=mode).to("cpu")
+    assert evidence.rows.weight.dtype == torch.float32
     found = torch.zeros_like(expected)
     found[evidence.rows.row_index() * columns + evidence.rows.column + 1] = evidence.rows.weight.double()
     found[evidence.unlabeled.row_index() * columns] = evidence.unlabeled.weight.double()
+    return found, expected
 
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+@pytest.mark.parametrize("path", weight_fixtures(), ids=lambda path: path.stem)
+def test_float32_weights_are_those_of_the_cuda_kernels(path, backend, record_property):
+    name, _, mode = path.stem.split("_")
+    camera, labels, arrays = fixture_view(path)
+    found, expected = _places(scene_of(name), camera, labels, arrays, backend, mode)
     frobenius = float((found - expected).norm() / expected.norm())
     one_sided = float((found + expected)[(found == 0) != (expected == 0)].sum() / expected.sum())
     total = abs(float(found.sum() / expected.sum()) - 1)
     for key, value in (("frobenius", frobenius), ("one_sided", one_sided), ("total", total)):
         record_property(key, value)
     print(f"{path.stem} {backend}: Frobenius {frobenius:.1e}, one-sided weight {one_sided:.1e}, total {total:.1e}")
-    assert evidence.rows.weight.dtype == torch.float32
     assert frobenius <= 2e-5
     assert one_sided < 1e-6
     assert total < 1e-6

@@ -1,6 +1,7 @@
 """Parameters that no float32 rasterizer can draw: the same Gaussians are left out, and counted, on every backend."""
 
 import math
+import sys
 import warnings
 
 import numpy as np
@@ -13,7 +14,7 @@ from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, rende
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.raster import triton
 from normlift_ns.raster.backend import Batch, Job
-from tests.kernels.test_regions import hard_scene
+from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.scenes import dense, orbit, orbit_camera, random_labels, random_scene
 
 BACKENDS = ["torch", "numba"]
@@ -123,42 +124,36 @@ def test_both_ends_are_drawn():
 
 
 @pytest.fixture
-def gsplat_on_the_cpu(monkeypatch):
-    """gsplat's compiled projection and tile lists, replaced by its own torch code, as CUDA gives infinity and NaN."""
-    from gsplat.cuda import _torch_impl, _wrapper  # noqa: PLC0415 (imports slowly)
-
-    def projection(means, covars, quats, scales, poses, intrinsics, width, height, **options):
-        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False)
-        radii, *rest = _torch_impl._fully_fused_projection(means, covars, poses, intrinsics, width, height, **options)
-        return (torch.where(radii < 0, 2**31 - 128, radii).int(), *rest)  # CUDA saturates
-
-    def tiles(*arguments, n_cameras):
-        counts, keys, members = _torch_impl._isect_tiles(*arguments, sort=False)
-        order = keys.argsort(stable=True)  # equal depths by index, as a radix sort leaves them
-        return counts, keys[order], members[order]
-
-    monkeypatch.setattr(_wrapper, "fully_fused_projection", projection)
-    monkeypatch.setattr(_wrapper, "isect_offset_encode", _torch_impl._isect_offset_encode)
-    monkeypatch.setattr(_wrapper, "isect_tiles", tiles)
+def without_gsplat(monkeypatch):
+    """No module of gsplat can be imported."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="the kernels are compiled for the GPU")
+@pytest.mark.parametrize("rules", ["1.4", "1.5"])
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.usefixtures("gsplat_on_the_cpu")
-def test_the_gpu_backend_leaves_out_and_draws_the_same(mode):
-    """Through gsplat's formulas and Triton's interpreter: bad parameters, enormous scales, ordinary hard Gaussians."""
+@pytest.mark.usefixtures("without_gsplat")
+def test_the_gpu_backend_leaves_out_and_draws_the_same(mode, rules):
+    """Without gsplat, in Triton's interpreter: bad parameters, enormous scales, ordinary hard Gaussians."""
     scene, cameras = hard_scene(), orbit(2, width=33, height=18)
     scene.scales[:3] = torch.tensor([[1e6] * 3, [4.8e8] * 3, [1e9, 1e9, 1.0]])
     scene.scales[30:32] = torch.tensor([5e8, torch.inf])[:, None]
     scene.means[32], scene.means[33, 1], scene.quats[34], scene.quats[35] = 1e19, torch.nan, 1e-30, 0
     scene.quats[36], scene.opacities[37] = 1e20, torch.nan
     labels = [random_labels(camera, 3, seed=v) for v, camera in enumerate(cameras)]
-    job = Job(scene, mode == "antialiased", RasterSettings(), torch.float32)
-    entries = triton.views_evidence(job, Batch(cameras, labels, [3, 3]))
-    found = Evidence.from_entries([entries], len(scene))
-    expected = evidence_of(scene, cameras, labels, "torch", rasterize_mode=mode)
+    job = Job(scene.to(DEVICE), mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
+    entries = triton.views_evidence(job, Batch(cameras, [x.to(DEVICE) for x in labels], [3, 3]))
+    found = Evidence.from_entries([entries], len(scene)).to("cpu")
+    expected = evidence_of(scene, cameras, labels, "torch", rasterize_mode=mode, settings=job.settings)
     assert expected.num_excluded == 9
     ours, theirs = dense(found.rows, 6), dense(expected.rows, 6)
     assert theirs[:2].amin() >= 0 and theirs[:2].sum() > 1  # enormous, and seen
     assert ours[~scene.drawable].abs().max() == 0
-    assert (ours - theirs).abs().max() < (1e-5 if mode == "classic" else 1e-3) * theirs.max()
+    tolerance = 1e-5 if mode == "classic" else 1e-3
+    assert (ours - theirs).abs().max() < tolerance * theirs.max()
+    values = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(0))
+    drawn = [x.cpu() for x in triton.composite(job, cameras[1], values.to(DEVICE))]
+    pictures = render(scene, cameras[1], values, backend="torch", rasterize_mode=mode, settings=job.settings)
+    for picture, known in zip(drawn, pictures):
+        assert (picture - known).abs().max() < tolerance

@@ -1,0 +1,257 @@
+"""Which Gaussians some cameras see, and where in the image: gsplat's projection, one thread per Gaussian.
+
+The arithmetic is that of gsplat's utils.cuh, product by product, so that the compiler fuses the same ones. Distances
+along the axis of the camera, which decide the order of drawing, are rounded bit for bit as CUDA rounds them there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+CAMERA = 16
+"""Numbers of a camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
+SPLAT = 8
+"""Numbers of a splat: centre u, v in pixels, half of xx and of yy of the inverse covariance and its xy, opacity, half
+sides of the rectangle. A splat is read as four pairs."""
+_BLOCK = 128
+_ENORMOUS = tl.constexpr(2.0**60)
+"""Covariance in square pixels above which determinants are computed in larger units."""
+_LARGEST = tl.constexpr(3.4028234e38)
+
+
+class Rules(NamedTuple):
+    """Numbers that decide what is drawn: fields of the rasterizer's settings."""
+
+    near_plane: float
+    far_plane: float
+    eps2d: float
+    frustum_margin: float
+    min_discriminant: float
+    min_compensation: float
+    radius_sigmas: float
+    min_alpha: float
+
+
+class Splats(NamedTuple):
+    """Gaussians that some cameras see."""
+
+    seen: Int64[Tensor, " m"]
+    """gaussian * views + view, ascending."""
+    splats: Float32[Tensor, "m 8"]
+    """See `SPLAT`."""
+    depth: Float32[Tensor, " m"]
+
+
+@triton.jit
+def _camera_axis(camera, axis: tl.constexpr, x, y, z):
+    """One camera coordinate, rounded as CUDA rounds R p + t."""
+    a, b = tl.load(camera + 4 * axis), tl.load(camera + 4 * axis + 1)
+    c, t = tl.load(camera + 4 * axis + 2), tl.load(camera + 4 * axis + 3)
+    return tl.fma(z, c, tl.fma(x, a, b * y)) + t
+
+
+@triton.jit
+def _dot(ax, ay, az, bx, by, bz):
+    return ax * bx + ay * by + az * bz
+
+
+@triton.jit
+def _covariance(quats, scales, i, there):
+    """R diag(scale ** 2) R^T: xx, xy, xz, yy, yz, zz."""
+    w = tl.load(quats + 4 * i, mask=there, other=1.0)
+    x = tl.load(quats + 4 * i + 1, mask=there, other=0.0)
+    y = tl.load(quats + 4 * i + 2, mask=there, other=0.0)
+    z = tl.load(quats + 4 * i + 3, mask=there, other=0.0)
+    sx = tl.load(scales + 3 * i, mask=there, other=0.0)
+    sy = tl.load(scales + 3 * i + 1, mask=there, other=0.0)
+    sz = tl.load(scales + 3 * i + 2, mask=there, other=0.0)
+    inverse = tl.rsqrt(x * x + y * y + z * z + w * w)
+    x, y, z, w = x * inverse, y * inverse, z * inverse, w * inverse
+    x2, y2, z2, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+    ax, ay, az = (1.0 - 2.0 * (y2 + z2)) * sx, 2.0 * (xy - wz) * sy, 2.0 * (xz + wy) * sz
+    bx, by, bz = 2.0 * (xy + wz) * sx, (1.0 - 2.0 * (x2 + z2)) * sy, 2.0 * (yz - wx) * sz
+    cx, cy, cz = 2.0 * (xz - wy) * sx, 2.0 * (yz + wx) * sy, (1.0 - 2.0 * (x2 + y2)) * sz
+    return (
+        _dot(ax, ay, az, ax, ay, az),
+        _dot(ax, ay, az, bx, by, bz),
+        _dot(ax, ay, az, cx, cy, cz),
+        _dot(bx, by, bz, bx, by, bz),
+        _dot(bx, by, bz, cx, cy, cz),
+        _dot(cx, cy, cz, cx, cy, cz),
+    )
+
+
+@triton.jit
+def _turned(camera, xx, xy, xz, yy, yz, zz):
+    """The covariance in the axes of a camera."""
+    a, b, c = tl.load(camera), tl.load(camera + 1), tl.load(camera + 2)
+    d, e, f = tl.load(camera + 4), tl.load(camera + 5), tl.load(camera + 6)
+    g, h, k = tl.load(camera + 8), tl.load(camera + 9), tl.load(camera + 10)
+    x0, x1, x2 = _dot(a, b, c, xx, xy, xz), _dot(a, b, c, xy, yy, yz), _dot(a, b, c, xz, yz, zz)
+    y0, y1, y2 = _dot(d, e, f, xx, xy, xz), _dot(d, e, f, xy, yy, yz), _dot(d, e, f, xz, yz, zz)
+    z0, z1, z2 = _dot(g, h, k, xx, xy, xz), _dot(g, h, k, xy, yy, yz), _dot(g, h, k, xz, yz, zz)
+    return (
+        _dot(x0, x1, x2, a, b, c),
+        _dot(x0, x1, x2, d, e, f),
+        _dot(x0, x1, x2, g, h, k),
+        _dot(y0, y1, y2, d, e, f),
+        _dot(y0, y1, y2, g, h, k),
+        _dot(z0, z1, z2, g, h, k),
+    )
+
+
+@triton.jit
+def _splat(
+    camera, width, height, x, y, z, xx, xy, xz, yy, yz, zz, opacity,
+    near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
+    ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr,
+):  # fmt: skip
+    """(whether the image can show it, u, v, conic xx, xy, yy, opacity, half width, half height, depth)."""
+    fx, fy = tl.load(camera + 12), tl.load(camera + 13)
+    cx, cy = tl.load(camera + 14), tl.load(camera + 15)
+    xc, yc, depth = _camera_axis(camera, 0, x, y, z), _camera_axis(camera, 1, x, y, z), _camera_axis(camera, 2, x, y, z)
+    seen = (depth >= near_plane) & (depth <= far_plane)
+    zc = tl.where(seen, depth, 1.0)
+    xx, xy, xz, yy, yz, zz = _turned(camera, xx, xy, xz, yy, yz, zz)
+
+    margin_x, margin_y = frustum_margin * (0.5 * width / fx), frustum_margin * (0.5 * height / fy)
+    rz = 1.0 / zc
+    rz2 = rz * rz
+    tx = zc * tl.minimum((width - cx) / fx + margin_x, tl.maximum(-(cx / fx + margin_x), xc * rz))
+    ty = zc * tl.minimum((height - cy) / fy + margin_y, tl.maximum(-(cy / fy + margin_y), yc * rz))
+    jx, jy, jxz, jyz = fx * rz, fy * rz, -fx * tx * rz2, -fy * ty * rz2
+    p0, p1, p2 = jxz * xz + jx * xx, jxz * yz + jx * xy, jxz * zz + jx * xz
+    q1, q2 = jyz * yz + jy * yy, jyz * zz + jy * yz
+    a, b, c = p2 * jxz + p0 * jx, p2 * jyz + p1 * jy, q2 * jyz + q1 * jy
+
+    unit = tl.where(tl.maximum(a, c) > _ENORMOUS, 1.0 / _ENORMOUS, 1.0)
+    a, b, c = unit * a, unit * b, unit * c
+    sharp = a * c - b * b
+    a, c = a + unit * eps2d, c + unit * eps2d
+    det = a * c - b * b
+    seen &= det > 0
+    det = tl.where(seen, det, 1.0)
+    if ANTIALIASED:
+        opacity *= tl.sqrt(tl.maximum(min_compensation * min_compensation, sharp / det))
+    inverse = 1.0 / det
+    conic_x, conic_xy, conic_y = unit * (c * inverse), unit * (-b * inverse), unit * (a * inverse)
+    seen &= (tl.abs(conic_x) <= _LARGEST) & (tl.abs(conic_xy) <= _LARGEST) & (tl.abs(conic_y) <= _LARGEST)
+
+    if PER_AXIS:
+        seen &= opacity >= min_alpha
+        reach = tl.sqrt(2.0 * tl.log(tl.maximum(opacity / min_alpha, 1.0)))
+        sigmas = tl.minimum(radius_sigmas, reach)
+        half_width, half_height = tl.ceil(sigmas * tl.sqrt(a / unit)), tl.ceil(sigmas * tl.sqrt(c / unit))
+        seen &= (half_width > 0) & (half_height > 0)
+    else:
+        mean = 0.5 * (a + c)
+        larger = mean + tl.sqrt(tl.maximum(unit * unit * min_discriminant, mean * mean - det))
+        half_width = tl.ceil(radius_sigmas * tl.sqrt(larger / unit))
+        half_height = half_width
+    seen &= (half_width <= _LARGEST) & (half_height <= _LARGEST)
+    u, v = fx * xc * rz + cx, fy * yc * rz + cy
+    seen &= (u + half_width > 0) & (u - half_width < width) & (v + half_height > 0) & (v - half_height < height)
+    return seen, u, v, conic_x, conic_xy, conic_y, opacity, half_width, half_height, depth
+
+
+@triton.jit
+def _find_seen(
+    means, quats, scales, opacities, drawable, cameras, out, gaussians, views, width, height,
+    near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
+    ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """out[gaussian, view]: whether the image can show it, and its opacity is not too small for any pixel."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < gaussians
+    there = tl.load(drawable + i, mask=inside, other=0) != 0
+    x = tl.load(means + 3 * i, mask=there, other=0.0)
+    y = tl.load(means + 3 * i + 1, mask=there, other=0.0)
+    z = tl.load(means + 3 * i + 2, mask=there, other=0.0)
+    opacity = tl.load(opacities + i, mask=there, other=0.0)
+    xx, xy, xz, yy, yz, zz = _covariance(quats, scales, i, there)
+    for view in range(views):
+        seen, _, _, _, _, _, found, _, _, _ = _splat(
+            cameras + view * CAMERA, width, height, x, y, z, xx, xy, xz, yy, yz, zz, opacity,
+            near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
+            ANTIALIASED, PER_AXIS,
+        )  # fmt: skip
+        tl.store(out + i * views + view, (seen & there & (found >= min_alpha)).to(tl.int8), mask=inside)
+
+
+@triton.jit
+def _project_seen(
+    means, quats, scales, opacities, cameras, seen, out_splat, out_depth, count, views, width, height,
+    near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
+    ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, SPLAT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    there = e < count
+    place = tl.load(seen + e, mask=there, other=0)
+    i = place // views
+    # Every lane has a camera of its own.
+    camera = cameras + (place - i * views) * CAMERA
+    x = tl.load(means + 3 * i, mask=there, other=0.0)
+    y = tl.load(means + 3 * i + 1, mask=there, other=0.0)
+    z = tl.load(means + 3 * i + 2, mask=there, other=1.0)
+    opacity = tl.load(opacities + i, mask=there, other=0.0)
+    xx, xy, xz, yy, yz, zz = _covariance(quats, scales, i, there)
+    _, u, v, a, b, c, opacity, half_width, half_height, depth = _splat(
+        camera, width, height, x, y, z, xx, xy, xz, yy, yz, zz, opacity,
+        near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
+        ANTIALIASED, PER_AXIS,
+    )  # fmt: skip
+    row = out_splat + SPLAT * e
+    tl.store(row, u, mask=there)
+    tl.store(row + 1, v, mask=there)
+    tl.store(row + 2, 0.5 * a, mask=there)
+    tl.store(row + 3, 0.5 * c, mask=there)
+    tl.store(row + 4, b, mask=there)
+    tl.store(row + 5, opacity, mask=there)
+    tl.store(row + 6, half_width, mask=there)
+    tl.store(row + 7, half_height, mask=there)
+    tl.store(out_depth + e, depth, mask=there)
+
+
+def project(
+    means: Float32[Tensor, "n 3"],
+    quats: Float32[Tensor, "n 4"],
+    scales: Float32[Tensor, "n 3"],
+    opacities: Float32[Tensor, " n"],
+    drawable: Bool[Tensor, " n"],
+    cameras: Float32[Tensor, "views 16"],
+    width: int,
+    height: int,
+    rules: Rules,
+    *,
+    antialiased: bool,
+    per_axis: bool,
+) -> Splats:
+    """What some cameras of one size see of a scene. Nothing is stored of the rest but a byte.
+
+    Args:
+        cameras: see `CAMERA`.
+        per_axis: a rectangle as gsplat draws it from 1.5 on instead of a square.
+    """
+    views, n, device = len(cameras), len(means), means.device
+    scene = [x.contiguous() for x in (means, quats, scales, opacities)]
+    flags = torch.empty(n * views, dtype=torch.bool, device=device)
+    options = {"ANTIALIASED": antialiased, "PER_AXIS": per_axis, "CAMERA": CAMERA, "BLOCK": _BLOCK, "num_warps": 4}
+    if n > 0:
+        _find_seen[(triton.cdiv(n, _BLOCK),)](
+            *scene, drawable.view(torch.int8), cameras, flags.view(torch.int8), n, views, width, height, *rules,
+            **options,
+        )  # fmt: skip
+    seen = flags.nonzero().squeeze(1)
+    splats = torch.empty(len(seen), SPLAT, device=device)
+    depth = torch.empty(len(seen), device=device)
+    if len(seen) > 0:
+        _project_seen[(triton.cdiv(len(seen), _BLOCK),)](
+            *scene, cameras, seen, splats, depth, len(seen), views, width, height, *rules, SPLAT=SPLAT, **options
+        )
+    return Splats(seen, splats, depth)

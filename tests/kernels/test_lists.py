@@ -1,0 +1,145 @@
+"""Lists of splats by cell: those of gsplat's tiles, without the cells that no pixel feels."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Camera, GaussianScene, RasterSettings
+from normlift_ns.raster import triton
+from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.projection import assign_tiles, camera_depths, project, to_world
+from tests.kernels.test_regions import DEVICE, hard_scene
+from tests.scenes import generator, orbit, random_labels, random_scene
+
+RULES = ("1.4", "1.5", "1.6")
+
+
+def see(scene, cameras, rules="1.4", antialiased=False, cull=True):
+    job = Job(scene.to(DEVICE), antialiased, RasterSettings.of_gsplat(rules), torch.float32)
+    grid, seen, lists = triton.see(job, cameras, cull=cull)
+    return grid, *(type(x)(*(y.cpu() for y in x)) for x in (seen, lists))
+
+
+def pairs(lists):
+    """(cell, splat) of every pair."""
+    cell = torch.repeat_interleave(torch.arange(len(lists.offsets) - 1), lists.offsets.diff())
+    return list(zip(cell.tolist(), lists.members.tolist()))
+
+
+@pytest.mark.parametrize("rules", RULES[:2])
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("kind", ["random", "hard"])
+def test_lists_are_those_of_the_reference(kind, antialiased, rules, monkeypatch):
+    monkeypatch.setattr(triton, "CELL", (16, 16))
+    scene = random_scene(70, dtype=torch.float32) if kind == "random" else hard_scene()
+    cameras = orbit(2, width=37, height=21)
+    grid, seen, lists = see(scene, cameras, rules, antialiased, cull=False)
+    constants = RasterSettings.of_gsplat(rules)
+    bounds = lists.offsets.tolist()
+    for view, camera in enumerate(cameras):
+        projected = project(to_world(scene, torch.float32), camera, constants, antialiased)
+        tiles = assign_tiles(projected, camera.width, camera.height, constants.tile_size)
+        faint = projected.opacities < constants.min_alpha  # no pixel draws them
+        for tile in range(grid.cells):
+            there = tiles.members[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()
+            place = view * grid.cells + tile
+            splats = lists.members[bounds[place] : bounds[place + 1]].long()
+            assert torch.equal(seen.seen[splats] // 2, projected.gaussian[there[~faint[there]]])
+            assert (seen.seen[splats] % 2 == view).all()
+
+
+def felt(grid, splat, camera, min_alpha):
+    """Cells with a pixel whose alpha is at least `min_alpha`, in float64, but for a last digit of float32."""
+    u, v, a, c, b, opacity = splat.double()[:6]
+    x, y = torch.arange(camera.width).double() + 0.5 - u, (torch.arange(camera.height).double() + 0.5 - v)[:, None]
+    alpha = opacity * torch.exp(-(a * x * x + c * y * y + b * x * y))
+    row, column = (alpha >= min_alpha * (1 + 1e-6)).nonzero(as_tuple=True)
+    return set((row // grid.cell_height * grid.across + column // grid.cell_width).tolist())
+
+
+@pytest.mark.parametrize("kind", ["random", "hard"])
+def test_only_cells_that_no_pixel_feels_are_left_out(kind):
+    scene = random_scene(60, seed=4, dtype=torch.float32, size=0.6) if kind == "random" else hard_scene()
+    cameras = orbit(1, width=70, height=41)
+    grid, seen, lists = see(scene, cameras)
+    _, _, whole = see(scene, cameras, cull=False)
+    kept, all_pairs = set(pairs(lists)), set(pairs(whole))
+    assert kept < all_pairs
+    needed = {(cell, row) for row, splat in enumerate(seen.splats) for cell in felt(grid, splat, cameras[0], 1 / 255)}
+    assert needed & all_pairs <= kept
+    assert len(kept - needed) < 0.15 * len(needed)
+
+
+def wild_scene(seed: int) -> GaussianScene:
+    """Every kind of Gaussian that breaks bounds: needles, giants, dots, faint ones, off screen, before the lens."""
+    g = generator(seed)
+    scene = random_scene(14, seed=seed, dtype=torch.float32, size=0.5)
+    exponent = torch.randint(-9, 9, (14, 3), generator=g).float() * torch.rand(14, 1, generator=g)
+    scales = scene.scales * 10 ** exponent.clamp(-6, 2)
+    scales[0] = 4.8e8 * torch.rand(3, generator=g)
+    scales[1] = torch.tensor([1e3, 1e-6, 1e-6])
+    means = scene.means.clone()
+    means[2:4, 2] = -4 + 0.02 * torch.rand(2, generator=g)
+    means[4:6] *= 20
+    means[6:8] = means[6]
+    opacities = scene.opacities.clone()
+    opacities[8:11] = torch.tensor([1 / 255, 1 / 254, 0.0039])
+    opacities[11] = 1.0
+    return GaussianScene(means, scene.quats, scales, opacities)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**31), rules=st.sampled_from(RULES), antialiased=st.booleans())
+def test_leaving_cells_out_changes_no_bit(seed, rules, antialiased):
+    scene = wild_scene(seed)
+    cameras = orbit(1, width=35, height=26)
+    labels = [random_labels(cameras[0], 3, seed=seed).to(DEVICE)]
+    job = Job(scene.to(DEVICE), antialiased, RasterSettings.of_gsplat(rules), torch.float32)
+    found, whole = (triton.views_evidence(job, Batch(cameras, labels, [3]), cull=cull) for cull in (True, False))
+    for ours, theirs in zip(found[:3], whole[:3]):
+        assert torch.equal(ours, theirs)
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**31))
+def test_depths_are_rounded_as_cuda_rounds_them(seed):
+    scene = random_scene(100, seed=seed, dtype=torch.float32)
+    camera = orbit(7, width=35, height=26)[seed % 7]
+    _, seen, lists = see(scene, [camera])
+    depth = camera_depths(scene.means, camera)[seen.seen]
+    assert torch.equal(seen.depth, depth)
+    for first, second in itertools.pairwise(lists.offsets.tolist()):
+        members = lists.members[first:second].long()
+        order = list(zip(seen.depth[members].tolist(), members.tolist()))
+        assert order == sorted(order)
+
+
+def test_an_empty_scene_and_an_empty_view():
+    empty = GaussianScene(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
+    far = random_scene(3, dtype=torch.float32)
+    far.means[:] = torch.tensor([0.0, 0.0, -9.0])
+    camera = orbit(1)[0]
+    for scene in (empty, far):
+        grid, seen, lists = see(scene, [camera])
+        assert (len(seen.seen), len(lists.members), len(lists.offsets)) == (0, 0, grid.cells + 1)
+        job = Job(scene.to(DEVICE), False, RasterSettings(), torch.float32)
+        entries = triton.views_evidence(job, Batch([camera], [random_labels(camera, 3).to(DEVICE)], [3]))
+        assert len(entries.weight) == 0
+        image, alpha = triton.composite(job, camera, torch.ones(len(scene), 2, device=DEVICE))
+        assert image.shape == (camera.height, camera.width, 2)
+        assert float(image.abs().sum() + alpha.abs().sum()) == 0
+
+
+def test_many_cells_need_wider_keys():
+    scene = random_scene(6, dtype=torch.float32, size=0.4)
+    camera = orbit(1, width=2000, height=2200, focal=2000.0)[0]  # 34,375 cells
+    small = Camera(torch.diag(torch.tensor([1 / 40, 1 / 40, 1]).double()) @ camera.K, camera.world_to_camera, 50, 55)
+    _, seen, lists = see(scene, [camera])
+    assert len(lists.offsets) - 1 > 2**15
+    _, few, _ = see(scene, [small])
+    assert torch.equal(seen.seen, few.seen)
+    counts = torch.bincount(lists.members, minlength=len(seen.seen))
+    assert counts.max() > 100
