@@ -35,7 +35,9 @@ from normlift_ns.runs.files import (
     tidy,
     with_paths,
 )
+from normlift_ns.runs.write import write_run
 from normlift_ns.scenes.match import judge, match_photographs
+from normlift_ns.scenes.nerfstudio.load import CheckedViews, NerfstudioScene, load_scene
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import is_saved_splat, open_saved_splat
 from normlift_ns.stages import Report
@@ -64,9 +66,13 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
         clean(run_dir.parent)  # a lift that was killed while it replaced the run
     if config.is_file() and is_saved_splat(run_dir):
         return open_saved_splat(run_dir, data=place, load_step=load_step)
-    from normlift_ns.nerfstudio_plugin.load import load_scene  # noqa: PLC0415 (nerfstudio takes 20 s)
+    return load_scene(config, data=place, load_step=load_step, by_nerfstudio=_by_nerfstudio)
 
-    return load_scene(config, data=place, load_step=load_step)
+
+def _by_nerfstudio(*run: Any) -> tuple[CheckedViews, CheckedViews]:
+    from normlift_ns.nerfstudio_plugin.views import by_nerfstudio  # noqa: PLC0415 (nerfstudio takes 13 s)
+
+    return by_nerfstudio(*run)
 
 
 def open_run(
@@ -95,7 +101,7 @@ def open_run(
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     vectors = None if text_vectors is None else check_path("text_vectors", text_vectors)
-    check_run(folder)  # before nerfstudio, which takes 20 s
+    check_run(folder)
     device, scene = choose_device(device), open_scene(load_config, data=data)
     loaded = load_field(folder, scene.gaussians.means, checkpoint=scene.checkpoint_path)
     changed = cameras_changed(loaded, scene)
@@ -199,9 +205,6 @@ def lift_run(
     made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
     if made is not None and len(queries) > 0:
         made.text(queries)
-    from normlift_ns.nerfstudio_plugin.load import NerfstudioScene  # noqa: PLC0415 (nerfstudio takes 20 s)
-    from normlift_ns.nerfstudio_plugin.write import write_run  # noqa: PLC0415
-
     scene = config_or_scene
     if isinstance(scene, str | Path):
         scene = open_scene(scene, data=data, load_step=load_step)

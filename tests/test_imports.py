@@ -44,7 +44,7 @@ FOREIGN = {
     "objects": BASE,
     "lifting": {"torch", "jaxtyping"},
     "stages": {"torch"},
-    "scenes": BASE | {"msgspec", "cv2", "PIL", "plyfile"},
+    "scenes": BASE | {"msgspec", "cv2", "PIL", "plyfile", "yaml"},
     "selection": {"numpy", "jaxtyping"},
     "text_encoders": set(),
     "question": {"numpy", "jaxtyping"},

@@ -18,7 +18,6 @@ from torch import Tensor
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.picking import ray_weights
-from normlift_ns.nerfstudio_plugin.appearance import shading_degree
 from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
 from normlift_ns.nerfstudio_plugin.panel import Panel
 from normlift_ns.options import RasterizeMode
@@ -27,6 +26,7 @@ from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.files import check_run, with_paths
 from normlift_ns.runs.question import load_question
+from normlift_ns.scenes.nerfstudio.appearance import shading_degree
 from normlift_ns.scenes.photographs import to_camera
 from normlift_ns.viewer.display import Display, draw
 

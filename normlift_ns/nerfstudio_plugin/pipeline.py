@@ -20,16 +20,17 @@ from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
-from normlift_ns.nerfstudio_plugin.checks import check_options, check_parts
-from normlift_ns.nerfstudio_plugin.config import stored_data
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
-from normlift_ns.nerfstudio_plugin.views import DatasetViews, image_name
+from normlift_ns.nerfstudio_plugin.views import DatasetViews, by_nerfstudio
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.question import make_question
 from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, digests_beside, sealed
 from normlift_ns.runs.question import save_question
 from normlift_ns.scenes.checkpoint import numpy_numbers
+from normlift_ns.scenes.nerfstudio.checks import check_options, check_parts
+from normlift_ns.scenes.nerfstudio.config import stored_data
+from normlift_ns.scenes.nerfstudio.load import load_scene
+from normlift_ns.scenes.nerfstudio.views import image_name
 from normlift_ns.text_encoders import encoder_settings
 
 if TYPE_CHECKING:
@@ -161,7 +162,7 @@ def lift_trained(trainer: Trainer) -> Path:
     pipeline: Any = trainer.pipeline
     options, path = pipeline.config, trainer.base_dir / "config.yml"
     CONSOLE.print("Lifting the trained scene")
-    scene = load_scene(path)
+    scene = load_scene(path, by_nerfstudio=by_nerfstudio)
     source = source_of(trainer.config, str(pipeline.device))
     encoder = encoder_settings(options.source)
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"

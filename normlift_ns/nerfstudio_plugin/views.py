@@ -18,7 +18,9 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
 from normlift_ns.errors import InputError
+from normlift_ns.nerfstudio_plugin.config import as_nerfstudios
 from normlift_ns.scenes.image_files import check_mask, read_head, remarks
+from normlift_ns.scenes.nerfstudio.views import image_name
 from normlift_ns.scenes.photographs import to_camera
 
 _READ_WELL = {"RGB", "RGBA", "L", "CMYK"}
@@ -180,6 +182,20 @@ def _undistorted(
     return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
 
 
-def image_name(file: Path, folder: Path) -> str:
-    """The file relative to the folder of its dataset, with forward slashes."""
-    return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
+def by_nerfstudio(
+    config: Any, folder: Path, poses: Float[Tensor, "v 3 4"], background: Float[Tensor, " 3"]
+) -> tuple[DatasetViews, DatasetViews]:
+    """Trained and held-out photographs of a run that was read without nerfstudio.
+
+    Args:
+        config: with absolute paths.
+        poses: of the training views.
+    """
+    manager: Any = as_nerfstudios(config).pipeline.datamanager.setup(
+        device="cpu", test_mode="test", world_size=1, local_rank=0
+    )
+    held_out = manager.eval_dataset
+    return (
+        DatasetViews(manager.train_dataset, folder, poses, background),
+        DatasetViews(held_out, folder, held_out.cameras.camera_to_worlds, background),
+    )

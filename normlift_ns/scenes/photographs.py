@@ -81,7 +81,7 @@ class PhotographViews:
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
         frame = self.frames[index % len(self)]
-        image = torch.from_numpy(_undistorted(_read(frame), frame.intrinsics)[0])
+        image = torch.from_numpy(undistorted(_read(frame), frame.intrinsics)[0])
         if image.shape[2] == 4:
             alpha = image[:, :, 3:].float() / 255
             image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
@@ -97,16 +97,16 @@ def _camera(frame: Frame) -> Camera:
 
 
 def _pinhole(frame: Frame) -> Camera:
-    matrix, width, height = _without_distortion(frame.intrinsics)
+    matrix, width, height = without_distortion(frame.intrinsics)
     return to_camera(torch.from_numpy(frame.pose).float(), torch.from_numpy(matrix).float(), width, height)
 
 
 @lru_cache  # photographs of one camera differ in their poses only
-def _without_distortion(intrinsics: Intrinsics) -> tuple[Float[np.ndarray, "3 3"], int, int]:
+def without_distortion(intrinsics: Intrinsics) -> tuple[Float[np.ndarray, "3 3"], int, int]:
     """Camera matrix and size of the undistorted photograph."""
     if not any(intrinsics.distortion):
         return _matrix(intrinsics), intrinsics.width, intrinsics.height
-    pixels, matrix = _undistorted(np.empty((intrinsics.height, intrinsics.width, 1), np.uint8), intrinsics)
+    pixels, matrix = undistorted(np.empty((intrinsics.height, intrinsics.width, 1), np.uint8), intrinsics)
     return matrix, pixels.shape[1], pixels.shape[0]
 
 
@@ -116,7 +116,7 @@ def _matrix(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
 
 
-def _undistorted(
+def undistorted(
     image: UInt8[np.ndarray, "h w c"], intrinsics: Intrinsics
 ) -> tuple[UInt8[np.ndarray, "h2 w2 c"], Float[np.ndarray, "3 3"]]:
     """The image without distortion, and its camera matrix."""
@@ -181,4 +181,4 @@ def _mask(frame: Frame) -> Bool[Tensor, "h w"] | None:
             "as its image. Save it in grey."
         )
     kept = np.where(values != 0, np.uint8(255), np.uint8(0))[:, :, None]
-    return torch.from_numpy(_undistorted(kept, frame.intrinsics)[0][:, :, 0]).bool()
+    return torch.from_numpy(undistorted(kept, frame.intrinsics)[0][:, :, 0]).bool()

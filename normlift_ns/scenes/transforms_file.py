@@ -54,6 +54,7 @@ class Entries(CameraEntry, kw_only=True):
     frames: list[FrameEntry]
     applied_transform: list[list[float]] | None = None
     applied_scale: float = 1.0
+    orientation_override: Any = None
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None

@@ -12,9 +12,9 @@ from nerfstudio.configs.method_configs import all_methods
 from benchmarks.captures import SHARED
 from normlift_ns import SemanticField, lift, rasterize_evidence
 from normlift_ns.method_configs.normlift import normlift_method
-from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
-from normlift_ns.nerfstudio_plugin.write import write_run
 from normlift_ns.runs.files import load_field, run_directory
+from normlift_ns.runs.write import write_run
+from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
 
 

@@ -23,8 +23,9 @@ from nerfstudio.engine import optimizers, schedulers
 
 from normlift_ns.errors import InputError
 from normlift_ns.method_configs.normlift import normlift_method
-from normlift_ns.nerfstudio_plugin.allowed import PAIRS
-from normlift_ns.nerfstudio_plugin.config import locate, read_config
+from normlift_ns.nerfstudio_plugin.config import read_config
+from normlift_ns.scenes.nerfstudio.allowed import PAIRS
+from normlift_ns.scenes.nerfstudio.config import locate
 
 READ = (NerfstudioDataParserConfig, ColmapDataParserConfig, BlenderDataParserConfig)
 

@@ -11,8 +11,8 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
 from benchmarks.captures import SHARED
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.nerfstudio_plugin.config import rerooted
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.raster.rasterize import render_picture
 from tests.nerfstudio_plugin.conftest import field_of, lifted_field, write
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto
 

@@ -9,8 +9,9 @@ import pytest
 import yaml
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-from normlift_ns.nerfstudio_plugin.config import locate, read_config
-from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.front_door import open_scene as load_scene
+from normlift_ns.nerfstudio_plugin.config import read_config
+from normlift_ns.scenes.nerfstudio.config import locate
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, working_directory
 
 HEADER = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: splatfacto\n"

@@ -19,7 +19,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, _pose, train_splatfacto, write_dataset
 from tests.scenes.made import write_colmap

@@ -14,8 +14,8 @@ from nerfstudio.plugins import registry
 from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.method_configs.scannet import scannet_method
-from normlift_ns.nerfstudio_plugin.config import SUPPORTED_METHODS
 from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+from normlift_ns.scenes.nerfstudio.config import SUPPORTED_METHODS
 
 if sys.version_info >= (3, 11):
     import tomllib

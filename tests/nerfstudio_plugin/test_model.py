@@ -12,8 +12,8 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns import asking
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.nerfstudio_plugin.config import rerooted
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.question import Question
 from normlift_ns.raster import reference

@@ -23,9 +23,9 @@ from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerElement
 from plyfile import PlyData
 
 from normlift_ns.asking import answer
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.options import SourceOptions
 from normlift_ns.question import Question
 from normlift_ns.runs.question import load_question

@@ -21,13 +21,13 @@ from normlift_ns.asking import answer
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.encoders.build import SourceOptions
 from normlift_ns.errors import InputError
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.lifting import LiftOptions
 from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.method_configs.scannet import scannet_method
 from normlift_ns.nerfstudio_plugin import pipeline as module
 from normlift_ns.nerfstudio_plugin.config import rerooted
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.question import make_question
 from normlift_ns.runs.question import load_question
 from normlift_ns.text_encoders import encoder_of

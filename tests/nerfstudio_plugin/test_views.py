@@ -11,7 +11,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.models import splatfacto
 from PIL import Image
 
-from normlift_ns.nerfstudio_plugin.load import load_scene
+from normlift_ns.front_door import open_scene as load_scene
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, train_splatfacto, write_dataset
 
 

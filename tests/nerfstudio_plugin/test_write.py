@@ -14,13 +14,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from normlift_ns import open_run
 from normlift_ns.core.disk import atomic
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.nerfstudio_plugin.config import read_config
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.nerfstudio_plugin.write import write_run
 from normlift_ns.question import Question
 from normlift_ns.runs.files import cache_folder, run_directory
 from normlift_ns.runs.question import load_question
+from normlift_ns.runs.write import write_run
 from tests.nerfstudio_plugin.conftest import field_of, lifted_field, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 from tests.processes import killed_at

@@ -16,8 +16,8 @@ from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInt
 from PIL import Image
 
 from normlift_ns import open_run, render
+from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.method_configs.normlift import normlift_method
-from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry

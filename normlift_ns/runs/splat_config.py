@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
-
-from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
 from normlift_ns.runs.files import FIELD_FOLDER
+from normlift_ns.scenes.nerfstudio.classes import (
+    FullImageDatamanagerConfig,
+    NerfstudioDataParserConfig,
+    NormLiftModelConfig,
+    TrainerConfig,
+    VanillaPipelineConfig,
+    ViewerConfig,
+)
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, TRANSFORMS_FILE
 
@@ -33,7 +34,7 @@ def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
     )
     model = NormLiftModelConfig(
         sh_degree=max(1, scene.splat.degree),
-        background_color=scene.background_name,  # type: ignore[arg-type]
+        background_color=scene.background_name,
         rasterize_mode=scene.rasterize_mode,
         semantics=run_dir / FIELD_FOLDER,
     )

@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
-from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.errors import InputError, OutputError
-from normlift_ns.nerfstudio_plugin.appearance import LOADED_STEP, background, shading_degree
-from normlift_ns.nerfstudio_plugin.config import RunLocation, locate, read_config, rerooted, stored_data
-from normlift_ns.nerfstudio_plugin.datasets import check_dataset
-from normlift_ns.nerfstudio_plugin.views import DatasetViews
+from normlift_ns.core.scene import Views
+from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
+from normlift_ns.scenes.nerfstudio.appearance import COLORS, LOADED_STEP, background, shading_degree
+from normlift_ns.scenes.nerfstudio.classes import (
+    BlenderDataParserConfig,
+    FullImageDatamanagerConfig,
+    NerfstudioDataParserConfig,
+    SplatfactoModelConfig,
+    TrainerConfig,
+)
+from normlift_ns.scenes.nerfstudio.config import RunLocation, locate, read_config, rebased
+from normlift_ns.scenes.nerfstudio.datasets import check_dataset
+from normlift_ns.scenes.nerfstudio.parsers import Photographs, parse
+from normlift_ns.scenes.nerfstudio.poses import adjusted
+from normlift_ns.scenes.nerfstudio.views import Reading, TrainedViews
 from normlift_ns.scenes.similarity import read_dataparser_transforms
 
 _TRANSFORM_TOLERANCE = 1e-3
+
+
+class CheckedViews(Views, Protocol):
+    """Photographs whose files can be looked at."""
+
+    def check_files(self) -> tuple[str, ...]:
+        """What a person should know of them."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -42,9 +55,9 @@ class NerfstudioScene:
     checkpoint: Checkpoint
     gaussians: GaussianScene
     """The Gaussians, activated; none cropped away."""
-    train: DatasetViews
+    train: Views
     """Photographs that the run was trained with; where it optimised the camera poses, with the optimised ones."""
-    held_out: DatasetViews
+    held_out: Views
     """Photographs kept for evaluation."""
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
@@ -109,10 +122,19 @@ class NerfstudioScene:
     @property
     def model_config(self) -> SplatfactoModelConfig:
         """The model's part of the config."""
-        return cast(SplatfactoModelConfig, self.config.pipeline.model)
+        return self.config.pipeline.model
 
 
-def load_scene(load_config: Path, *, data: Path | None = None, load_step: int | None = None) -> NerfstudioScene:
+ByNerfstudio = Callable[
+    [TrainerConfig, Path, Float[Tensor, "v 3 4"], Float[Tensor, " 3"]], tuple[CheckedViews, CheckedViews]
+]
+"""Trained and held-out photographs of a config with absolute paths, by the folder of the dataset, the poses of the
+training and the background."""
+
+
+def load_scene(
+    load_config: Path, *, data: Path | None = None, load_step: int | None = None, by_nerfstudio: ByNerfstudio
+) -> NerfstudioScene:
     """Loads a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
 
     Reads nothing but config, checkpoint and the dataset's transforms; photographs are read as they are asked for.
@@ -121,31 +143,44 @@ def load_scene(load_config: Path, *, data: Path | None = None, load_step: int | 
         load_config: config.yml of the run, in output_dir/experiment/method/timestamp.
         data: where the dataset is now, if it was moved.
         load_step: step of the checkpoint; None: the last.
+        by_nerfstudio: makes the views of Aria's cameras (FISHEYE624), which nerfstudio alone undistorts.
     Raises:
         FileNotFoundError: config, checkpoint, dataset or an image is missing.
         ValueError: a config of another method or program, a damaged checkpoint, another dataset than the run's.
     """
     stored = read_config(load_config)
     location = locate(stored, load_config, data)
-    config = rerooted(stored, load_config, data)
+    config = rebased(stored, location)
     checkpoint = read_checkpoint(find_checkpoint(config.relative_model_dir, load_step))
-    model = cast(SplatfactoModelConfig, config.pipeline.model)
+    datamanager, model = config.pipeline.datamanager, config.pipeline.model
     _check_degree(checkpoint, model, load_config)
     gaussians = _scene(checkpoint)
-    datamanager = _datamanager(config)
-    outputs = datamanager.train_dataparser_outputs
-    _check_images([*outputs.image_filenames, *(outputs.mask_filenames or ())], location)
-    remarks = _check_transform(outputs.dataparser_transform, float(outputs.dataparser_scale), location)
-    train, held_out = (
-        DatasetViews(dataset, location.folder, poses, background(model))
-        for dataset, poses in (
-            (datamanager.train_dataset, _training_poses(datamanager.train_dataset.cameras, model, checkpoint)),
-            (datamanager.eval_dataset, datamanager.eval_dataset.cameras.camera_to_worlds),
-        )
-    )
+    check_dataset(datamanager.dataparser)
+    found = parse(datamanager)
+    _check_images([*found.train.files, *(found.train.masks or ())], location)
+    remarks = _check_transform(found.transform, found.scale, location)
+    poses = _training_poses(found.train, model, checkpoint)
+    behind = background(model)
+    if found.train.kind == "FISHEYE624":
+        train, held_out = by_nerfstudio(config, location.folder, poses, behind)
+    else:
+        reading = _reading(datamanager)
+        train = TrainedViews(found.train, location.folder, poses, behind, reading)
+        held_out = TrainedViews(found.held_out, location.folder, found.held_out.poses, behind, reading)
     remarks += train.check_files()
-    transform, scale = outputs.dataparser_transform, float(outputs.dataparser_scale)
-    return NerfstudioScene(stored, location, checkpoint, gaussians, train, held_out, transform, scale, remarks)
+    return NerfstudioScene(
+        stored, location, checkpoint, gaussians, train, held_out, found.transform, found.scale, remarks
+    )
+
+
+def _reading(datamanager: FullImageDatamanagerConfig) -> Reading:
+    parser = datamanager.dataparser
+    behind = instead = None
+    if isinstance(parser, BlenderDataParserConfig) and parser.alpha_color is not None:
+        behind = COLORS[parser.alpha_color.lower()]
+    if isinstance(parser, NerfstudioDataParserConfig):
+        instead = parser.mask_color
+    return Reading(datamanager.camera_res_scale_factor, behind, instead)
 
 
 def _check_degree(checkpoint: Checkpoint, model: SplatfactoModelConfig, load_config: Path) -> None:
@@ -172,28 +207,6 @@ def _scene(checkpoint: Checkpoint) -> GaussianScene:
             "are NaN, infinite or rotations of zeros. Give another checkpoint with --load-step, or train again."
         )
     return scene
-
-
-def _datamanager(config: TrainerConfig) -> FullImageDatamanager[InputDataset]:
-    """nerfstudio's own, in test mode: "inference" would switch the downscaling of the images off."""
-    data = stored_data(config)
-    check_dataset(cast(Any, config.pipeline.datamanager).dataparser)
-    try:
-        return config.pipeline.datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-    except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"{error.filename} is missing from the dataset {data}. Expected the dataset that the run was trained with; "
-            "say where it is with --data."
-        ) from error
-    except OutputError:  # it prints while it reads
-        raise
-    except (Exception, SystemExit) as error:  # whatever nerfstudio makes of a data set that it was not trained with
-        if isinstance(error.__context__, BrokenPipeError):  # nobody reads what it prints
-            raise
-        raise InputError(
-            f"nerfstudio cannot read the dataset {data} ({type(error).__name__}: {error}). Expected the dataset that "
-            "the run was trained with; say where it is with --data."
-        ) from error
 
 
 def _check_images(files: Sequence[Path], location: RunLocation) -> None:
@@ -232,29 +245,21 @@ def _world(transform: Tensor, scale: float) -> Tensor:
     return transform * torch.tensor([1.0, 1.0, 1.0, scale])
 
 
-def _training_poses(cameras: Cameras, model: SplatfactoModelConfig, checkpoint: Checkpoint) -> Float[Tensor, "v 3 4"]:
+def _training_poses(split: Photographs, model: SplatfactoModelConfig, checkpoint: Checkpoint) -> Float[Tensor, "v 3 4"]:
     """Poses that the Gaussians fit: where the run optimised its cameras, splatfacto applies that in training only."""
     if model.camera_optimizer.mode == "off":
-        return cameras.camera_to_worlds
+        return split.poses
     adjustment = checkpoint.model.get("camera_optimizer.pose_adjustment")
     found = 0 if adjustment is None or adjustment.ndim == 0 else len(adjustment)
-    if adjustment is None or found != len(cameras):
+    if adjustment is None or found != len(split):
         raise InputError(
             f"The run optimised its camera poses (mode {model.camera_optimizer.mode}), but {checkpoint.path} has "
-            f"{found} of them for {len(cameras)} training images. Use the checkpoint and the dataset of the run; say "
+            f"{found} of them for {len(split)} training images. Use the checkpoint and the dataset of the run; say "
             "where the dataset is with --data."
         )
     if adjustment.shape[1:] != (6,) or not bool(adjustment.isfinite().all()):
         raise InputError(
             f"{checkpoint.path}: its camera_optimizer.pose_adjustment is {adjustment.dtype} {tuple(adjustment.shape)}, "
-            f"or not finite. Expected finite numbers of shape ({len(cameras)}, 6); copy the checkpoint again."
+            f"or not finite. Expected finite numbers of shape ({len(split)}, 6); copy the checkpoint again."
         )
-    optimizer = model.camera_optimizer.setup(num_cameras=len(adjustment), device="cpu")
-    poses = []
-    with torch.no_grad():
-        optimizer.pose_adjustment.copy_(adjustment)
-        for i in range(len(cameras)):
-            camera = cameras[i : i + 1]
-            camera.metadata = {"cam_idx": i}
-            poses.append(optimizer.apply_to_camera(camera))
-    return torch.cat(poses)
+    return adjusted(split.poses, adjustment, model.camera_optimizer.mode)

@@ -9,22 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
-from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.files import draft_directory, new_file, numbered, publish, write_text
 from normlift_ns.encoders.texts.files import write_text_vectors
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.config import set_data, skip_seed_points
-from normlift_ns.nerfstudio_plugin.load import NerfstudioScene
-from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
-from normlift_ns.nerfstudio_plugin.splat_config import splat_config
 from normlift_ns.question import Question
 from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, digests_beside, refuse_existing_run, sealed, tidy
 from normlift_ns.runs.question import save_question
+from normlift_ns.runs.splat_config import splat_config
 from normlift_ns.scenes.checkpoint import Checkpoint
+from normlift_ns.scenes.nerfstudio.allowed import dump_config
+from normlift_ns.scenes.nerfstudio.classes import NormLiftModelConfig, TrainerConfig
+from normlift_ns.scenes.nerfstudio.config import set_data, skip_seed_points
+from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, checkpoint_of, save_splat
 
@@ -76,7 +75,7 @@ def write_run(
         for place in (run_dir,) if exact else numbered(run_dir):
             of_splat = isinstance(source, SplatScene)
             config = splat_config(source, place) if of_splat else _lifted_config(source, place)
-            write_text(folder / "config.yml", sealed(yaml.dump(config)), overwrite=True)
+            write_text(folder / "config.yml", sealed(dump_config(config)), overwrite=True)
             if publish(folder, place, overwrite=overwrite and exact):
                 return place
     refuse_existing_run(run_dir, overwrite=False)  # another process was faster
@@ -96,8 +95,9 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     if location.moved_data or config.output_dir.is_absolute():
         set_data(config, location.data)  # a relative one would not be found
     skip_seed_points(config)
-    datamanager: Any = config.pipeline.datamanager
-    datamanager.cache_images = "gpu"  # that is, on the pipeline's device; "cpu" pins memory, which needs CUDA
+    config.pipeline.datamanager.cache_images = (
+        "gpu"  # that is, on the pipeline's device; "cpu" pins memory, which needs CUDA
+    )
     return config
 
 

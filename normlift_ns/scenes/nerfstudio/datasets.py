@@ -10,16 +10,18 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.colmap_dataparser import MAX_AUTO_RESOLUTION, ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.checks import DataParser
 from normlift_ns.scenes.colmap import read_model
 from normlift_ns.scenes.image_files import read_head
+from normlift_ns.scenes.nerfstudio.classes import (
+    BlenderDataParserConfig,
+    ColmapDataParserConfig,
+    DataParser,
+    NerfstudioDataParserConfig,
+)
 from normlift_ns.scenes.transforms_file import Entries, read_entries
 
+MAX_AUTO_RESOLUTION = 1600
 _ADVICE = "Restore it, or say where the dataset is with --data."
 _NEEDED = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 

@@ -8,21 +8,19 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.optimizers import OptimizerConfig
-from nerfstudio.engine.schedulers import SchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
-
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.allowed import PAIRS
 from normlift_ns.options import LiftOptions, RefineConfig
+from normlift_ns.scenes.nerfstudio.allowed import PAIRS
+from normlift_ns.scenes.nerfstudio.classes import (
+    NAMES,
+    DataParser,
+    FullImageDatamanagerConfig,
+    OptimizerConfig,
+    SchedulerConfig,
+    SplatfactoModelConfig,
+    TrainerConfig,
+)
 
-DataParser = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
-"""Those whose data sets are read."""
 _PARTS = {
     "pipeline": ("VanillaPipelineConfig", "NormLiftPipelineConfig"),
     "pipeline.datamanager": ("FullImageDatamanagerConfig",),
@@ -56,7 +54,7 @@ def check_config(config: Any, path: Path) -> None:
         check_options(pipeline.lift, f"{path}: pipeline.lift")
 
 
-def check_parts(config: TrainerConfig, path: Path) -> None:
+def check_parts(config: Any, path: Path) -> None:
     """Refuses pipelines, data managers, data parsers and models other than those that are tested here.
 
     Raises:
@@ -67,7 +65,7 @@ def check_parts(config: TrainerConfig, path: Path) -> None:
         for step in name.split("."):
             part = getattr(part, step)
         found = type(part)
-        if found.__name__ not in classes or f"{found.__module__}.{found.__qualname__}" not in PAIRS:
+        if found.__name__ not in classes or NAMES.get(found, f"{found.__module__}.{found.__qualname__}") not in PAIRS:
             raise InputError(
                 f"{path} says method {str(config.method_name)!r}, but its {name} is a {found.__name__}, expected "
                 f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "

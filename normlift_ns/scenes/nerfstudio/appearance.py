@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
-from nerfstudio.utils.colors import get_color
 from torch import Tensor
 
+from normlift_ns.scenes.nerfstudio.classes import SplatfactoModelConfig
+
+COLORS = {
+    "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}  # fmt: skip
+"""nerfstudio's, by their names."""
 LOADED_STEP = 30000
 """The step that splatfacto takes a loaded checkpoint for, whatever its own."""
 _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
@@ -16,7 +21,7 @@ _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 def background(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
     """RGB in 0..1 behind the Gaussians, as splatfacto has it outside training; for "random", that of the viewer."""
     name = config.background_color
-    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else get_color(name)
+    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(COLORS[name])
 
 
 def shading_degree(config: SplatfactoModelConfig, step: int) -> int | None:

@@ -1,0 +1,1 @@
+"""Runs of nerfstudio's splatfacto, read and written without importing nerfstudio."""
