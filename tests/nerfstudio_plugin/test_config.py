@@ -7,10 +7,10 @@ from pathlib import Path, PureWindowsPath
 
 import pytest
 import yaml
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.nerfstudio_plugin.config import read_config
+from normlift_ns.scenes.nerfstudio import classes
 from normlift_ns.scenes.nerfstudio.config import locate
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, working_directory
 
@@ -24,7 +24,7 @@ def test_a_stock_config_is_read_as_nerfstudio_reads_it(stock: StockRun) -> None:
 def test_splatfacto_big_is_read(workspace: Path) -> None:
     big = train_splatfacto(workspace, Path("scene"), method="splatfacto-big", timestamp="big")
     model = load_scene(big.config).model_config
-    assert type(model) is SplatfactoModelConfig
+    assert type(model) is classes.SplatfactoModelConfig
     assert model.cull_alpha_thresh == 0.005
 
 

@@ -64,7 +64,8 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     if name not in PAIRS or not isinstance(node, yaml.MappingNode):
         parser = " is not one of the data parsers that are read" if name.endswith("DataParserConfig") else ""
         raise _refusal(f"{name}{parser or ' is no part of a configuration'}", node)
-    cls, target = READ[name], PAIRS[name]
+    cls: Any = READ[name]
+    target = PAIRS[name]
     config = cls.__new__(cls)
     yield config
     values = loader.construct_mapping(node, deep=True)

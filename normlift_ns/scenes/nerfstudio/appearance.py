@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -24,6 +26,10 @@ def background(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
     return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(COLORS[name])
 
 
-def shading_degree(config: SplatfactoModelConfig, step: int) -> int | None:
-    """Degree of the spherical harmonics in use at a training step; None: colours do not depend on the view."""
+def shading_degree(config: Any, step: int) -> int | None:
+    """Degree of the spherical harmonics in use at a training step; None: colours do not depend on the view.
+
+    Args:
+        config: of splatfacto, nerfstudio's own or its mirror.
+    """
     return min(step // config.sh_degree_interval, config.sh_degree) if config.sh_degree > 0 else None

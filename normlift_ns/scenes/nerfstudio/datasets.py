@@ -41,6 +41,17 @@ def check_dataset(parser: DataParser) -> None:
         _check_blender(parser)
 
 
+def size_of(file: Path, parser: DataParser) -> tuple[int, int]:
+    """Width and height of a photograph.
+
+    Raises:
+        FileNotFoundError, ValueError: none there, or no image.
+    """
+    if not file.exists():
+        raise FileNotFoundError(f"{file} is missing from the dataset {parser.data}. {_ADVICE}")
+    return read_head(file).size
+
+
 def _entries(path: Path, data: Path) -> Entries:
     if not path.exists():
         raise FileNotFoundError(f"{path} is missing from the dataset {data}. {_ADVICE}")
@@ -70,7 +81,7 @@ def _check_blender(parser: BlenderDataParserConfig) -> None:
             )
         files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in found.frames]
         _check_files(files, path)
-        read_head(files[0])  # which nerfstudio reads whole
+        size_of(files[0], parser)  # which nerfstudio reads whole
 
 
 def _check_colmap(parser: ColmapDataParserConfig) -> None:
@@ -87,7 +98,7 @@ def _check_colmap(parser: ColmapDataParserConfig) -> None:
     factor = parser.downscale_factor
     if factor is None:  # nerfstudio's own rule
         factor = 1
-        while max(read_head(files[0]).size) / factor > MAX_AUTO_RESOLUTION:
+        while max(size_of(files[0], parser)) / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
     if factor == 1:
         return

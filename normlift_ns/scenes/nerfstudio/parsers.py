@@ -15,7 +15,6 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.colmap import Camera, Registered, read_model
-from normlift_ns.scenes.image_files import read_head
 from normlift_ns.scenes.nerfstudio.appearance import COLORS
 from normlift_ns.scenes.nerfstudio.classes import (
     BlenderDataParserConfig,
@@ -24,7 +23,7 @@ from normlift_ns.scenes.nerfstudio.classes import (
     FullImageDatamanagerConfig,
     NerfstudioDataParserConfig,
 )
-from normlift_ns.scenes.nerfstudio.datasets import MAX_AUTO_RESOLUTION
+from normlift_ns.scenes.nerfstudio.datasets import MAX_AUTO_RESOLUTION, size_of
 from normlift_ns.scenes.nerfstudio.poses import orient_and_center
 from normlift_ns.scenes.transforms_file import CameraEntry, Entries, read_entries
 
@@ -220,7 +219,7 @@ def _transforms(parser: NerfstudioDataParserConfig) -> Dataset:
     folder, meta = path.parent, read_entries(path)
     factor = parser.downscale_factor
     if factor is None:
-        factor = _largest_fitting(folder, Path(meta.frames[0].file_path))
+        factor = _largest_fitting(folder, Path(meta.frames[0].file_path), parser)
 
     def place(name: str, prefix: str = "images_") -> Path:
         return folder / f"{prefix}{factor}" / Path(name).name if factor > 1 else folder / name
@@ -260,9 +259,9 @@ def _transforms(parser: NerfstudioDataParserConfig) -> Dataset:
     return Dataset(train, held_out, _applied(transform, applied), scale * float(meta.applied_scale))
 
 
-def _largest_fitting(folder: Path, name: Path) -> int:
+def _largest_fitting(folder: Path, name: Path, parser: DataParser) -> int:
     """By which factor nerfstudio takes smaller copies: as long as there are any, and the image is too large."""
-    longest, power = max(read_head(folder / name).size), 0
+    longest, power = max(size_of(folder / name, parser)), 0
     while longest / 2**power > MAX_AUTO_RESOLUTION and (folder / f"images_{2 ** (power + 1)}" / name.name).exists():
         power += 1
     return 2**power
@@ -288,7 +287,7 @@ def _reconstruction(parser: ColmapDataParserConfig) -> Dataset:
     chosen = _listed(_lists(parser), files) or _split(files, parser)
     factor = parser.downscale_factor
     if factor is None:
-        longest, factor = max(read_head(files[0]).size), 1
+        longest, factor = max(size_of(files[0], parser)), 1
         while longest / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
     if factor > 1:
@@ -360,7 +359,7 @@ def _blender(parser: BlenderDataParserConfig) -> Dataset:
 def _blender_split(parser: BlenderDataParserConfig, split: str) -> Photographs:
     meta = read_entries(parser.data / f"transforms_{split}.json")
     files = [parser.data / Path(frame.file_path.replace("./", "") + ".png") for frame in meta.frames]
-    width, height = read_head(files[0]).size
+    width, height = size_of(files[0], parser)
     focal = 0.5 * width / np.tan(0.5 * float(meta.camera_angle_x or 0.0))
     poses = torch.from_numpy(np.array([frame.transform_matrix for frame in meta.frames]).astype(np.float32)[:, :3])
     poses[..., 3] *= parser.scale_factor

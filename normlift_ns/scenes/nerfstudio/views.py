@@ -117,7 +117,8 @@ class TrainedViews:
         try:
             if lens.kind not in ("PERSPECTIVE", "FISHEYE"):
                 raise InputError(
-                    f"it was taken with a {lens.kind} camera; splatfacto draws perspective and fisheye cameras only"
+                    f"{self.files[index]} was taken with a {lens.kind} camera; splatfacto draws perspective and "
+                    "fisheye cameras only."
                 )
             return to_camera(self._poses[index], *_pinhole(lens))
         except InputError as error:
@@ -126,8 +127,8 @@ class TrainedViews:
     def _lens(self, index: int) -> _Lens:
         width, height = self._split.sizes[index].tolist()
         distortion = () if self._split.distortion is None else tuple(self._split.distortion[index].tolist())
-        projection = self._split.projections[index].tolist()
-        return _Lens(self._split.kind, Intrinsics(*projection, width, height), distortion)
+        fx, fy, cx, cy = self._split.projections[index].tolist()
+        return _Lens(self._split.kind, Intrinsics(fx, fy, cx, cy, width, height), distortion)
 
     def check_files(self) -> tuple[str, ...]:
         """Looks at the heads of all photographs and masks; returns what a person should know, in whole sentences.

@@ -1,0 +1,341 @@
+"""Runs are read and written without nerfstudio: what comes out is nerfstudio's, bit by bit."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from copy import deepcopy
+from dataclasses import MISSING, fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.configs.method_configs import method_configs
+from nerfstudio.utils import colors, writer
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from normlift_ns.errors import InputError
+from normlift_ns.front_door import open_scene
+from normlift_ns.nerfstudio_plugin.config import as_nerfstudios
+from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+from normlift_ns.nerfstudio_plugin.views import DatasetViews
+from normlift_ns.runs.files import FIELD_FOLDER
+from normlift_ns.runs.write import _lifted_config
+from normlift_ns.scenes.nerfstudio import classes
+from normlift_ns.scenes.nerfstudio.allowed import dump_config
+from normlift_ns.scenes.nerfstudio.appearance import COLORS
+from normlift_ns.scenes.nerfstudio.config import read_config, set_data, skip_seed_points
+from normlift_ns.scenes.nerfstudio.load import _reading
+from normlift_ns.scenes.nerfstudio.parsers import parse
+from normlift_ns.scenes.nerfstudio.poses import adjusted
+from normlift_ns.scenes.nerfstudio.views import TrainedViews
+from tests.nerfstudio_plugin.stock_run import StockRun
+
+GREY = torch.tensor([0.2, 0.4, 0.7])
+
+
+def original(name: str) -> Any:
+    """nerfstudio's class of that name."""
+    module, _, attribute = name.rpartition(".")
+    return getattr(import_module(module), attribute)
+
+
+@pytest.mark.parametrize("mirror", [cls for cls in classes.NAMES if cls is not classes.EventName])
+def test_mirrors_have_the_fields_and_defaults_of_nerfstudios_classes(mirror: type) -> None:
+    theirs, ours = original(classes.NAMES[mirror]), {item.name: item for item in fields(mirror)}
+    assert set(ours) == {item.name for item in fields(theirs)}
+    hints, known = get_type_hints(mirror), get_type_hints(theirs)
+    for item in fields(theirs):
+        if item.name == "_target":
+            continue
+        mine = ours[item.name]
+        assert (mine.default is MISSING) == (item.default is MISSING), item.name
+        if item.default is not MISSING and not isinstance(mine.default, tuple):
+            assert mine.default == item.default
+        if hints[item.name] in (int, float, bool, str, Path):
+            assert hints[item.name] is known[item.name] or item.name == "vis"
+    if "_target" in ours and mirror not in (classes.SchedulerConfig,):
+        target: Any = ours["_target"].default_factory
+        made = {item.name: item for item in fields(theirs)}["_target"]
+        found: Any = made.default if made.default is not MISSING else made.default_factory()  # type: ignore[misc]
+        assert target().name == f"{found.__module__}.{found.__qualname__}"
+
+
+def test_names_and_colours_are_nerfstudios() -> None:
+    assert {item.name: item.value for item in classes.EventName} == {item.name: item.value for item in writer.EventName}
+    assert {name: list(value) for name, value in COLORS.items()} == {
+        name: value.tolist() for name, value in colors.COLORS_DICT.items()
+    }
+
+
+@pytest.mark.parametrize("method", ["splatfacto", "splatfacto-big"])
+def test_a_config_is_written_as_nerfstudio_writes_it(method: str, tmp_path: Path) -> None:
+    config: Any = deepcopy(method_configs[method])
+    config.data = config.pipeline.datamanager.data = Path("scene")
+    config.experiment_name, config.timestamp = "scene", "now"
+    path = tmp_path / "config.yml"
+    path.write_text(yaml.dump(config))
+    read = read_config(path)
+    assert yaml.load(dump_config(read), Loader=yaml.Loader) == config
+    assert as_nerfstudios(read) == config
+
+
+def test_the_config_of_a_lifted_run_is_the_edited_one(copied: Path, tmp_path: Path) -> None:
+    scene: Any = open_scene(copied)
+    run_dir = copied.parents[2] / "normlift" / "first"
+    config: Any = yaml.load(copied.read_text(), Loader=yaml.Loader)
+    config.method_name, config.timestamp = "normlift", "first"
+    config.output_dir = scene.location.portable(run_dir.parents[2])
+    config.relative_model_dir = Path("nerfstudio_models")
+    config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
+    semantics = scene.location.portable(run_dir / FIELD_FOLDER)
+    config.pipeline.model = NormLiftModelConfig.upgrade(config.pipeline.model, semantics=semantics)
+    if scene.location.moved_data or config.output_dir.is_absolute():
+        set_data(config, scene.location.data)
+    skip_seed_points(config)
+    config.pipeline.datamanager.cache_images = "gpu"
+    assert yaml.load(dump_config(_lifted_config(scene, run_dir)), Loader=yaml.Loader) == config
+
+
+def test_a_config_of_splats_is_nerfstudios() -> None:
+    ours = classes.TrainerConfig(method_name="normlift", pipeline=classes.VanillaPipelineConfig())
+    read: Any = as_nerfstudios(ours)
+    assert type(read).__module__ == "nerfstudio.engine.trainer"
+    assert read.pipeline.model == type(read.pipeline.model)()
+    assert read.pipeline.datamanager == type(read.pipeline.datamanager)()
+    assert read.viewer == type(read.viewer)()
+    assert read.logging == type(read.logging)()
+
+
+def assert_equal(datamanager: classes.FullImageDatamanagerConfig, folder: Path) -> None:
+    """The views and the world of a data set are those of nerfstudio's own data manager."""
+    config = classes.TrainerConfig(pipeline=classes.VanillaPipelineConfig(datamanager=datamanager))
+    manager: Any = as_nerfstudios(config).pipeline.datamanager.setup(device="cpu", test_mode="test")
+    found = parse(datamanager)
+    outputs = manager.train_dataparser_outputs
+    assert torch.equal(found.transform, outputs.dataparser_transform)
+    assert found.scale == outputs.dataparser_scale
+    for split, dataset in ((found.train, manager.train_dataset), (found.held_out, manager.eval_dataset)):
+        assert split.files == dataset.image_filenames
+        assert split.masks == dataset._dataparser_outputs.mask_filenames
+        assert torch.equal(split.poses, dataset.cameras.camera_to_worlds)
+        if len(split) > 0:
+            assert split.kind == CameraType(int(dataset.cameras.camera_type[0])).name
+        ours = TrainedViews(split, folder, split.poses, GREY, _reading(datamanager))
+        theirs = DatasetViews(dataset, folder, dataset.cameras.camera_to_worlds, GREY)
+        assert ours.names == theirs.names
+        assert ours.check_files() == theirs.check_files()
+        try:
+            expected = list(theirs)
+        except InputError as error:  # nerfstudio's "pca" mirrors some poses, which nothing could draw
+            with pytest.raises(InputError, match="no mirror"):
+                list(ours)
+            assert "no mirror" in str(error)
+            continue
+        for a, b in zip(ours, expected, strict=True):
+            assert torch.equal(a.image, b.image)
+            assert a.image.dtype == b.image.dtype
+            assert (a.mask is None) == (b.mask is None)
+            assert a.mask is None or (torch.equal(a.mask, b.mask) and a.mask.dtype == b.mask.dtype)
+            assert torch.equal(a.camera.K, b.camera.K)
+            assert torch.equal(a.camera.world_to_camera, b.camera.world_to_camera)
+            assert (a.camera.width, a.camera.height, a.original) == (b.camera.width, b.camera.height, b.original)
+
+
+def poses(rng: np.random.Generator, count: int) -> list[list[list[float]]]:
+    """Camera-to-world matrices, roughly upright, as captures have them."""
+    found = []
+    for _ in range(count):
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_euler("zyx", rng.normal([0, 0, 1.4], [1.5, 0.4, 0.4])).as_matrix()
+        matrix[:3, 3] = rng.normal(0, 3, 3)
+        found.append(matrix.tolist())
+    return found
+
+
+def write_images(rng: np.random.Generator, files: list[Path], size: tuple[int, int], mode: str) -> None:
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shape = (size[1], size[0]) if mode == "L" else (size[1], size[0], len(mode))
+        Image.fromarray(rng.integers(0, 256, shape, dtype=np.uint8), mode).save(file)
+
+
+WORLD = {
+    "orientation_method": st.sampled_from(["pca", "up", "vertical", "none"]),
+    "center_method": st.sampled_from(["poses", "focus", "none"]),
+    "auto_scale_poses": st.booleans(),
+    "scale_factor": st.sampled_from([1.0, 0.3, 7.0]),
+    "eval_mode": st.sampled_from(["fraction", "interval", "filename", "all"]),
+    "train_split_fraction": st.sampled_from([0.5, 0.9, 1.0]),
+    "eval_interval": st.sampled_from([2, 3, 8]),
+    "downscale_factor": st.sampled_from([None, 1, 2]),
+}
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    parser=st.fixed_dictionaries(WORLD),
+    seed=st.integers(0, 2**32 - 1),
+    model=st.sampled_from([None, "OPENCV", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"]),
+    per_frame=st.booleans(),
+    distorted=st.booleans(),
+    masks=st.booleans(),
+    mode=st.sampled_from(["RGB", "RGBA", "L"]),
+    shrink=st.sampled_from([1.0, 0.5]),
+    extra=st.sampled_from([
+        {}, {"applied_transform": [[0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 2]], "applied_scale": 0.7},
+        {"orientation_override": "none"},
+    ]),
+    lists=st.booleans(),
+)  # fmt: skip
+def test_data_sets_with_transforms(
+    parser: dict[str, Any], seed: int, model: str | None, per_frame: bool, distorted: bool, masks: bool, mode: str,
+    shrink: float, extra: dict[str, Any], lists: bool,
+) -> None:  # fmt: skip
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        factor = parser["downscale_factor"] or 1
+        names = [f"{'eval' if i % 3 == 0 else 'train'}_{9 - i}.png" for i in range(7)]
+        sub = "images" if factor == 1 else f"images_{factor}"
+        size = (40 // factor, 32 // factor)
+        write_images(rng, [folder / sub / n for n in names], size, mode)
+        write_images(rng, [folder / "images" / names[0]], (40, 32), mode)
+        frames: list[dict[str, Any]] = []
+        for n, pose in zip(names, poses(rng, len(names))):
+            numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), (rng.normal([35, 36, 20, 16], 0.7)).tolist()))
+            numbers |= {"w": 40, "h": 32}
+            if distorted:
+                numbers |= dict(zip(("k1", "k2", "k3"), rng.normal(0, 0.02, 3).tolist()))
+                tail = ("p1", "p2") if model != "OPENCV_FISHEYE" else ("k4",)
+                numbers |= dict(zip(tail, rng.normal(0, 0.005, 2).tolist()))
+            frames.append({"file_path": f"images/{n}", "transform_matrix": pose, **numbers})
+            if masks:
+                frames[-1]["mask_path"] = f"masks/{n}"
+        if masks:
+            place = "masks" if factor == 1 else f"masks_{factor}"
+            write_images(rng, [folder / place / n for n in names], size, "L")
+        meta: dict[str, Any] = {"frames": frames, **extra}
+        if model is not None:
+            meta["camera_model"] = model
+        if not per_frame:
+            common = {key: value for key, value in frames[0].items() if key in (
+                "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2",
+            )}  # fmt: skip
+            meta |= common
+        if lists:
+            meta |= {"train_filenames": [f["file_path"] for f in frames[2:]]}
+            meta |= {"test_filenames": [f["file_path"] for f in frames[:2]], "val_filenames": []}
+        (folder / "transforms.json").write_text(json.dumps(meta))
+        if parser["eval_mode"] == "fraction" and parser["train_split_fraction"] == 1.0 and not lists:
+            parser = {**parser, "train_split_fraction": 0.8}  # nerfstudio makes no cameras of nothing
+        config = classes.NerfstudioDataParserConfig(data=folder, **parser)
+        assert_equal(
+            classes.FullImageDatamanagerConfig(data=folder, dataparser=config, camera_res_scale_factor=shrink), folder
+        )
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    parser=st.fixed_dictionaries(WORLD),
+    seed=st.integers(0, 2**32 - 1),
+    model=st.sampled_from(["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]),
+    flip=st.booleans(),
+    masks=st.booleans(),
+    rounding=st.sampled_from(["floor", "round", "ceil"]),
+    lists=st.booleans(),
+)
+def test_data_sets_of_colmap(
+    parser: dict[str, Any], seed: int, model: str, flip: bool, masks: bool, rounding: str, lists: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    tail = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 3}.get(model, 0)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        factor = parser["downscale_factor"] or 1
+        size = {"floor": (20, 15), "round": (20, 16), "ceil": (21, 16)}[rounding] if factor == 2 else (41, 31)
+        names = [f"a/{'eval' if i % 3 == 0 else 'train'}_{i}.png" for i in range(7)]
+        suffix = "" if factor == 1 else f"_{factor}"
+        write_images(rng, [folder / f"images{suffix}" / n for n in names], size, "RGB")
+        write_images(rng, [folder / "images" / names[-1]], (41, 31), "RGB")
+        if masks:
+            write_images(rng, [folder / f"masks{suffix}" / n for n in names], size, "L")
+        model_folder = folder / "colmap/sparse/0"
+        model_folder.mkdir(parents=True)
+        cameras, images = [], []
+        for i, n in enumerate(names):
+            numbers = [*rng.normal([36, 35], 0.5)[: 1 if model.startswith("SIMPLE") or model == "RADIAL" else 2], 20.4]
+            numbers += [15.3, *rng.normal(0, 0.004, tail), *([0.0] if model == "OPENCV_FISHEYE" else [])]
+            cameras.append(f"{i + 1} {model} 41 31 {' '.join(repr(float(x)) for x in numbers)}")
+            pose = [*np.roll(Rotation.random(random_state=seed % 1000 + i).as_quat(), 1), *rng.normal(0, 2, 3)]
+            images.append(f"{9 - i} {' '.join(repr(float(x)) for x in pose)} {i + 1} {n}\n")
+        (model_folder / "cameras.txt").write_text("\n".join(cameras) + "\n")
+        (model_folder / "images.txt").write_text("\n".join(images) + "\n")
+        if lists:
+            (folder / "train_list.txt").write_text("\n".join(names[2:]) + "\n")
+            (folder / "test_list.txt").write_text("\n".join(names[:2]) + "\n")
+        if parser["eval_mode"] == "fraction" and parser["train_split_fraction"] == 1.0 and not lists:
+            parser = {**parser, "train_split_fraction": 0.8}
+        config = classes.ColmapDataParserConfig(
+            data=folder, **parser, load_3D_points=False, assume_colmap_world_coordinate_convention=flip,
+            masks_path=Path("masks") if masks else None, downscale_rounding_mode=rounding,  # type: ignore[arg-type]
+        )  # fmt: skip
+        assert_equal(classes.FullImageDatamanagerConfig(data=folder, dataparser=config), folder)
+
+
+@pytest.mark.parametrize("color", ["white", "Blue", None])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+@pytest.mark.parametrize("shrink", [1.0, 0.5])
+def test_data_sets_of_blender(color: str | None, mode: str, shrink: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    for split in ("train", "test"):
+        write_images(rng, [tmp_path / split / f"r_{i}.png" for i in range(3)], (37, 26), mode)
+        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": pose} for i, pose in enumerate(poses(rng, 3))]
+        meta = {"camera_angle_x": 0.691, "frames": frames}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(meta))
+    config = classes.BlenderDataParserConfig(data=tmp_path, alpha_color=color, scale_factor=0.6)
+    assert_equal(
+        classes.FullImageDatamanagerConfig(data=tmp_path, dataparser=config, camera_res_scale_factor=shrink), tmp_path
+    )
+
+
+@pytest.mark.parametrize("mode", ["SO3xR3", "SE3"])
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
+def test_optimized_poses_are_nerfstudios(mode: Any, size: float) -> None:
+    rng = np.random.default_rng(0)
+    given_poses = torch.tensor(poses(rng, 9))[:, :3].float()
+    moves = torch.from_numpy(rng.normal(0, size, (9, 6))).float()
+    optimizer = CameraOptimizerConfig(mode=mode).setup(num_cameras=9, device="cpu")
+    with torch.no_grad():
+        optimizer.pose_adjustment.copy_(moves)
+        for i, found in enumerate(adjusted(given_poses, moves, mode)):
+            change = optimizer(torch.tensor([i]))
+            rotated = torch.bmm(change[..., :3, :3], given_poses[i : i + 1, :3, :3])
+            expected = torch.cat([rotated, given_poses[i : i + 1, :3, 3:] + change[..., :3, 3:]], dim=-1)
+            assert torch.equal(found, expected[0])
+
+
+@pytest.mark.slow
+def test_captures(capture: Path) -> None:
+    scene: Any = open_scene(capture)
+    datamanager = deepcopy(scene.config.pipeline.datamanager)
+    datamanager.data = datamanager.dataparser.data = scene.location.data
+    datamanager.dataparser.load_3D_points = False
+    assert_equal(datamanager, scene.location.folder)
+
+
+def test_a_stock_run_has_nerfstudios_views(stock: StockRun) -> None:
+    scene: Any = open_scene(stock.config)
+    datamanager = deepcopy(scene.config.pipeline.datamanager)
+    datamanager.data = datamanager.dataparser.data = scene.location.data
+    datamanager.dataparser.load_3D_points = False
+    assert_equal(datamanager, scene.location.folder)
