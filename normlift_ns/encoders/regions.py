@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Int32, UInt8
-from skimage.segmentation import slic
 from torch import Tensor
 
 from normlift_ns.encoders.images import grey_depth, read_pixels, read_size
@@ -53,6 +52,8 @@ class Superpixels:
         return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
+        from skimage.segmentation import slic  # noqa: PLC0415 (0.5 s that other regions need not wait)
+
         found = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
         return _compact(found, np.ones(found.shape, dtype=bool))[None, None]
 

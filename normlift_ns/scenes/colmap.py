@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Intrinsics
@@ -131,6 +130,8 @@ def intrinsics_of(camera: Camera, model: Path) -> Intrinsics:
 
 def pose_of(image: Registered) -> Float[np.ndarray, "3 4"]:
     """Camera to world in OpenGL convention."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (runs of nerfstudio do without)
+
     matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
     return np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(image.translation)[:, None]], axis=1)
 

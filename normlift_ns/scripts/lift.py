@@ -68,8 +68,16 @@ class NormLift:
         """Lifts, and returns the new run."""
         start = time.perf_counter()
         self._check()
+        say(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.front_door import lift_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.lifting import Export  # noqa: PLC0415
+
+        imported = time.perf_counter()
+        opened: list[float] = []
+
+        def tell(text: str) -> None:
+            opened.append(time.perf_counter())
+            say(text)
 
         with progress_bars() as report:
             run = lift_run(
@@ -86,9 +94,10 @@ class NormLift:
                 device=self.device,
                 export=None if self.export_langsplat is None else Export(self.export_langsplat, self.overwrite),
                 report=report,
-                say=say,
+                say=tell,
             )
-        CONSOLE.print(summary(run, time.perf_counter() - start, self.queries))
+        before = {"start": imported - start, "open": (opened or [imported])[0] - imported}
+        CONSOLE.print(summary(run, before, time.perf_counter() - start, self.queries))
         return run
 
     def _check(self) -> None:
@@ -156,7 +165,7 @@ def progress_bars() -> Iterator[Report]:
         yield report
 
 
-def summary(run: LiftedRun, total: float, queries: tuple[str, ...]) -> Panel:
+def summary(run: LiftedRun, before: dict[str, float], total: float, queries: tuple[str, ...]) -> Panel:
     """The panel at the end: what was found, what it took, where it lies and what to type next."""
     facts: dict[str, Any] = dict(run.field.manifest)
     numbers = facts["statistics"]
@@ -174,7 +183,9 @@ def summary(run: LiftedRun, total: float, queries: tuple[str, ...]) -> Panel:
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"
         table.add_row("refined", f"{numbers['refined_share']:.1%} of Gaussians; {lost}")
-    table.add_row("seconds", "  ".join(f"{name} {t:.1f}" for name, t in run.seconds.items()) + f"  total {total:.1f}")
+    seconds = {**before, **run.seconds}
+    seconds |= {"check, write": total - sum(seconds.values()), "total": total}
+    table.add_row("seconds", "  ".join(f"{name} {t:.1f}" for name, t in seconds.items()))
     cost = facts["cost"]
     gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""
     if "memory_gib" in cost:

@@ -49,7 +49,7 @@ def summary(text: str) -> Any:
         "cost": {},
     }
     run = SimpleNamespace(field=SimpleNamespace(manifest=manifest), seconds={}, folder=Path(text), config=Path(text))
-    return lift.summary(run, 1.0, (text,))  # type: ignore[arg-type]
+    return lift.summary(run, {}, 1.0, (text,))  # type: ignore[arg-type]
 
 
 TABLES: dict[str, Callable[[str], Any]] = {
