@@ -108,7 +108,7 @@ def test_missing_small_photographs_are_refused_without_a_question(
         )
     )
     if factor is None:
-        monkeypatch.setattr("normlift_ns.nerfstudio_plugin.datasets.MAX_AUTO_RESOLUTION", 24)
+        monkeypatch.setattr("normlift_ns.scenes.nerfstudio.datasets.MAX_AUTO_RESOLUTION", 24)
         monkeypatch.setattr("nerfstudio.data.dataparsers.colmap_dataparser.MAX_AUTO_RESOLUTION", 24)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("builtins.input", lambda *args: pytest.fail("nerfstudio asked"))

@@ -15,7 +15,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from normlift_ns import open_run
 from normlift_ns.core.disk import atomic
 from normlift_ns.front_door import open_scene as load_scene
-from normlift_ns.nerfstudio_plugin.config import read_config
+from normlift_ns.nerfstudio_plugin.config import as_nerfstudios, read_config
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.question import Question
 from normlift_ns.runs.files import cache_folder, run_directory
@@ -50,7 +50,7 @@ def test_the_config_is_the_sources_with_another_method_and_model(copied: Path) -
     source = load_scene(copied)
     run_dir = write(source, lifted_field(source), question=Question(("a",), torch.eye(8)[:1]))
     config: Any = read_config(run_dir / "config.yml")
-    stored: Any = source.config
+    stored: Any = as_nerfstudios(source.config)
     assert config.method_name == "normlift"
     assert type(config.pipeline.model) is NormLiftModelConfig
     question = load_question(run_dir / "normlift")

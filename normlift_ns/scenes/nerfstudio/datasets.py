@@ -52,6 +52,14 @@ def size_of(file: Path, parser: DataParser) -> tuple[int, int]:
     return read_head(file).size
 
 
+def automatic_factor(file: Path, parser: ColmapDataParserConfig) -> int:
+    """By which factor nerfstudio takes smaller photographs, where the config does not say it."""
+    longest, factor = max(size_of(file, parser)), 1
+    while longest / factor > MAX_AUTO_RESOLUTION:
+        factor *= 2
+    return factor
+
+
 def _entries(path: Path, data: Path) -> Entries:
     if not path.exists():
         raise FileNotFoundError(f"{path} is missing from the dataset {data}. {_ADVICE}")
@@ -96,10 +104,8 @@ def _check_colmap(parser: ColmapDataParserConfig) -> None:
     files = [images / image.name for image in registered]
     _check_files(files, model)
     factor = parser.downscale_factor
-    if factor is None:  # nerfstudio's own rule
-        factor = 1
-        while max(size_of(files[0], parser)) / factor > MAX_AUTO_RESOLUTION:
-            factor *= 2
+    if factor is None:
+        factor = automatic_factor(files[0], parser)
     if factor == 1:
         return
     smaller = images.parent / f"{images.name}_{factor}"

@@ -23,7 +23,7 @@ from normlift_ns.scenes.nerfstudio.classes import (
     FullImageDatamanagerConfig,
     NerfstudioDataParserConfig,
 )
-from normlift_ns.scenes.nerfstudio.datasets import MAX_AUTO_RESOLUTION, size_of
+from normlift_ns.scenes.nerfstudio.datasets import MAX_AUTO_RESOLUTION, automatic_factor, size_of
 from normlift_ns.scenes.nerfstudio.poses import orient_and_center
 from normlift_ns.scenes.transforms_file import CameraEntry, Entries, read_entries
 
@@ -287,9 +287,7 @@ def _reconstruction(parser: ColmapDataParserConfig) -> Dataset:
     chosen = _listed(_lists(parser), files) or _split(files, parser)
     factor = parser.downscale_factor
     if factor is None:
-        longest, factor = max(size_of(files[0], parser)), 1
-        while longest / factor > MAX_AUTO_RESOLUTION:
-            factor *= 2
+        factor = automatic_factor(files[0], parser)
     if factor > 1:
         files = _smaller(files, named, factor)
         masks = None if masks is None else _smaller(masks, parser.data / (parser.masks_path or ""), factor)
