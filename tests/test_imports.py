@@ -148,7 +148,9 @@ def test_importing_the_package_costs_nothing():
     assert (
         loaded("import normlift_ns; normlift_ns.lift, normlift_ns.render", heavy - {"torch", "numpy", "scipy"}) == "[]"
     )
-    assert loaded("import normlift_ns.front_door", {"nerfstudio", "open_clip", "gsplat"}) == "[]"
+    others = {"nerfstudio", "open_clip", "gsplat", "torchvision", "sympy", "torch._dynamo", "scipy.stats", "viser"}
+    lifting = "import normlift_ns.front_door, normlift_ns.encoders.build as b; from normlift_ns import SourceOptions"
+    assert loaded(f"{lifting}; b.make_source(SourceOptions(encoder='colour')).text(['red'])", others) == "[]"
 
 
 def test_public_names_exist_and_have_docstrings_with_examples():
