@@ -118,7 +118,7 @@ def test_scalars_by_gsplat_are_those_of_the_cpu(
     model, view = pipeline.model, load_scene(stock.config).train.cameras[0]
     rows = model.means[:, 2] > model.means[:, 2].median() if cropped else None
     values = torch.rand(model.num_points, 2)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend("torch", reference).composite)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend(reference).composite)
     monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     _, expected = model._render_on_cpu(view, values, rows)
     torch.testing.assert_close(model._scalars_by_gsplat(view, values, rows), expected, atol=1e-6, rtol=1e-4)
@@ -162,7 +162,7 @@ def test_without_a_question_only_the_relevancies_are_missing(pipeline) -> None:
 
 def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the model take the way of CUDA: stock splatfacto, and gsplat for the scalars."""
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend("torch", reference).composite)
+    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend(reference).composite)
     monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     monkeypatch.setattr(type(pipeline.model), "on_cpu", False)
 
@@ -210,7 +210,7 @@ def test_an_overlay_costs_one_pass_of_scalars(pipeline, monkeypatch, on_cpu: boo
 
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)
-    ours = counted("scalars", TileBackend("torch", reference).composite, lambda args: args[2].shape[1])
+    ours = counted("scalars", TileBackend(reference).composite, lambda args: args[2].shape[1])
     monkeypatch.setattr("normlift_ns.raster.gsplat.composite", ours)
     monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     if on_cpu:
