@@ -70,7 +70,8 @@ def load_splat(splats, m, there):
 def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
     """(A_ij, transmittance behind) of one splat in all pixels; a finished pixel has transmittance 0."""
     dx, dy = u - px, v - py
-    sigma = (a * dx * dx + c * dy * dy) + b * dx * dy
+    # As nvcc fuses it in rasterize_to_pixels_fwd.cu.
+    sigma = tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
     alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
     felt = (sigma >= 0) & (alpha >= min_alpha)
     after = T * (1.0 - alpha)
