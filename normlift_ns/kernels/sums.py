@@ -114,11 +114,18 @@ def _row_norms(
         view_weight, squared, by_view = all_weight, all_weight, all_weight
         views, first = 0, start
         view = -1
+        # The row of the next entry is on its way while the present one is added.
+        s = tl.load(column + start)
+        next_view, next_w = tl.load(column_view + s), tl.load(weight + start)
+        next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop + 1):
-            inside = e < stop
-            s = tl.load(column + e, mask=inside, other=0)
-            next_view = tl.load(column_view + s, mask=inside, other=-2)
-            if (next_view != view) & (view != -1):  # the entries of a view end here
+            here, w, row = next_view, next_w, next_row
+            more = e + 1 < stop
+            s = tl.load(column + e + 1, mask=more, other=0)
+            next_view = tl.load(column_view + s, mask=more, other=-2)
+            next_w = tl.load(weight + e + 1, mask=more, other=0.0)
+            next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=more & (d < dimension), other=0.0)
+            if (here != view) & (view != -1):  # the entries of a view end here
                 norm = view_weight  # of a single unit row
                 if e - first > 1:
                     norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
@@ -133,11 +140,9 @@ def _row_norms(
                 of_view = zero
                 view_weight = tl.zeros([], tl.float64)
                 first = e
-            if inside:
-                w = tl.load(weight + e)
-                of_view += w * tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
-                view_weight += w.to(tl.float64)
-            view = next_view
+            of_view += w * row  # behind the last entry 0
+            view_weight += w.to(tl.float64)
+            view = here
         norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
         if (norm < cancelled * all_weight) | (stop - start > many):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
@@ -183,10 +188,15 @@ def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, canc
     total = tl.zeros([BLOCK], tl.float32)
     all_weight = tl.zeros([], tl.float32)
     if tl.load(known + j) > 0:
+        next_w = tl.load(weight + start, mask=start < stop, other=0.0)
+        s = tl.load(column + start, mask=start < stop, other=0).to(tl.int64)
+        next_row = tl.load(table + s * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop):
-            w = tl.load(weight + e)
-            row = tl.load(column + e).to(tl.int64) * dimension + d
-            total += w * tl.load(table + row, mask=d < dimension, other=0.0)
+            w, row, more = next_w, next_row, e + 1 < stop
+            next_w = tl.load(weight + e + 1, mask=more, other=0.0)
+            s = tl.load(column + e + 1, mask=more, other=0).to(tl.int64)
+            next_row = tl.load(table + s * dimension + d, mask=more & (d < dimension), other=0.0)
+            total += w * row
             all_weight += w
         norm = tl.sqrt(tl.sum(total * total, axis=0))
         if (norm < cancelled * all_weight) | (stop - start > many):

@@ -48,6 +48,9 @@ class Projections(NamedTuple):
     """Indices into c * n, by camera, tile and depth."""
     offsets: Int32[Tensor, "c tiles_y tiles_x"]
     """Where each tile starts in `members`."""
+    depths: Float32[Tensor, "c n"]
+    radii: Int32[Tensor, "c n *axes"]
+    """Half sides of squares, or of rectangles; 0: not drawn."""
 
 
 def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
@@ -76,7 +79,8 @@ def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
     _project_enormous(job, cameras, radii, means2d, depths, conics, opacities)
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
     _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down)
-    return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
+    offsets = isect_offset_encode(keys, len(cameras), across, down)
+    return Projections(means2d, conics, opacities, members, offsets, depths, radii)
 
 
 def _squares(conics: Float32[Tensor, "c n 3"], settings: RasterSettings) -> Int32[Tensor, "c n 2"]:
@@ -172,6 +176,11 @@ def rules_named(wanted: str, recorded: str | None) -> str:
     if wanted != "installed":
         return wanted
     return ".".join(installed_version().split(".")[:2])
+
+
+def in_flight(job: Job, camera: Camera) -> int:
+    """One: its lists of a view take 60 bytes per Gaussian."""
+    return 1
 
 
 def views_evidence(job: Job, batch: Batch) -> Entries:
