@@ -120,11 +120,11 @@ def _row_norms(
         next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop + 1):
             here, w, row = next_view, next_w, next_row
-            more = e + 1 < stop
-            s = tl.load(column + e + 1, mask=more, other=0)
-            next_view = tl.load(column_view + s, mask=more, other=-2)
-            next_w = tl.load(weight + e + 1, mask=more, other=0.0)
-            next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=more & (d < dimension), other=0.0)
+            following = tl.minimum(e + 1, stop - 1)
+            s = tl.load(column + following)
+            next_view = tl.where(e + 1 < stop, tl.load(column_view + s), -2)
+            next_w = tl.where(e + 1 < stop, tl.load(weight + following), 0.0)
+            next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
             if (here != view) & (view != -1):  # the entries of a view end here
                 norm = view_weight  # of a single unit row
                 if e - first > 1:
@@ -192,10 +192,9 @@ def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, canc
         s = tl.load(column + start, mask=start < stop, other=0).to(tl.int64)
         next_row = tl.load(table + s * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop):
-            w, row, more = next_w, next_row, e + 1 < stop
-            next_w = tl.load(weight + e + 1, mask=more, other=0.0)
-            s = tl.load(column + e + 1, mask=more, other=0).to(tl.int64)
-            next_row = tl.load(table + s * dimension + d, mask=more & (d < dimension), other=0.0)
+            w, row, following = next_w, next_row, tl.minimum(e + 1, stop - 1)
+            next_w, s = tl.load(weight + following), tl.load(column + following).to(tl.int64)
+            next_row = tl.load(table + s * dimension + d, mask=d < dimension, other=0.0)
             total += w * row
             all_weight += w
         norm = tl.sqrt(tl.sum(total * total, axis=0))

@@ -195,7 +195,8 @@ def _flights(
     views: Iterator[tuple[Camera, Tensor, int | None]], most: Callable[[Camera], int]
 ) -> Iterator[list[tuple[Camera, Tensor, int | None]]]:
     """Consecutive views of one size, at most so many at once."""
-    for _, same_size in groupby(views, key=lambda view: (view[0].width, view[0].height)):
+    for _, group in groupby(views, key=lambda view: (view[0].width, view[0].height)):
+        same_size = iter(group)
         for first in same_size:
             yield [first, *islice(same_size, most(first[0]) - 1)]
 
