@@ -114,14 +114,15 @@ def _row_norms(
         view_weight, squared, by_view = all_weight, all_weight, all_weight
         views, first = 0, start
         view = -1
-        # The row of the next entry is on its way while the present one is added.
+        # The row of the next entry is on its way while the present one is added, and so is the column of the next but one.
         s = tl.load(column + start)
+        later = tl.load(column + start + 1)
         next_view, next_w = tl.load(column_view + s), tl.load(weight + start)
         next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop + 1):
             here, w, row = next_view, next_w, next_row
-            following = tl.minimum(e + 1, stop - 1)
-            s = tl.load(column + following)
+            s, following = later, tl.minimum(e + 1, stop - 1)
+            later = tl.load(column + tl.minimum(e + 2, stop - 1))
             next_view = tl.where(e + 1 < stop, tl.load(column_view + s), -2)
             next_w = tl.where(e + 1 < stop, tl.load(weight + following), 0.0)
             next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
@@ -188,14 +189,10 @@ def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, canc
     total = tl.zeros([BLOCK], tl.float32)
     all_weight = tl.zeros([], tl.float32)
     if tl.load(known + j) > 0:
-        next_w = tl.load(weight + start, mask=start < stop, other=0.0)
-        s = tl.load(column + start, mask=start < stop, other=0).to(tl.int64)
-        next_row = tl.load(table + s * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop):
-            w, row, following = next_w, next_row, tl.minimum(e + 1, stop - 1)
-            next_w, s = tl.load(weight + following), tl.load(column + following).to(tl.int64)
-            next_row = tl.load(table + s * dimension + d, mask=d < dimension, other=0.0)
-            total += w * row
+            w = tl.load(weight + e)
+            row = tl.load(column + e).to(tl.int64) * dimension + d
+            total += w * tl.load(table + row, mask=d < dimension, other=0.0)
             all_weight += w
         norm = tl.sqrt(tl.sum(total * total, axis=0))
         if (norm < cancelled * all_weight) | (stop - start > many):
