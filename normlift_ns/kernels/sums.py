@@ -114,7 +114,7 @@ def _row_norms(
         view_weight, squared, by_view = all_weight, all_weight, all_weight
         views, first = 0, start
         view = -1
-        # The row of the next entry is on its way while the present one is added, and so is the column of the next but one.
+        # On their way while an entry is added: the row of the next one, and the column of the next but one.
         s = tl.load(column + start)
         later = tl.load(column + start + 1)
         next_view, next_w = tl.load(column_view + s), tl.load(weight + start)

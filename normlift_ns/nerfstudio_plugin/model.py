@@ -121,7 +121,7 @@ class NormLiftModel(SplatfactoModel):
             # where all is cropped away, splatfacto's outputs are on the CPU and its background is [3]
             outputs = {name: value.to(self.device) for name, value in outputs.items()}
             outputs["background"] = outputs["background"].expand(view.height, view.width, 3)
-            scalars = self._scalars_by_gsplat(view, values, rows)
+            scalars = self._composited(view, values, rows)
         self.set_crop(obb_box)
         if display is None:
             return outputs
@@ -171,10 +171,10 @@ class NormLiftModel(SplatfactoModel):
         }
         return outputs, image[:, :, 4:]
 
-    def _scalars_by_gsplat(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
+    def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
         """sum_j A_ij value_j [H, W, C], rasterized as splatfacto rasterizes the colours."""
         drawn, mode = values if rows is None else values[rows], self.config.rasterize_mode
-        return render(self._scene(rows), view, drawn, backend="gsplat", rasterize_mode=mode)[0]
+        return render(self._scene(rows), view, drawn, rasterize_mode=mode)[0]
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

@@ -7,7 +7,7 @@ repeatable (gsplat adds with atomics), but gsplat's own code throughout.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
@@ -226,14 +226,10 @@ def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator
     The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py).
     """
     seen, settings = project_views(job, [camera]), job.settings
-    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
-
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
     drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
     lists = (settings.tile_size, seen.offsets, seen.members)
-    later = hasattr(_C, "rasterize_to_pixels_3dgs_fwd")
-    forward = _C.rasterize_to_pixels_3dgs_fwd if later else _C.rasterize_to_pixels_fwd
-    backward = _C.rasterize_to_pixels_3dgs_bwd if later else _C.rasterize_to_pixels_bwd
+    forward, backward = compiled_rasterizer()
     _, alphas, last = forward(*drawing, *lists)
     column = labels.long() + 1
     for first in range(0, count + 1, _CHANNELS):
@@ -241,3 +237,11 @@ def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator
         one_hot = (column[None, :, :, None] == channels).float()
         gradients = backward(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
         yield first, gradients[3][0]
+
+
+def compiled_rasterizer() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """gsplat's compiled forward and backward pass over pixels, whatever its version calls them."""
+    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
+
+    name = "rasterize_to_pixels_3dgs" if hasattr(_C, "rasterize_to_pixels_3dgs_fwd") else "rasterize_to_pixels"
+    return getattr(_C, f"{name}_fwd"), getattr(_C, f"{name}_bwd")
