@@ -2,7 +2,7 @@
 
     python -m benchmarks.gpu            fox, tabletop, rooms of 0.48, 1.93 and 10 million Gaussians, growth
     python -m benchmarks.gpu --quick    fox and tabletop only
-    python -m benchmarks.gpu --rooms    evidence, lift and RGB of rooms of 1.93 and 10 million Gaussians, with all stages
+    python -m benchmarks.gpu --rooms    evidence, lift and RGB of rooms of 1.93 and 10 million Gaussians, by stages
 
 Every time is the median of three runs after a first one, the GPU waited for on both sides. What is compared with stock
 gsplat's RGB render is measured in turns with it, in seven rounds.
@@ -122,9 +122,7 @@ def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
             _, alphas, last = forward(*drawing, offsets, members)
             gradient = torch.rand(1, height, width, CHANNELS, device="cuda")
             for first in range(0, DIMENSION, CHANNELS):
-                found = gradients(
-                    *drawing, offsets, members, alphas, last, gradient, torch.zeros_like(alphas), False
-                )
+                found = gradients(*drawing, offsets, members, alphas, last, gradient, torch.zeros_like(alphas), False)
                 total[:, first : first + CHANNELS] += found[3][0]
 
     return rgb, backward
@@ -171,10 +169,14 @@ def compare_with_rgb(report: Report, case: Case, rounds: int = 7) -> None:
         add("evidence_lift_over_rgb_high", ratios[-1], "the largest of all turns")
         for stage, spent in stage_seconds(case.evidence).items():
             add(f"stage.{stage}_ms", 1e3 * spent, "ms, the GPU waited for around every stage")
-        lifting = {"evidence": case.evidence, "reliability": steps["reliability_s"], "directions": steps["directions_s"]}
+        lifting = {
+            "evidence": case.evidence,
+            "reliability": steps["reliability_s"],
+            "directions": steps["directions_s"],
+        }
         for part, run in lifting.items():
             for name, spent in kernel_milliseconds(run).items():
-                print(f"{case.name}, {part}: {spent:9.2f} ms  {name}", flush=True)
+                print(f"{case.name}, {part[:-2]}: {spent:9.2f} ms  {name}", flush=True)
 
 
 def measure(report: Report, case: Case) -> None:

@@ -25,6 +25,7 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.question import Question
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import check_run, with_paths
 from normlift_ns.runs.question import load_question
 from normlift_ns.scenes.photographs import to_camera
@@ -172,9 +173,10 @@ class NormLiftModel(SplatfactoModel):
         return outputs, image[:, :, 4:]
 
     def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
-        """sum_j A_ij value_j [H, W, C], rasterized as splatfacto rasterizes the colours."""
+        """sum_j A_ij value_j [H, W, C], by the rules of the lift."""
         drawn, mode = values if rows is None else values[rows], self.config.rasterize_mode
-        return render(self._scene(rows), view, drawn, rasterize_mode=mode)[0]
+        settings = RasterSettings.recorded({} if self._field is None else self._field.manifest)
+        return render(self._scene(rows), view, drawn, rasterize_mode=mode, settings=settings)[0]
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

@@ -112,19 +112,15 @@ def test_scalars_are_composited(pipeline, stock: StockRun) -> None:
 
 
 @pytest.mark.parametrize("cropped", [False, True])
-def test_scalars_by_gsplat_are_those_of_the_cpu(
-    pipeline, stock: StockRun, monkeypatch: pytest.MonkeyPatch, cropped: bool
-) -> None:
+def test_scalars_are_those_of_the_cpu(pipeline, stock: StockRun, cropped: bool) -> None:
     model, view = pipeline.model, load_scene(stock.config).train.cameras[0]
     rows = model.means[:, 2] > model.means[:, 2].median() if cropped else None
     values = torch.rand(model.num_points, 2)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend("torch", reference).composite)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     _, expected = model._render_on_cpu(view, values, rows)
-    torch.testing.assert_close(model._scalars_by_gsplat(view, values, rows), expected, atol=1e-6, rtol=1e-4)
-    assert model._scalars_by_gsplat(view, values[:, :0], rows).shape == (35, 47, 0)
+    torch.testing.assert_close(model._composited(view, values, rows), expected, atol=1e-6, rtol=1e-4)
+    assert model._composited(view, values[:, :0], rows).shape == (35, 47, 0)
     nothing = torch.zeros(model.num_points, dtype=torch.bool)
-    assert not model._scalars_by_gsplat(view, values, nothing).any()
+    assert not model._composited(view, values, nothing).any()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -162,8 +158,6 @@ def test_without_a_question_only_the_relevancies_are_missing(pipeline) -> None:
 
 def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the model take the way of CUDA: stock splatfacto, and gsplat for the scalars."""
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend("torch", reference).composite)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     monkeypatch.setattr(type(pipeline.model), "on_cpu", False)
 
 
