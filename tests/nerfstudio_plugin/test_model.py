@@ -16,8 +16,6 @@ from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.load import load_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.question import Question
-from normlift_ns.raster import reference
-from normlift_ns.raster.backend import TileBackend
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.viewer.display import make_display
 from tests.nerfstudio_plugin.conftest import lifted_field, write
@@ -204,12 +202,8 @@ def test_an_overlay_costs_one_pass_of_scalars(pipeline, monkeypatch, on_cpu: boo
 
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)
-    ours = counted("scalars", TileBackend("torch", reference).composite, lambda args: args[2].shape[1])
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", ours)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
-    if on_cpu:
-        counting = counted("cpu", render, lambda args: args[2].shape[1])
-        monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.render", counting)
+    counting = counted("cpu" if on_cpu else "scalars", render, lambda args: args[2].shape[1])
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.render", counting)
     question = Question(("left",) * prompts, torch.eye(8)[:1].expand(prompts, 8))
     with splatfacto_on_cpu():
         stock = counted("stock", rasterization, lambda _: 0)
