@@ -2,8 +2,10 @@
 
     python -m benchmarks.gpu            fox, tabletop, rooms of 0.48, 1.93 and 10 million Gaussians, growth
     python -m benchmarks.gpu --quick    fox and tabletop only
+    python -m benchmarks.gpu --rooms    evidence, lift and RGB of rooms of 1.93 and 10 million Gaussians, by stages
 
-Every time is the median of three runs after a first one, the GPU waited for on both sides.
+Every time is the median of three runs after a first one, the GPU waited for on both sides. What is compared with stock
+gsplat's RGB render is measured in turns with it, in seven rounds.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import torch
 from benchmarks import rooms
 from benchmarks.captures import trained_scene, training_cameras
 from benchmarks.cpu import grid_labels, relative_difference
+from benchmarks.gpu_stages import kernel_milliseconds, stage_seconds
 from benchmarks.report import RESULTS, Report
 from normlift_ns import (
     Camera,
@@ -36,7 +39,7 @@ from normlift_ns import (
 )
 from normlift_ns.core.storage import StoredEvidence
 from normlift_ns.raster.backend import Job
-from normlift_ns.raster.gsplat import project_views
+from normlift_ns.raster.gsplat import compiled_rasterizer, project_views
 from normlift_ns.raster.settings import RasterSettings
 
 DIMENSION, CHANNELS, GSPLAT_VIEWS, SAMPLE = 512, 32, 6, 20_000
@@ -82,7 +85,6 @@ def features(rows: int, device: str = "cuda") -> torch.Tensor:
 
 def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
     """The RGB render of all views by stock gsplat, and its backward pass for 512 channels of the first few."""
-    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
     from gsplat.cuda._wrapper import (  # noqa: PLC0415
         fully_fused_projection,
         isect_offset_encode,
@@ -111,20 +113,70 @@ def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
             rasterize_to_pixels(means2d, conics, colors, opacities, width, height, 16, offsets, members)
 
     def backward() -> None:
+        forward, gradients = compiled_rasterizer()
         total = torch.zeros(n, DIMENSION, device="cuda")
         blank = torch.zeros(1, n, CHANNELS, device="cuda")
         for v in range(min(GSPLAT_VIEWS, len(case.cameras))):
             means2d, conics, width, height, offsets, members = prepared(v)
             drawing = (means2d, conics, blank, scene.opacities[None].contiguous(), None, None, width, height, 16)
-            _, alphas, last = _C.rasterize_to_pixels_fwd(*drawing, offsets, members)
+            _, alphas, last = forward(*drawing, offsets, members)
             gradient = torch.rand(1, height, width, CHANNELS, device="cuda")
             for first in range(0, DIMENSION, CHANNELS):
-                found = _C.rasterize_to_pixels_bwd(
-                    *drawing, offsets, members, alphas, last, gradient, torch.zeros_like(alphas), False
-                )
+                found = gradients(*drawing, offsets, members, alphas, last, gradient, torch.zeros_like(alphas), False)
                 total[:, first : first + CHANNELS] += found[3][0]
 
     return rgb, backward
+
+
+def once(run: Callable[[], Any]) -> float:
+    """Seconds of one run, the GPU waited for on both sides."""
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    run()
+    torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def compare_with_rgb(report: Report, case: Case, rounds: int = 7) -> None:
+    """Evidence and lift over stock gsplat's RGB render, in turns: medians, the ends of the ratio, and the error."""
+
+    def add(key: str, value: Any, unit: str, error: Any = None) -> None:
+        report.add(f"{case.name}.{key}", value, unit, error)
+
+    with torch.no_grad():
+        rgb, evidence = stock_renders(case)[0], case.evidence()
+        table = features(evidence.num_regions)
+        lifted = lift(evidence, table)
+        worst = max(evidence_error(case, evidence), *lift_errors(case, evidence, table, lifted))
+        steps = {
+            "rgb_s": rgb,
+            "evidence_s": case.evidence,
+            "reliability_s": lambda: lift(evidence, table),
+            "directions_s": lambda: lifted.directions(dtype=torch.float16),
+        }
+        seconds: dict[str, list[float]] = {name: [] for name in steps}
+        for turn in range(rounds + 1):
+            for name, step in steps.items():
+                spent = once(step)
+                if turn > 0:  # the first one warms up
+                    seconds[name].append(spent)
+        ratios = sorted((e + r + d) / rgb for rgb, e, r, d in zip(*seconds.values()))
+        for name, spent in seconds.items():
+            add(f"turns.{name}", sorted(spent)[rounds // 2], f"s, median of {rounds} turns, {min(spent):.4g} to "
+                f"{max(spent):.4g}")  # fmt: skip
+        add("evidence_lift_over_rgb", ratios[rounds // 2], "times the RGB render of the same turn, median", worst)
+        add("evidence_lift_over_rgb_low", ratios[0], "the least of all turns")
+        add("evidence_lift_over_rgb_high", ratios[-1], "the largest of all turns")
+        for stage, spent in stage_seconds(case.evidence).items():
+            add(f"stage.{stage}_ms", 1e3 * spent, "ms, the GPU waited for around every stage")
+        lifting = {
+            "evidence": case.evidence,
+            "reliability": steps["reliability_s"],
+            "directions": steps["directions_s"],
+        }
+        for part, run in lifting.items():
+            for name, spent in kernel_milliseconds(run).items():
+                print(f"{case.name}, {part[:-2]}: {spent:9.2f} ms  {name}", flush=True)
 
 
 def measure(report: Report, case: Case) -> None:
@@ -167,7 +219,8 @@ def measure(report: Report, case: Case) -> None:
         add("reliability_s", reliability_s, "s", norm_error)
         add("lift_s", lift_s, "s, reliability and directions", direction_error)
         add("evidence_lift_s", evidence_s + lift_s, "s")
-        add("evidence_lift_over_rgb", (evidence_s + lift_s) / rgb_s, "times the RGB render")
+        if not case.name.startswith("rooms"):  # those are measured in turns
+            add("evidence_lift_over_rgb", (evidence_s + lift_s) / rgb_s, "times the RGB render")
         add("neighbors_s", neighbors_s, "s", 0)
         add("vote_s", vote_s, "s", vote_error)
         add("total_s", evidence_s + lift_s + neighbors_s + vote_s, "s")
@@ -293,16 +346,31 @@ def growth(report: Report) -> None:
             report.add(f"growth.{key}_{value}.evidence_s", seconds, f"s, {evidence.nnz} entries")
 
 
-def main(quick: bool, output: Path) -> None:
-    report = Report("h100")
+ROOMS = (("rooms_480k", 480_000, 131), ("rooms_1930k", 1_930_000, 177), ("rooms_10m", 10**7, 20))
+
+
+def compare_rooms(report: Report, names: Sequence[str]) -> None:
+    for name, n, views in ROOMS:
+        if name in names:
+            compare_with_rgb(report, room_case(name, n, views))
+            torch.cuda.empty_cache()
+
+
+def main(quick: bool, rooms_only: bool, output: Path) -> None:
+    report = Report("h100_rooms" if rooms_only else "h100")
+    if rooms_only:
+        compare_rooms(report, ("rooms_1930k", "rooms_10m"))
+        report.write(output)
+        return
     captures = [capture_case(name) for name in ("fox", "tabletop")]
     agreement(report, captures)
     while captures:
         measure(report, captures.pop(0))
     if not quick:
-        for name, n, views in (("rooms_480k", 480_000, 131), ("rooms_1930k", 1_930_000, 177), ("rooms_10m", 10**7, 20)):
+        for name, n, views in ROOMS:
             measure(report, room_case(name, n, views))
             torch.cuda.empty_cache()
+        compare_rooms(report, [name for name, _, _ in ROOMS])
         growth(report)
     report.write(output)
 
@@ -310,6 +378,7 @@ def main(quick: bool, output: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="captures only")
+    parser.add_argument("--rooms", action="store_true", help="evidence, lift and RGB of two rooms, with all stages")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
-    main(arguments.quick, arguments.output)
+    main(arguments.quick, arguments.rooms, arguments.output)

@@ -211,7 +211,7 @@ class LiftedRun:
             found: an answer, or what it says of one text.
         """
         camera = view if isinstance(view, Camera) else self.camera(view)
-        settings = RasterSettings.of_gsplat(str(self.field.manifest.get("gsplat_rules", "1.4")))
+        settings = RasterSettings.recorded(self.field.manifest)
         picture = render_picture(self.scene, camera, settings=settings)
         if found is None:
             return picture

@@ -18,7 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RefineConfig, View
+from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RasterSettings, RefineConfig, View
 from normlift_ns.encoders import LangSplat, RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import LabelFiles
@@ -297,3 +297,15 @@ def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):
         assert steps[-1] == N
         assert steps == sorted(steps)
     assert len([step for step in told if step[0] == "neighbors"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("asked", "recorded", "rules"), [("auto", None, "1.4"), ("auto", "1.5", "1.5"), ("1.6", "1.5", "1.6")]
+)
+def test_the_manifest_says_what_rasterized_and_by_which_rules(asked, recorded, rules, tmp_path):
+    made = scene("a.png")
+    made.identity = {} if recorded is None else {"gsplat_rules": recorded}
+    found = lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made, gsplat_rules=asked, backend="auto")
+    assert found.field.manifest["gsplat_rules"] == rules
+    assert found.field.manifest["backend"] == "numba"
+    assert RasterSettings.recorded(found.field.manifest) == RasterSettings.of_gsplat(rules)

@@ -111,17 +111,9 @@ class Evidence:
         """Joins the entries of all views, in their order."""
         device = parts[0].weight.device if parts else torch.device("cpu")
         counts = [count for part in parts for count in part.num_regions]
-        labeled, blank = [], []
-        first, view = 0, 0
-        for part in parts:
-            is_region, new = _column_table(part.num_regions, first, view)
-            is_region, new = is_region.to(device)[part.column], new.to(device)[part.column]
-            for found, keep in ((labeled, is_region), (blank, ~is_region)):
-                found.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
-            first, view = first + sum(part.num_regions), view + len(part.num_regions)
-        rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
-        region_view = torch.tensor([v for v, count in enumerate(counts) for _ in range(count)], dtype=torch.int32)
-        return Evidence(rows, region_view.to(device), unlabeled, view, weight_power, num_excluded)
+        rows, unlabeled = (_joined_by_sorting if device.type == "cuda" else _joined)(parts, num_gaussians, device)
+        region_view = torch.repeat_interleave(torch.arange(len(counts), dtype=torch.int32), torch.tensor(counts).int())
+        return Evidence(rows, region_view.to(device), unlabeled, len(counts), weight_power, num_excluded)
 
     @cached_property
     def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
@@ -310,6 +302,43 @@ class Evidence:
         """What a file held, without a copy."""
         rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (found.rows, found.unlabeled))
         return Evidence(rows, torch.from_numpy(found.region_view), unlabeled, *found.counts)
+
+
+def _joined(parts: Sequence[Entries], num_gaussians: int, device: torch.device) -> tuple[SparseRows, SparseRows]:
+    """Regions and unlabelled pixels of all parts, every entry put straight to its place."""
+    labeled, blank = [], []
+    first, view = 0, 0
+    for part in parts:
+        is_region, new = _column_table(part.num_regions, first, view)
+        is_region, new = is_region.to(device)[part.column], new.to(device)[part.column]
+        for found, keep in ((labeled, is_region), (blank, ~is_region)):
+            found.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
+        first, view = first + sum(part.num_regions), view + len(part.num_regions)
+    rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
+    return rows, unlabeled
+
+
+def _joined_by_sorting(
+    parts: Sequence[Entries], num_gaussians: int, device: torch.device
+) -> tuple[SparseRows, SparseRows]:
+    """The same by one stable sort, which suits a GPU: the rows of the regions, and behind them those of the unlabelled
+    pixels.
+    """
+    is_region, new = _column_table([count for part in parts for count in part.num_regions], 0, 0)
+    code = torch.where(is_region, new, -1 - new).to(device)  # of a region its number, of the others -1 - view
+    widths = torch.tensor([0, *(sum(part.num_regions) + len(part.num_regions) for part in parts)]).cumsum(0).tolist()
+    column = torch.cat([code[first:][part.column] for part, first in zip(parts, widths)])
+    weight = torch.cat([part.weight for part in parts])
+    kind = torch.int32 if 2 * num_gaussians < 2**31 else torch.int64
+    row = torch.cat([part.gaussian.to(kind) for part in parts])
+    row, order = torch.where(column < 0, row + num_gaussians, row).sort(stable=True)
+    column, weight = column[order], weight[order]
+    offsets = torch.searchsorted(row, torch.arange(2 * num_gaussians + 1, dtype=kind, device=device))
+    middle = int(offsets[num_gaussians])
+    return (
+        SparseRows(offsets[: num_gaussians + 1].clone(), column[:middle], weight[:middle]),
+        SparseRows(offsets[num_gaussians:] - middle, -1 - column[middle:], weight[middle:].clone()),
+    )
 
 
 def _column_table(

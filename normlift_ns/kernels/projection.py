@@ -1,7 +1,9 @@
 """Which Gaussians some cameras see, and where in the image: gsplat's projection, one thread per Gaussian.
 
-The arithmetic is that of gsplat's utils.cuh, product by product, so that the compiler fuses the same ones. Distances
-along the axis of the camera, which decide the order of drawing, are rounded bit for bit as CUDA rounds them there.
+The arithmetic is that of gsplat 1.4.0's fully_fused_projection_fwd.cu as nvcc 13.0 compiles it for sm_90 with gsplat's
+flags (-O3 --use_fast_math): which product of a sum is rounded and which ones are fused is written out here as read from
+that machine code, and the compiler is told to fuse nothing else. Divisions, square roots and reciprocals are the
+approximate ones of both compilers. Every number is so the same, bit for bit, but for those below 2 ** -126.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ def _camera_axis(camera, axis: tl.constexpr, x, y, z):
 
 @triton.jit
 def _dot(ax, ay, az, bx, by, bz):
-    return ax * bx + ay * by + az * bz
+    return tl.fma(az, bz, tl.fma(ax, bx, ay * by))
 
 
 @triton.jit
@@ -71,12 +73,13 @@ def _covariance(quats, scales, i, there):
     sx = tl.load(scales + 3 * i, mask=there, other=0.0)
     sy = tl.load(scales + 3 * i + 1, mask=there, other=0.0)
     sz = tl.load(scales + 3 * i + 2, mask=there, other=0.0)
-    inverse = tl.rsqrt(x * x + y * y + z * z + w * w)
+    inverse = tl.rsqrt(tl.fma(w, w, _dot(x, y, z, x, y, z)))
     x, y, z, w = x * inverse, y * inverse, z * inverse, w * inverse
-    x2, y2, z2, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
-    ax, ay, az = (1.0 - 2.0 * (y2 + z2)) * sx, 2.0 * (xy - wz) * sy, 2.0 * (xz + wy) * sz
-    bx, by, bz = 2.0 * (xy + wz) * sx, (1.0 - 2.0 * (x2 + z2)) * sy, 2.0 * (yz - wx) * sz
-    cx, cy, cz = 2.0 * (xz - wy) * sx, 2.0 * (yz + wx) * sy, (1.0 - 2.0 * (x2 + y2)) * sz
+    y2, z2, wx, wy, wz = y * y, z * z, w * x, w * y, w * z
+    ax = (1.0 - 2.0 * (y2 + z2)) * sx
+    ay, az = 2.0 * tl.fma(x, y, -wz) * sy, 2.0 * tl.fma(x, z, wy) * sz
+    bx, by, bz = 2.0 * tl.fma(x, y, wz) * sx, (1.0 - 2.0 * tl.fma(x, x, z2)) * sy, 2.0 * tl.fma(y, z, -wx) * sz
+    cx, cy, cz = 2.0 * tl.fma(x, z, -wy) * sx, 2.0 * tl.fma(y, z, wx) * sy, (1.0 - 2.0 * tl.fma(x, x, y2)) * sz
     return (
         _dot(ax, ay, az, ax, ay, az),
         _dot(ax, ay, az, bx, by, bz),
@@ -88,22 +91,25 @@ def _covariance(quats, scales, i, there):
 
 
 @triton.jit
+def _row_times(a, b, c, xx, xy, xz, yy, yz, zz):
+    """A row of the pose times the covariance; its last number is summed in another order, in gsplat too."""
+    return _dot(a, b, c, xx, xy, xz), _dot(a, b, c, xy, yy, yz), tl.fma(c, zz, tl.fma(b, yz, a * xz))
+
+
+@triton.jit
 def _turned(camera, xx, xy, xz, yy, yz, zz):
-    """The covariance in the axes of a camera."""
+    """The covariance C in the axes of a camera, row by row but for the last number: C_ij and C_ji are rounded apart."""
     a, b, c = tl.load(camera), tl.load(camera + 1), tl.load(camera + 2)
     d, e, f = tl.load(camera + 4), tl.load(camera + 5), tl.load(camera + 6)
     g, h, k = tl.load(camera + 8), tl.load(camera + 9), tl.load(camera + 10)
-    x0, x1, x2 = _dot(a, b, c, xx, xy, xz), _dot(a, b, c, xy, yy, yz), _dot(a, b, c, xz, yz, zz)
-    y0, y1, y2 = _dot(d, e, f, xx, xy, xz), _dot(d, e, f, xy, yy, yz), _dot(d, e, f, xz, yz, zz)
-    z0, z1, z2 = _dot(g, h, k, xx, xy, xz), _dot(g, h, k, xy, yy, yz), _dot(g, h, k, xz, yz, zz)
+    x0, x1, x2 = _row_times(a, b, c, xx, xy, xz, yy, yz, zz)
+    y0, y1, y2 = _row_times(d, e, f, xx, xy, xz, yy, yz, zz)
+    z0, z1, z2 = _row_times(g, h, k, xx, xy, xz, yy, yz, zz)
     return (
-        _dot(x0, x1, x2, a, b, c),
-        _dot(x0, x1, x2, d, e, f),
-        _dot(x0, x1, x2, g, h, k),
-        _dot(y0, y1, y2, d, e, f),
-        _dot(y0, y1, y2, g, h, k),
-        _dot(z0, z1, z2, g, h, k),
-    )
+        _dot(x0, x1, x2, a, b, c), _dot(x0, x1, x2, d, e, f), _dot(x0, x1, x2, g, h, k),
+        _dot(y0, y1, y2, a, b, c), _dot(y0, y1, y2, d, e, f), _dot(y0, y1, y2, g, h, k),
+        _dot(z0, z1, z2, a, b, c), _dot(z0, z1, z2, d, e, f), _dot(z0, z1, z2, g, h, k),
+    )  # fmt: skip
 
 
 @triton.jit
@@ -118,28 +124,33 @@ def _splat(
     xc, yc, depth = _camera_axis(camera, 0, x, y, z), _camera_axis(camera, 1, x, y, z), _camera_axis(camera, 2, x, y, z)
     seen = (depth >= near_plane) & (depth <= far_plane)
     zc = tl.where(seen, depth, 1.0)
-    xx, xy, xz, yy, yz, zz = _turned(camera, xx, xy, xz, yy, yz, zz)
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = _turned(camera, xx, xy, xz, yy, yz, zz)
 
-    margin_x, margin_y = frustum_margin * (0.5 * width / fx), frustum_margin * (0.5 * height / fy)
+    half_x, half_y = 0.5 * width / fx, 0.5 * height / fy
     rz = 1.0 / zc
-    rz2 = rz * rz
-    tx = zc * tl.minimum((width - cx) / fx + margin_x, tl.maximum(-(cx / fx + margin_x), xc * rz))
-    ty = zc * tl.minimum((height - cy) / fy + margin_y, tl.maximum(-(cy / fy + margin_y), yc * rz))
-    jx, jy, jxz, jyz = fx * rz, fy * rz, -fx * tx * rz2, -fy * ty * rz2
-    p0, p1, p2 = jxz * xz + jx * xx, jxz * yz + jx * xy, jxz * zz + jx * xz
-    q1, q2 = jyz * yz + jy * yy, jyz * zz + jy * yz
-    a, b, c = p2 * jxz + p0 * jx, p2 * jyz + p1 * jy, q2 * jyz + q1 * jy
+    low, high = tl.fma(half_x, frustum_margin, cx / fx), tl.fma(half_x, frustum_margin, (width - cx) / fx)
+    tx = zc * tl.minimum(high, tl.maximum(-low, xc * rz))
+    low, high = tl.fma(half_y, frustum_margin, cy / fy), tl.fma(half_y, frustum_margin, (height - cy) / fy)
+    ty = zc * tl.minimum(high, tl.maximum(-low, yc * rz))
+    # The Jacobian is (jx, 0, -jxz), (0, jy, -jyz).
+    jx, jy, jxz, jyz = fx * rz, fy * rz, rz * rz * (fx * tx), rz * rz * (fy * ty)
+    p0, q0 = tl.fma(-c20, jxz, c00 * jx), tl.fma(-c20, jyz, c10 * jy)
+    p1, q1 = tl.fma(-c21, jxz, c01 * jx), tl.fma(-c21, jyz, c11 * jy)
+    p2, q2 = tl.fma(-c22, jxz, c02 * jx), tl.fma(-c22, jyz, c12 * jy)
+    a, b = tl.fma(jxz, -p2, jx * p0), tl.fma(jxz, -q2, jx * q0)
+    b_again, c = tl.fma(jyz, -p2, jy * p1), tl.fma(jyz, -q2, jy * q1)
 
     unit = tl.where(tl.maximum(a, c) > _ENORMOUS, 1.0 / _ENORMOUS, 1.0)
-    a, b, c = unit * a, unit * b, unit * c
-    sharp = a * c - b * b
+    a, b, b_again, c = unit * a, unit * b, unit * b_again, unit * c
+    square = b_again * b
+    sharp = tl.fma(c, a, -square)
     a, c = a + unit * eps2d, c + unit * eps2d
-    det = a * c - b * b
+    det = tl.fma(c, a, -square)
     seen &= det > 0
     det = tl.where(seen, det, 1.0)
-    if ANTIALIASED:
-        opacity *= tl.sqrt(tl.maximum(min_compensation * min_compensation, sharp / det))
     inverse = 1.0 / det
+    if ANTIALIASED:
+        opacity *= tl.sqrt(tl.maximum(min_compensation * min_compensation, sharp * inverse))
     conic_x, conic_xy, conic_y = unit * (c * inverse), unit * (-b * inverse), unit * (a * inverse)
     seen &= (tl.abs(conic_x) <= _LARGEST) & (tl.abs(conic_xy) <= _LARGEST) & (tl.abs(conic_y) <= _LARGEST)
 
@@ -151,11 +162,11 @@ def _splat(
         seen &= (half_width > 0) & (half_height > 0)
     else:
         mean = 0.5 * (a + c)
-        larger = mean + tl.sqrt(tl.maximum(unit * unit * min_discriminant, mean * mean - det))
+        larger = mean + tl.sqrt(tl.maximum(unit * unit * min_discriminant, tl.fma(mean, mean, -det)))
         half_width = tl.ceil(radius_sigmas * tl.sqrt(larger / unit))
         half_height = half_width
     seen &= (half_width <= _LARGEST) & (half_height <= _LARGEST)
-    u, v = fx * xc * rz + cx, fy * yc * rz + cy
+    u, v = tl.fma(rz, fx * xc, cx), tl.fma(rz, fy * yc, cy)
     seen &= (u + half_width > 0) & (u - half_width < width) & (v + half_height > 0) & (v - half_height < height)
     return seen, u, v, conic_x, conic_xy, conic_y, opacity, half_width, half_height, depth
 
@@ -242,6 +253,7 @@ def project(
     scene = [x.contiguous() for x in (means, quats, scales, opacities)]
     flags = torch.empty(n * views, dtype=torch.bool, device=device)
     options = {"ANTIALIASED": antialiased, "PER_AXIS": per_axis, "CAMERA": CAMERA, "BLOCK": _BLOCK, "num_warps": 4}
+    options["enable_fp_fusion"] = False
     if n > 0:
         _find_seen[(triton.cdiv(n, _BLOCK),)](
             *scene, drawable.view(torch.int8), cameras, flags.view(torch.int8), n, views, width, height, *rules,

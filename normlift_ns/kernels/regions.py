@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float32, Int, Int32
+from jaxtyping import Float32, Int, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.kernels.lists import Grid, Lists
@@ -24,6 +24,7 @@ _MOST_SLOTS = 2**26
 """Slots at once, of 8 or 12 bytes each."""
 _COPIED = 128
 """Sums that a program moves at once."""
+_PLACES = 512
 
 
 class Limits(NamedTuple):
@@ -70,7 +71,8 @@ def load_splat(splats, m, there):
 def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
     """(A_ij, transmittance behind) of one splat in all pixels; a finished pixel has transmittance 0."""
     dx, dy = u - px, v - py
-    sigma = (a * dx * dx + c * dy * dy) + b * dx * dy
+    # As nvcc fuses it in rasterize_to_pixels_fwd.cu.
+    sigma = tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
     alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
     felt = (sigma >= 0) & (alpha >= min_alpha)
     after = T * (1.0 - alpha)
@@ -224,3 +226,34 @@ def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, in
     return [
         (first, last, low, high) for (first, low), (last, high) in pairwise(zip(cell.tolist(), slots[cell].tolist()))
     ]
+
+
+@triton.jit
+def _places(key, seen, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    there = i < count
+    k = tl.load(key + i, mask=there, other=0)
+    splat = k // columns
+    place = tl.load(seen + splat, mask=there, other=0)
+    gaussian = place // views
+    column = tl.load(first + (place - gaussian * views), mask=there, other=0) + (k - splat * columns).to(tl.int32)
+    tl.store(out_gaussian + i, gaussian.to(tl.int32), mask=there)
+    tl.store(out_column + i, column, mask=there)
+
+
+def places(
+    key: Int[Tensor, " m"], seen: Int64[Tensor, " splats"], first: Int32[Tensor, " views_plus_1"], columns: int
+) -> tuple[Int32[Tensor, " m"], Int32[Tensor, " m"]]:
+    """Gaussian and column of sums.
+
+    Args:
+        key: as in `RegionSums`.
+        seen: gaussian * views + view of every splat.
+        first: first column of every view.
+    """
+    gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))
+    if len(key) > 0:
+        _places[(triton.cdiv(len(key), _PLACES),)](
+            key, seen, first, gaussian, column, len(key), columns, len(first) - 1, BLOCK=_PLACES, num_warps=4
+        )
+    return gaussian, column

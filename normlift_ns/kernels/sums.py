@@ -114,11 +114,19 @@ def _row_norms(
         view_weight, squared, by_view = all_weight, all_weight, all_weight
         views, first = 0, start
         view = -1
+        # On their way while an entry is added: the row of the next one, and the column of the next but one.
+        s = tl.load(column + start)
+        later = tl.load(column + start + 1)
+        next_view, next_w = tl.load(column_view + s), tl.load(weight + start)
+        next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop + 1):
-            inside = e < stop
-            s = tl.load(column + e, mask=inside, other=0)
-            next_view = tl.load(column_view + s, mask=inside, other=-2)
-            if (next_view != view) & (view != -1):  # the entries of a view end here
+            here, w, row = next_view, next_w, next_row
+            s, following = later, tl.minimum(e + 1, stop - 1)
+            later = tl.load(column + tl.minimum(e + 2, stop - 1))
+            next_view = tl.where(e + 1 < stop, tl.load(column_view + s), -2)
+            next_w = tl.where(e + 1 < stop, tl.load(weight + following), 0.0)
+            next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
+            if (here != view) & (view != -1):  # the entries of a view end here
                 norm = view_weight  # of a single unit row
                 if e - first > 1:
                     norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
@@ -133,11 +141,9 @@ def _row_norms(
                 of_view = zero
                 view_weight = tl.zeros([], tl.float64)
                 first = e
-            if inside:
-                w = tl.load(weight + e)
-                of_view += w * tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
-                view_weight += w.to(tl.float64)
-            view = next_view
+            of_view += w * row  # behind the last entry 0
+            view_weight += w.to(tl.float64)
+            view = here
         norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
         if (norm < cancelled * all_weight) | (stop - start > many):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)

@@ -24,6 +24,7 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.question import Question
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import check_run, with_paths
 from normlift_ns.runs.question import load_question
 from normlift_ns.scenes.nerfstudio.appearance import shading_degree
@@ -121,7 +122,7 @@ class NormLiftModel(SplatfactoModel):
             # where all is cropped away, splatfacto's outputs are on the CPU and its background is [3]
             outputs = {name: value.to(self.device) for name, value in outputs.items()}
             outputs["background"] = outputs["background"].expand(view.height, view.width, 3)
-            scalars = self._scalars_by_gsplat(view, values, rows)
+            scalars = self._composited(view, values, rows)
         self.set_crop(obb_box)
         if display is None:
             return outputs
@@ -171,10 +172,11 @@ class NormLiftModel(SplatfactoModel):
         }
         return outputs, image[:, :, 4:]
 
-    def _scalars_by_gsplat(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
-        """sum_j A_ij value_j [H, W, C], rasterized as splatfacto rasterizes the colours."""
+    def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
+        """sum_j A_ij value_j [H, W, C], by the rules of the lift."""
         drawn, mode = values if rows is None else values[rows], self.config.rasterize_mode
-        return render(self._scene(rows), view, drawn, backend="gsplat", rasterize_mode=mode)[0]
+        settings = RasterSettings.recorded({} if self._field is None else self._field.manifest)
+        return render(self._scene(rows), view, drawn, rasterize_mode=mode, settings=settings)[0]
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

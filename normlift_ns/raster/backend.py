@@ -61,6 +61,10 @@ class Backend(Protocol):
         """
         ...
 
+    def in_flight(self, job: Job, camera: Camera) -> int:
+        """How many views of the size of this one `views_evidence` is best given at once."""
+        ...
+
     def views_evidence(self, job: Job, batch: Batch) -> Entries:
         """Sums of A_ij ** weight_power by (Gaussian, region)."""
         ...
@@ -81,6 +85,10 @@ class TileBackend:
 
     def check(self, job: Job, *, pictures: bool) -> None:
         """Nothing to refuse: any device will do."""
+
+    def in_flight(self, job: Job, camera: Camera) -> int:
+        """One: views are independent of each other."""
+        return 1
 
     def views_evidence(self, job: Job, batch: Batch) -> Entries:  # noqa: D102 (as in the protocol)
         (camera,), (labels,), (count,) = batch

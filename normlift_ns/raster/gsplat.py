@@ -7,7 +7,7 @@ repeatable (gsplat adds with atomics), but gsplat's own code throughout.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
@@ -48,6 +48,9 @@ class Projections(NamedTuple):
     """Indices into c * n, by camera, tile and depth."""
     offsets: Int32[Tensor, "c tiles_y tiles_x"]
     """Where each tile starts in `members`."""
+    depths: Float32[Tensor, "c n"]
+    radii: Int32[Tensor, "c n *axes"]
+    """Half sides of squares, or of rectangles; 0: not drawn."""
 
 
 def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
@@ -76,7 +79,8 @@ def project_views(job: Job, cameras: Sequence[Camera]) -> Projections:
     _project_enormous(job, cameras, radii, means2d, depths, conics, opacities)
     across, down = -(-width // settings.tile_size), -(-height // settings.tile_size)
     _, keys, members = isect_tiles(means2d, radii, depths, settings.tile_size, across, down)
-    return Projections(means2d, conics, opacities, members, isect_offset_encode(keys, len(cameras), across, down))
+    offsets = isect_offset_encode(keys, len(cameras), across, down)
+    return Projections(means2d, conics, opacities, members, offsets, depths, radii)
 
 
 def _squares(conics: Float32[Tensor, "c n 3"], settings: RasterSettings) -> Int32[Tensor, "c n 2"]:
@@ -174,6 +178,11 @@ def rules_named(wanted: str, recorded: str | None) -> str:
     return ".".join(installed_version().split(".")[:2])
 
 
+def in_flight(job: Job, camera: Camera) -> int:
+    """One: its lists of a view take 60 bytes per Gaussian."""
+    return 1
+
+
 def views_evidence(job: Job, batch: Batch) -> Entries:
     """Entries of some views, from gsplat's forward and backward pass alone.
 
@@ -217,14 +226,10 @@ def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator
     The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py).
     """
     seen, settings = project_views(job, [camera]), job.settings
-    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
-
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
     drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
     lists = (settings.tile_size, seen.offsets, seen.members)
-    later = hasattr(_C, "rasterize_to_pixels_3dgs_fwd")
-    forward = _C.rasterize_to_pixels_3dgs_fwd if later else _C.rasterize_to_pixels_fwd
-    backward = _C.rasterize_to_pixels_3dgs_bwd if later else _C.rasterize_to_pixels_bwd
+    forward, backward = compiled_rasterizer()
     _, alphas, last = forward(*drawing, *lists)
     column = labels.long() + 1
     for first in range(0, count + 1, _CHANNELS):
@@ -232,3 +237,11 @@ def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator
         one_hot = (column[None, :, :, None] == channels).float()
         gradients = backward(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
         yield first, gradients[3][0]
+
+
+def compiled_rasterizer() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """gsplat's compiled forward and backward pass over pixels, whatever its version calls them."""
+    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
+
+    name = "rasterize_to_pixels_3dgs" if hasattr(_C, "rasterize_to_pixels_3dgs_fwd") else "rasterize_to_pixels"
+    return getattr(_C, f"{name}_fwd"), getattr(_C, f"{name}_bwd")

@@ -22,11 +22,6 @@ from normlift_ns.raster.backends import choose_backend
 from normlift_ns.raster.settings import RasterSettings
 
 Progress = Callable[[int, int | None], None]
-_IN_FLIGHT = 8
-"""Most views at once on a GPU."""
-_FLIGHT_ELEMENTS = {"gsplat": 2**24, "triton": 2**26}
-"""Views in flight times Gaussians, about, of the backends that take several views at once: each takes 60 bytes of
-gsplat, of triton those that are seen take twice as many, and all others one."""
 _ADVICE = "rasterize at a fraction of the resolution (ns-normlift --lift-downscale 2), or on the CPU (--device cpu)"
 
 
@@ -83,8 +78,7 @@ def rasterize_evidence(
     if weight_power not in (0, 1, 2):
         raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
     job = _job(scene, rasterize_mode, settings, dtype, weight_power)
-    name, chosen = choose_backend(backend, job, pictures=False)
-    in_flight = max(1, min(_IN_FLIGHT, _FLIGHT_ELEMENTS.get(name, 0) // max(1, len(scene))))
+    _, chosen = choose_backend(backend, job, pictures=False)
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
@@ -96,7 +90,7 @@ def rasterize_evidence(
     parts: list[Entries] = []
     done = 0
     with torch.no_grad():
-        for flight in _flights(_zip_views(cameras, labels, num_regions), in_flight):
+        for flight in _flights(_zip_views(cameras, labels, num_regions), lambda camera: chosen.in_flight(job, camera)):
             for i, (camera, there, _) in enumerate(flight):
                 _check_map(done + i, camera, there)
             device = scene.means.device
@@ -198,12 +192,13 @@ def _job(
 
 
 def _flights(
-    views: Iterator[tuple[Camera, Tensor, int | None]], most: int
+    views: Iterator[tuple[Camera, Tensor, int | None]], most: Callable[[Camera], int]
 ) -> Iterator[list[tuple[Camera, Tensor, int | None]]]:
     """Consecutive views of one size, at most so many at once."""
-    for _, same_size in groupby(views, key=lambda view: (view[0].width, view[0].height)):
-        while flight := list(islice(same_size, most)):
-            yield flight
+    for _, group in groupby(views, key=lambda view: (view[0].width, view[0].height)):
+        same_size = iter(group)
+        for first in same_size:
+            yield [first, *islice(same_size, most(first[0]) - 1)]
 
 
 def _zip_views(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import KNOWN_RULES
@@ -70,3 +72,15 @@ class RasterSettings:
             return RasterSettings()
         rectangle = RasterSettings(per_axis=True, radius_sigmas=3.33)
         return rectangle if rules == "1.5" else replace(rectangle, max_alpha=0.99, min_compensation=0.005)
+
+    @staticmethod
+    def recorded(facts: Mapping[str, Any]) -> RasterSettings:
+        """The constants that a manifest names as `gsplat_rules`; of one without, those of gsplat 1.4.
+
+        Raises:
+            ValueError: rules of which nothing is known.
+
+        >>> RasterSettings.recorded({"gsplat_rules": "1.5"}).per_axis, RasterSettings.recorded({}).per_axis
+        (True, False)
+        """
+        return RasterSettings.of_gsplat(str(facts.get("gsplat_rules", KNOWN_RULES[0])))

@@ -15,12 +15,18 @@ from normlift_ns.errors import InputError
 from normlift_ns.kernels import composite as pictures
 from normlift_ns.kernels.lists import Grid, Lists, list_cells
 from normlift_ns.kernels.projection import Rules, Splats, project
-from normlift_ns.kernels.regions import Limits, region_sums
+from normlift_ns.kernels.regions import Limits, places, region_sums
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.settings import RasterSettings
 
-CELL = (16, 8)
-"""Largest width and height in pixels of the cells that have lists of their own."""
+CELL, SMALL_CELL = (16, 16), (16, 8)
+"""Largest width and height in pixels of the cells that have lists of their own. Where there are many Gaussians, few
+pixels of a cell feel the same ones, and smaller cells pay."""
+_MANY = 4_000_000
+_ELEMENTS, _MOST_VIEWS = 2**26, 16
+"""Most views in flight times Gaussians, and most views: each takes a byte per Gaussian, and 120 of those it sees."""
+_SHORT = 2**15
+"""Cells of all views in flight that an int16 numbers, which takes half the time of an int32 to sort."""
 
 
 def check(job: Job, *, pictures: bool = False) -> None:
@@ -48,14 +54,26 @@ def see(job: Job, cameras: Sequence[Camera], *, cull: bool = True) -> tuple[Grid
         for camera in cameras
     ]
     views = torch.stack(rows).to(scene.means.device)
-    tile, width, height = settings.tile_size, cameras[0].width, cameras[0].height
-    grid = Grid(width, height, tile, min(CELL[0], tile), min(CELL[1], tile))
+    width, height = cameras[0].width, cameras[0].height
+    grid = _grid(job, cameras[0])
     seen = project(
         scene.means, scene.quats, scene.scales, scene.opacities, scene.drawable, views, width, height,
         Rules(*(getattr(settings, name) for name in Rules._fields)),
         antialiased=job.antialiased, per_axis=settings.per_axis,
     )  # fmt: skip
     return grid, seen, list_cells(seen, len(cameras), grid, settings.min_alpha, cull=cull)
+
+
+def in_flight(job: Job, camera: Camera) -> int:
+    """How many views of one size are best taken at once."""
+    most = min(_ELEMENTS // max(1, len(job.scene)), (_SHORT - 1) // max(1, _grid(job, camera).cells), _MOST_VIEWS)
+    return max(1, most)
+
+
+def _grid(job: Job, camera: Camera) -> Grid:
+    tile = job.settings.tile_size
+    across, down = CELL if len(job.scene) < _MANY else SMALL_CELL
+    return Grid(camera.width, camera.height, tile, min(across, tile), min(down, tile))
 
 
 def views_evidence(job: Job, batch: Batch, *, cull: bool = True) -> Entries:
@@ -65,19 +83,15 @@ def views_evidence(job: Job, batch: Batch, *, cull: bool = True) -> Entries:
         cull: see `list_cells`; the entries do not depend on it.
     """
     grid, seen, lists = see(job, batch.cameras, cull=cull)
-    views, columns = len(batch.cameras), max(batch.num_regions) + 1
+    columns = max(batch.num_regions) + 1
     labels = torch.stack(list(batch.labels))
     found = region_sums(
         seen.splats, lists, labels, grid, columns=columns, limits=_limits(job.settings), weight_power=job.weight_power
     )
     key, weight = sum_equal_keys(*found)
     # Splats are numbered by Gaussian and then by view: keys in ascending order are entries in theirs.
-    splat = torch.div(key, columns, rounding_mode="floor")
-    place = seen.seen[splat.long()]
-    gaussian = torch.div(place, views, rounding_mode="floor")
-    first = torch.tensor([0, *(count + 1 for count in batch.num_regions)]).cumsum(0).to(key.device)
-    column = first[place - gaussian * views] + (key - splat * columns)
-    return Entries(gaussian.int(), column.int(), weight, tuple(batch.num_regions))
+    first = torch.tensor([0, *(count + 1 for count in batch.num_regions)]).cumsum(0).int().to(key.device)
+    return Entries(*places(key, seen.seen, first, columns), weight, tuple(batch.num_regions))
 
 
 def composite(

@@ -263,8 +263,9 @@ def _assumptions(
     if options.rasterize_mode is None and mode is None:
         texts.append(f"{path.name} does not say how it was rasterized: taken for classic, see --rasterize-mode.")
     texts.append(
-        "Weights are those of gsplat 1.4: a Gaussian covers at most 0.999 of a pixel. Inria's trainer stops at 0.99 "
-        "and puts the principal point in the middle; photographs with distortion are undistorted as ns-train does it."
+        "Weights are those of gsplat, by the rules of --gsplat-rules (1.4 by default): a Gaussian covers at most 0.999 "
+        "of a pixel, by those of 1.6 at most 0.99, as in Inria's trainer. That one "
+        "puts the principal point in the middle; photographs with distortion are undistorted as ns-train does it."
     )
     if len(held_out) > 0:
         lifted = "lifted too" if options.views == "all" else "not lifted"

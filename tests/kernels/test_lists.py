@@ -11,7 +11,7 @@ from normlift_ns import Camera, GaussianScene, RasterSettings
 from normlift_ns.raster import triton
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import assign_tiles, camera_depths, project, to_world
-from tests.kernels.test_regions import DEVICE, hard_scene
+from tests.kernels.test_regions import DEVICE, NEEDLES, hard_scene
 from tests.scenes import generator, orbit, random_labels, random_scene
 
 RULES = ("1.4", "1.5", "1.6")
@@ -47,7 +47,10 @@ def test_lists_are_those_of_the_reference(kind, antialiased, rules, monkeypatch)
             there = tiles.members[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()
             place = view * grid.cells + tile
             splats = lists.members[bounds[place] : bounds[place + 1]].long()
-            assert torch.equal(seen.seen[splats] // 2, projected.gaussian[there[~faint[there]]])
+            ours, theirs = seen.seen[splats] // 2, projected.gaussian[there[~faint[there]]]
+            if (kind, antialiased) == ("hard", True):  # no digit of a needle's determinant, and so of its opacity
+                ours, theirs = ours[ours >= NEEDLES], theirs[theirs >= NEEDLES]
+            assert torch.equal(ours, theirs)
             assert (seen.seen[splats] % 2 == view).all()
 
 

@@ -12,6 +12,8 @@ from tests.scenes import dense, generator, orbit, random_labels, random_scene
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 SETTINGS = RasterSettings()
+NEEDLES = 8
+"""The first Gaussians of the hard scene."""
 
 
 def job(scene, antialiased=False, weight_power=1, settings=SETTINGS):
@@ -55,8 +57,8 @@ def hard_scene():
     g = generator(3)
     scene = random_scene(60, seed=3, dtype=torch.float32)
     means, scales, opacities = scene.means.clone(), scene.scales.clone(), scene.opacities.clone()
-    scales[:8] = torch.tensor([1.0, 1e-4, 1e-4])  # needles
-    scales[8:14] = torch.tensor([0.5, 0.5, 1e-5])  # pancakes
+    scales[:NEEDLES] = torch.tensor([1.0, 1e-4, 1e-4])
+    scales[NEEDLES:14] = torch.tensor([0.5, 0.5, 1e-5])  # pancakes
     scales[14:16] = 30.0  # larger than the image
     means[16:26] = torch.tensor([0.1, 0.2, 0.3])  # one place, one depth
     opacities[16:20] = 0.999

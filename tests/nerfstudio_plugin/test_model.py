@@ -16,8 +16,6 @@ from normlift_ns.front_door import open_scene as load_scene
 from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.question import Question
-from normlift_ns.raster import reference
-from normlift_ns.raster.backend import TileBackend
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.viewer.display import make_display
 from tests.nerfstudio_plugin.conftest import lifted_field, write
@@ -112,19 +110,15 @@ def test_scalars_are_composited(pipeline, stock: StockRun) -> None:
 
 
 @pytest.mark.parametrize("cropped", [False, True])
-def test_scalars_by_gsplat_are_those_of_the_cpu(
-    pipeline, stock: StockRun, monkeypatch: pytest.MonkeyPatch, cropped: bool
-) -> None:
+def test_scalars_are_those_of_the_cpu(pipeline, stock: StockRun, cropped: bool) -> None:
     model, view = pipeline.model, load_scene(stock.config).train.cameras[0]
     rows = model.means[:, 2] > model.means[:, 2].median() if cropped else None
     values = torch.rand(model.num_points, 2)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend(reference).composite)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     _, expected = model._render_on_cpu(view, values, rows)
-    torch.testing.assert_close(model._scalars_by_gsplat(view, values, rows), expected, atol=1e-6, rtol=1e-4)
-    assert model._scalars_by_gsplat(view, values[:, :0], rows).shape == (35, 47, 0)
+    torch.testing.assert_close(model._composited(view, values, rows), expected, atol=1e-6, rtol=1e-4)
+    assert model._composited(view, values[:, :0], rows).shape == (35, 47, 0)
     nothing = torch.zeros(model.num_points, dtype=torch.bool)
-    assert not model._scalars_by_gsplat(view, values, nothing).any()
+    assert not model._composited(view, values, nothing).any()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -162,8 +156,6 @@ def test_without_a_question_only_the_relevancies_are_missing(pipeline) -> None:
 
 def _by_cuda(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the model take the way of CUDA: stock splatfacto, and gsplat for the scalars."""
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", TileBackend(reference).composite)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
     monkeypatch.setattr(type(pipeline.model), "on_cpu", False)
 
 
@@ -210,12 +202,8 @@ def test_an_overlay_costs_one_pass_of_scalars(pipeline, monkeypatch, on_cpu: boo
 
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)
-    ours = counted("scalars", TileBackend(reference).composite, lambda args: args[2].shape[1])
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", ours)
-    monkeypatch.setattr("normlift_ns.raster.gsplat.check", lambda job, pictures: None)
-    if on_cpu:
-        counting = counted("cpu", render, lambda args: args[2].shape[1])
-        monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.render", counting)
+    counting = counted("cpu" if on_cpu else "scalars", render, lambda args: args[2].shape[1])
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.model.render", counting)
     question = Question(("left",) * prompts, torch.eye(8)[:1].expand(prompts, 8))
     with splatfacto_on_cpu():
         stock = counted("stock", rasterization, lambda _: 0)
