@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -46,28 +46,9 @@ class QuickRun:
         """The encoder of texts; raises as `encoder_of`."""
         return encoder_of(self, self.device, texts_cache(self.folder))
 
-    def ask(
-        self,
-        texts: Sequence[str],
-        *,
-        negatives: Sequence[str] | None = None,
-        rule: Rule | Literal["auto"] = "auto",
-        threshold: float | None = None,
-        min_reliability: float = 0.0,
-        refined: bool = True,
-    ) -> QuickAnswer:
-        """Arguments and errors as in `LiftedRun.ask`."""
-        question = make_question(
-            self,
-            self.texts.rows,
-            texts,
-            negatives=negatives,
-            rule=rule,
-            threshold=threshold,
-            min_reliability=min_reliability,
-            refined=refined,
-        )
-        return answer(self.field, question)
+    def ask(self, texts: Sequence[str], **rules: Any) -> QuickAnswer:
+        """The answer to some texts; rules and errors are those of `make_question`."""
+        return answer(self.field, make_question(self, self.texts.rows, texts, **rules))
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,7 @@ def test_lines_become_lines_of_json(lifted):
     assert red["text"] == "red" and 0.005 < red["fraction"] < 0.1 and red["rule"] == "cosine"
     assert "no colour name" in wooden["error"]
     assert blue["threshold"] == 0.5
-    assert "1 lines could not be answered" in done.stderr
+    assert "1 of 3 lines could not be answered" in done.stderr
     whole = ask("--load-config", lifted, "--text", "red")
     assert f"{red['fraction']:.2%}" in whole.stdout
     assert ask("--load-config", lifted, "--stdin", "True", stdin="red\n").returncode == 0
@@ -133,7 +133,7 @@ def test_lines_are_answered_as_they_come(lifted, monkeypatch):
             yield text
 
     assert run is not None
-    with pytest.raises(InputError, match="1 lines"):
+    with pytest.raises(InputError, match="1 of 3 lines"):
         answer_lines(run, {}, lines())
 
 

@@ -121,6 +121,7 @@ def _take_places(temporary: Path, drafts: Sequence[Path], overwrite: bool, remov
         clean(folder)  # an older export that was never completed must not be completed after this one
         names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
         journal = write_journal(temporary, names | {"overwrite": overwrite})
+        _flush_names(temporary)
     for draft in drafts:
         if overwrite:
             os.replace(draft, folder / draft.name)
@@ -136,6 +137,7 @@ def _take_places(temporary: Path, drafts: Sequence[Path], overwrite: bool, remov
 def _replace_in_steps(draft: Path, path: Path) -> None:
     old, temporary = f"{path.name}.old", draft.parent
     write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
+    _flush_names(temporary)
     try:
         os.rename(path, temporary / old)
         os.rename(draft, path)

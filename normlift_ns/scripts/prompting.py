@@ -71,11 +71,12 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
     Raises:
         ValueError: some lines could not be answered; each of them was printed with its `error`.
     """
-    failed = 0
+    failed = asked = 0
     for line in sys.stdin.buffer if lines is None else lines:
         text = line.decode("utf8", "replace").strip()
         if text == "":
             continue
+        asked += 1
         try:
             found = run.ask([text], **rules)
             (row,) = found.summarize()
@@ -86,7 +87,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         sys.stdout.write(json.dumps(answered) + "\n")
         sys.stdout.flush()
     if failed > 0:
-        raise InputError(f"{failed} lines could not be answered; their `error` says why")
+        raise InputError(f"{failed} of {asked} lines could not be answered; their `error` says why")
 
 
 def show(rows: list[dict[str, Any]], question: Question) -> None:
