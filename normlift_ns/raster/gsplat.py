@@ -223,19 +223,22 @@ def composite(
 def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:
     """(first column, sums of A_ij by column) of 32 columns at once; column 0 holds the unlabelled pixels.
 
-    The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py).
+    The compiled functions are called as gsplat's own autograd function calls them (cuda/_wrapper.py). Its backward pass
+    starts from 1 - alpha, which has lost up to 3e-4 of a transmittance near 1e-4. All weights of a pixel are multiples
+    of it, so the true one, which is what a white background adds to a black scene, over that one mends them.
     """
     seen, settings = project_views(job, [camera]), job.settings
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)
-    drawing = (seen.means2d, seen.conics, colors, seen.opacities, None, None, camera.width, camera.height)
-    lists = (settings.tile_size, seen.offsets, seen.members)
+    splats = (seen.means2d, seen.conics, colors, seen.opacities)
+    lists = (None, camera.width, camera.height, settings.tile_size, seen.offsets, seen.members)
     forward, backward = compiled_rasterizer()
-    _, alphas, last = forward(*drawing, *lists)
+    transmittance, alphas, last = forward(*splats, colors.new_ones(1, _CHANNELS), *lists)
+    mended = transmittance[..., :1] / (1 - alphas)
     column = labels.long() + 1
     for first in range(0, count + 1, _CHANNELS):
         channels = torch.arange(first, first + _CHANNELS, device=column.device)
-        one_hot = (column[None, :, :, None] == channels).float()
-        gradients = backward(*drawing, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
+        one_hot = (column[None, :, :, None] == channels) * mended
+        gradients = backward(*splats, None, *lists, alphas, last, one_hot, torch.zeros_like(alphas), False)
         yield first, gradients[3][0]
 
 
