@@ -81,8 +81,9 @@ for kernel, signature in numba.kernel_signatures(torch.float32):
 
 def warming() -> dict[str, float]:
     """CPU seconds of a new process to import numba, and to load each kernel from the cache."""
-    for _ in range(2):  # the first one compiles what no cache holds
-        child = subprocess.run([sys.executable, "-c", WARM], capture_output=True, text=True, check=True)
+    _, child = (  # the first one compiles what no cache holds
+        subprocess.run([sys.executable, "-c", WARM], capture_output=True, text=True, check=True) for _ in range(2)
+    )
     first, *kernels = child.stdout.split("\n")[:-1]
     rows = [line.split() for line in kernels]
     if any(misses != "0" for _, _, misses in rows):
