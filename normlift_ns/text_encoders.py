@@ -75,7 +75,7 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
     """The encoder of texts that fits the field.
 
     Args:
-        device: where a network runs, as `choose_device` takes it.
+        device: where a network runs, as `choose_device` takes it; "auto": on the CPU where it is a plain text tower.
         cache: folder in which to keep vectors of texts that a network has read.
     Raises:
         ValueError: the manifest names none that this version knows, or other files of weights or text vectors are in
@@ -101,7 +101,13 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
 
     def network() -> Any:
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (needs torch)
-        from normlift_ns.encoders.build import make_texts  # noqa: PLC0415
+        from normlift_ns.encoders.clip.text_tower import load_text_tower  # noqa: PLC0415
+
+        there = "cpu" if device == "auto" else choose_device(device)  # a text takes less than waking a GPU
+        tower = load_text_tower(options.encoder_model, options.encoder_pretrained, options.text_template, there)
+        if tower is not None:
+            return tower
+        from normlift_ns.encoders.build import make_texts  # noqa: PLC0415 (imports open_clip)
 
         return make_texts(options, choose_device(device))
 

@@ -14,8 +14,10 @@ import urllib.error
 import urllib.request
 import zipfile
 import zlib
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError
 
@@ -64,6 +66,22 @@ def is_cached(repository: str, file: str) -> bool:
         return os.path.isfile(folder / "snapshots" / revision / file)
     except (OSError, ValueError):
         return False
+
+
+def hub_file(published: Mapping[str, Any], constants: Any) -> Path | None:
+    """The weights in the cache of the Hugging Face hub, looked for without the network.
+
+    Args:
+        published: what open_clip knows of a tag.
+        constants: the module of open_clip that names files.
+    """
+    hub = importlib.import_module("huggingface_hub")
+    repository, name = os.path.split(published.get("hf_hub", ""))
+    for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
+        found = hub.try_to_load_from_cache(repository, file) if repository else None
+        if isinstance(found, str):
+            return Path(found)
+    return None
 
 
 def _published(model: str, tag: str) -> str | None:

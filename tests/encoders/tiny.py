@@ -16,7 +16,7 @@ DEVICES = ["cpu", pytest.param("cuda", marks=needs_cuda)]
 
 CLIP = "normlift-tiny"
 """Name of the OpenCLIP architecture."""
-_CLIP_CONFIG = {
+CLIP_CONFIG = {
     "embed_dim": 24,
     "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
     "text_cfg": {"context_length": 77, "vocab_size": 49408, "width": 32, "heads": 2, "layers": 2},
@@ -77,7 +77,7 @@ def write_sam(path: Path, seed: int = 0, gain: float = 1.0) -> None:
 
 def write_clip(folder: Path, name: str = CLIP, dimension: int = 24) -> None:
     """Makes the architecture known to open_clip and writes tiny.pt and tiny.safetensors of the same 1.7 M weights."""
-    (folder / f"{name}.json").write_text(json.dumps({**_CLIP_CONFIG, "embed_dim": dimension}))
+    (folder / f"{name}.json").write_text(json.dumps({**CLIP_CONFIG, "embed_dim": dimension}))
     open_clip.add_model_config(folder / f"{name}.json")
     with torch.random.fork_rng():
         torch.manual_seed(0)

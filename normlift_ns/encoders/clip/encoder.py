@@ -19,12 +19,12 @@ from normlift_ns.core.disk.digests import file_digest
 from normlift_ns.encoders.batches import Batches
 from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
 from normlift_ns.encoders.clip.network import ClipNetwork, load_clip
+from normlift_ns.encoders.clip.text_tower import ENSEMBLE
 from normlift_ns.encoders.clip.weights import check_names, import_open_clip
 from normlift_ns.encoders.texts.prompts import check_prompts
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
 
-ENSEMBLE = "ensemble"
 _BATCH = {"cuda": 256, "cpu": 64}
 
 

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders.weights import first_line, probe
+from normlift_ns.encoders.weights import first_line, hub_file, probe
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
 
@@ -80,25 +80,14 @@ def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
         return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
     published = open_clip.get_pretrained_cfg(model, pretrained)
     try:
-        return _cached(published) or _download(published), published
+        constants = importlib.import_module("open_clip.constants")
+        return hub_file(published, constants) or _download(published), published
     except Exception as error:  # a download's client raises types of its own, which have nothing in common
         origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
         raise FileNotFoundError(
             f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are neither in the local cache nor can they "
             f"be downloaded ({first_line(error)}); go online once, {REMEDY}"
         ) from None
-
-
-def _cached(published: dict[str, Any]) -> Path | None:
-    """The file in the cache of the Hugging Face hub, looked for without the network."""
-    hub = importlib.import_module("huggingface_hub")
-    constants = importlib.import_module("open_clip.constants")
-    repository, name = os.path.split(published.get("hf_hub", ""))
-    for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
-        found = hub.try_to_load_from_cache(repository, file) if repository else None
-        if isinstance(found, str):
-            return Path(found)
-    return None
 
 
 def _download(published: dict[str, Any]) -> Path:

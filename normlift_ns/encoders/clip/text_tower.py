@@ -1,0 +1,183 @@
+"""The text tower of CLIP in plain torch, for a question that nobody has asked before.
+
+Importing open_clip takes ten seconds, of torchvision and transformers for the most part, and a text needs neither. Most
+of its architectures have one kind of text tower: a causal transformer over byte pairs, read at the end of the text.
+Those are computed here, from the same weights, with open_clip's own tokenizer; the others are left to open_clip.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from jaxtyping import Float32, Int64
+from safetensors import safe_open
+from torch import Tensor
+from torch.nn.functional import gelu, layer_norm, linear, normalize, scaled_dot_product_attention
+
+from normlift_ns.encoders.texts.prompts import check_prompts
+from normlift_ns.encoders.weights import FOREIGN_ERRORS, hub_file
+
+ENSEMBLE = "ensemble"
+_PLAIN = {"context_length", "vocab_size", "width", "heads", "layers"}
+"""What the configuration of a plain text tower says; any other key means another kind."""
+_PARTS = "_normlift_ns_open_clip"
+_BATCH = 64
+
+
+@dataclass(frozen=True)
+class TextTower:
+    """A text tower with its weights in float32; formulas as in open_clip's transformer.py."""
+
+    tokenizer: Callable[[Sequence[str]], Int64[Tensor, "b length"]]
+    templates: Sequence[Callable[[str], str]]
+    """What the network reads for a text; its vector is the mean of theirs."""
+    weights: Mapping[str, Float32[Tensor, ...]]
+    """By their names in the state of the model."""
+    heads: int
+    layers: int
+    quick_gelu: bool
+    device: str
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """One unit row per prompt, on the CPU.
+
+        Raises:
+            ValueError: no prompt, or an empty one.
+        """
+        check_prompts(prompts)
+        tokens = self.tokenizer([template(prompt) for prompt in prompts for template in self.templates])
+        rows = torch.cat([self._rows(part.to(self.device)) for part in tokens.split(_BATCH)])
+        return normalize(rows.unflatten(0, (len(prompts), len(self.templates))).mean(dim=1), dim=1).cpu()
+
+    @torch.no_grad()
+    def _rows(self, tokens: Int64[Tensor, "b length"]) -> Float32[Tensor, "b d"]:
+        end = tokens.argmax(dim=1)  # the end of a text has the largest number
+        tokens = tokens[:, : int(end.max()) + 1]  # nothing looks at what comes later
+        x = self.weights["token_embedding.weight"][tokens] + self.weights["positional_embedding"][: tokens.shape[1]]
+        for i in range(self.layers):
+            block = f"transformer.resblocks.{i}."
+            qkv = self._linear(self._norm(x, f"{block}ln_1"), f"{block}attn.in_proj_")
+            q, k, v = qkv.unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+            heard = scaled_dot_product_attention(q, k, v, is_causal=True)
+            x = x + self._linear(heard.transpose(1, 2).flatten(2), f"{block}attn.out_proj.")
+            hidden = self._linear(self._norm(x, f"{block}ln_2"), f"{block}mlp.c_fc.")
+            hidden = hidden * torch.sigmoid(1.702 * hidden) if self.quick_gelu else gelu(hidden)
+            x = x + self._linear(hidden, f"{block}mlp.c_proj.")
+        last = x[torch.arange(len(x), device=x.device), end]
+        return normalize(self._norm(last, "ln_final") @ self.weights["text_projection"], dim=1)
+
+    def _norm(self, x: Tensor, name: str) -> Tensor:
+        return layer_norm(x, x.shape[-1:], self.weights[f"{name}.weight"], self.weights[f"{name}.bias"])
+
+    def _linear(self, x: Tensor, name: str) -> Tensor:
+        return linear(x, self.weights[f"{name}weight"], self.weights[f"{name}bias"])
+
+
+def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
+    """The text tower of an OpenCLIP model; None where it is not of the plain kind, where its weights are not on this
+    machine, or where anything is not as expected: `OpenClipEncoder` knows what to do then, or says what is wrong.
+    """
+    try:
+        config = _config(model)
+        sizes = config["text_cfg"]
+        found = _weights_at_hand(model, pretrained)
+        if found is None or not set(sizes) <= _PLAIN or config.get("custom_text"):
+            return None
+        path, published = found
+        shapes = _shapes(config["embed_dim"], **sizes)
+        weights = _read(path, shapes)
+        if template == ENSEMBLE:
+            templates = open_clip_part("zero_shot_metadata").SIMPLE_IMAGENET_TEMPLATES
+        elif "{}" in template:
+            templates = [lambda text: template.replace("{}", text)]
+        else:
+            return None
+        tokenizer = open_clip_part("tokenizer").SimpleTokenizer(context_length=sizes["context_length"])
+    except FOREIGN_ERRORS:
+        return None
+    if {name: weight.shape for name, weight in weights.items()} != shapes:
+        return None
+    quick_gelu = config.get("quick_gelu", False) or published.get("quick_gelu", False)
+    weights = {name: weight.to(device, torch.float32) for name, weight in weights.items()}
+    return TextTower(tokenizer, templates, weights, sizes["heads"], sizes["layers"], quick_gelu, device)
+
+
+def open_clip_part(name: str) -> ModuleType:
+    """A module of open_clip without the rest of the package, unless that has been imported already.
+
+    Raises:
+        ImportError: open_clip, or this module of it, is not there, or needs the rest.
+    """
+    if "open_clip" in sys.modules:
+        return importlib.import_module(f"open_clip.{name}")
+    if _PARTS not in sys.modules:
+        package = ModuleType(_PARTS)
+        package.__path__ = [str(_folder())]
+        sys.modules[_PARTS] = package
+    return importlib.import_module(f"{_PARTS}.{name}")
+
+
+def _folder() -> Path:
+    spec = find_spec("open_clip")
+    if spec is None or spec.origin is None:
+        raise ImportError("open_clip is not installed")
+    return Path(spec.origin).parent
+
+
+def _config(model: str) -> dict[str, Any]:
+    """The architecture; an error of `FOREIGN_ERRORS` where open_clip does not know it."""
+    if "open_clip" in sys.modules:  # to which people may have added their own
+        return importlib.import_module("open_clip").get_model_config(model)
+    return json.loads((_folder() / "model_configs" / f"{os.path.basename(model)}.json").read_text("utf8"))
+
+
+def _weights_at_hand(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:
+    """The weight file, and what open_clip knows of its training; None where it is not on this machine."""
+    if os.path.isfile(pretrained):
+        return Path(pretrained), {}
+    published = open_clip_part("pretrained").get_pretrained_cfg(model, pretrained)
+    path = hub_file(published, open_clip_part("constants")) if published else None
+    return None if path is None else (path, published)
+
+
+def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Some tensors of a weight file; what else it holds is not read. Errors are those of `FOREIGN_ERRORS`."""
+    if path.suffix == ".safetensors":
+        with safe_open(path, "pt") as file:
+            return {name: file.get_tensor(name) for name in names}
+    state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    state = state.get("state_dict", state)
+    prefix = "module." if next(iter(state)).startswith("module.") else ""
+    return {name: state[prefix + name] for name in names}
+
+
+def _shapes(
+    embed_dim: int, context_length: int, vocab_size: int, width: int, heads: int, layers: int
+) -> dict[str, tuple[int, ...]]:
+    """Every weight of a plain text tower."""
+    block = {
+        "ln_1.weight": (width,), "ln_1.bias": (width,), "ln_2.weight": (width,), "ln_2.bias": (width,),
+        "attn.in_proj_weight": (3 * width, width), "attn.in_proj_bias": (3 * width,),
+        "attn.out_proj.weight": (width, width), "attn.out_proj.bias": (width,),
+        "mlp.c_fc.weight": (4 * width, width), "mlp.c_fc.bias": (4 * width,),
+        "mlp.c_proj.weight": (width, 4 * width), "mlp.c_proj.bias": (width,),
+    }  # fmt: skip
+    blocks = {f"transformer.resblocks.{i}.{name}": shape for i in range(layers) for name, shape in block.items()}
+    whole = {
+        "token_embedding.weight": (vocab_size, width),
+        "positional_embedding": (context_length, width),
+        "ln_final.weight": (width,),
+        "ln_final.bias": (width,),
+        "text_projection": (width, embed_dim),
+    }
+    return {**whole, **blocks}

@@ -1,0 +1,129 @@
+"""The text tower in plain torch against that of open_clip, with the same weights."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import open_clip
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from normlift_ns.encoders.clip import text_tower
+from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.text_tower import load_text_tower
+from normlift_ns.options import SourceOptions
+from normlift_ns.text_encoders import encoder_of, encoder_settings
+from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES, write_clip
+
+TEXTS = ["fox", "a red fox that sleeps under a very old tree", "ÄÖ 狐 🦊", "word " * 200, "it's 12,5 %"]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("weights")
+    write_clip(folder)
+    return folder
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("template", ["{}", "a photo of a {}", "ensemble"])
+@pytest.mark.parametrize("file", ["tiny.pt", "tiny.safetensors"])
+def test_vectors_are_those_of_open_clip(weights, file, template, device):
+    path = str(weights / file)
+    tower = load_text_tower(CLIP, path, template, device)
+    assert tower is not None
+    found, expected = tower.text(TEXTS), OpenClipEncoder(CLIP, path, template=template).text(TEXTS)
+    assert found.shape == expected.shape == (len(TEXTS), 24)
+    assert found.device.type == "cpu"
+    assert (found - expected).abs().max() < 2e-6
+    assert (found[0] - found[1]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_both_activations_agree_with_open_clip_in_float64(tmp_path, quick):
+    name = f"normlift-quick-{quick}"
+    config = {**CLIP_CONFIG, "quick_gelu": quick}
+    (tmp_path / f"{name}.json").write_text(json.dumps(config))
+    open_clip.add_model_config(tmp_path)
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(0)
+        model: Any = open_clip.create_model(name, pretrained_hf=False).eval()
+        model.text_projection.normal_()
+        model.token_embedding.weight.mul_(30)  # so that the activation matters
+        save_file(model.state_dict(), tmp_path / "weights.safetensors")
+        rows = model.double().encode_text(open_clip.get_tokenizer(name)(TEXTS))
+    expected = torch.nn.functional.normalize(rows, dim=1)
+    tower = load_text_tower(name, str(tmp_path / "weights.safetensors"), "{}")
+    assert tower is not None
+    assert tower.quick_gelu == quick
+    assert (tower.text(TEXTS).double() - expected).abs().max() < 2e-6
+    assert (replace(tower, quick_gelu=not quick).text(TEXTS).double() - expected).abs().max() > 1e-4
+
+
+def test_half_precision_wrapped_and_prefixed_weights_are_read(weights, tmp_path):
+    state = load_file(weights / "tiny.safetensors")
+    torch.save({"state_dict": {f"module.{k}": v.half() for k, v in state.items()}}, tmp_path / "wrapped.pt")
+    tower = load_text_tower(CLIP, str(tmp_path / "wrapped.pt"), "{}")
+    assert tower is not None
+    expected = OpenClipEncoder(CLIP, str(weights / "tiny.pt")).text(TEXTS)
+    assert 0 < (tower.text(TEXTS) - expected).abs().max() < 0.01
+
+
+def test_what_is_not_plain_is_left_to_open_clip(weights, tmp_path):
+    path = str(weights / "tiny.pt")
+    assert load_text_tower("roberta-ViT-B-32", path, "{}") is None
+    assert load_text_tower("coca_ViT-B-32", path, "{}") is None
+    assert load_text_tower("ViT-B-16-SigLIP", path, "{}") is None
+    assert load_text_tower("no-such-model", path, "{}") is None
+    assert load_text_tower(CLIP, "no-such-tag", "{}") is None
+    assert load_text_tower(CLIP, path, "no place") is None
+    assert load_text_tower("ViT-B-32", path, "{}") is None  # of other shapes
+    state = load_file(weights / "tiny.safetensors")
+    del state["ln_final.bias"]
+    save_file(state, tmp_path / "incomplete.safetensors")
+    (tmp_path / "text.pt").write_text("no weights")
+    (tmp_path / "empty.safetensors").write_bytes(b"")
+    torch.save([1, 2], tmp_path / "list.pt")
+    for name in ("incomplete.safetensors", "text.pt", "empty.safetensors", "list.pt"):
+        assert load_text_tower(CLIP, str(tmp_path / name), "{}") is None
+
+
+def test_a_text_that_is_new_imports_neither_torchvision_nor_transformers(tmp_path):
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(1)
+        model = open_clip.create_model("ViT-S-32", pretrained_hf=False)
+        save_file(model.state_dict(), tmp_path / "weights.safetensors")
+        expected = OpenClipEncoder("ViT-S-32", str(tmp_path / "weights.safetensors")).text(["fox", "tree"])
+    program = """
+import json, sys
+from pathlib import Path
+from normlift_ns.encoders.clip.text_tower import load_text_tower
+tower = load_text_tower("ViT-S-32", sys.argv[1], "{}")
+rows = tower.text(["fox", "tree"]).tolist()
+heavy = [name for name in ("open_clip", "torchvision", "transformers", "timm", "nerfstudio") if name in sys.modules]
+import open_clip  # the whole of it still works
+print(json.dumps([rows, heavy, open_clip.get_model_config("ViT-S-32")["embed_dim"]]))
+"""
+    child = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program, str(tmp_path / "weights.safetensors")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    rows, heavy, dimension = json.loads(child.stdout)
+    assert heavy == []
+    assert (torch.tensor(rows) - expected).abs().max() < 2e-6
+    assert dimension == expected.shape[1]
+
+
+def test_a_question_takes_the_tower_and_open_clip_where_there_is_none(weights, monkeypatch):
+    options = SourceOptions(encoder_model=CLIP, encoder_pretrained=str(weights / "tiny.pt"))
+    field: Any = SimpleNamespace(manifest={"encoder": encoder_settings(options)})
+    made = []
+    real = text_tower.load_text_tower
+    monkeypatch.setattr(text_tower, "load_text_tower", lambda *a: made.append(real(*a)) or made[-1])
+    found = encoder_of(field, "auto").text(["fox"])
+    assert isinstance(made[0], text_tower.TextTower)
+    monkeypatch.setattr(text_tower, "load_text_tower", lambda *a: None)
+    assert (found - encoder_of(field, "cpu").text(["fox"])).abs().max() < 2e-6
