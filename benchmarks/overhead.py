@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ from rich.table import Table
 from benchmarks.report import RESULTS, Report
 
 HERE = Path(__file__).parents[1]
+ON_CPU = {"CUDA_VISIBLE_DEVICES": "", "PYTHONWARNINGS": "ignore"}
 SOURCE = ("--encoder", "colour", "--device", "cpu")
 
 
@@ -41,10 +43,21 @@ class Cost(NamedTuple):
     """Seconds of all threads, in user and kernel mode."""
 
 
-def run(checkout: Path, command: str, *flags: object) -> Cost:
-    """One command of the version in a checkout, in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(checkout), "CUDA_VISIBLE_DEVICES": "", "PYTHONWARNINGS": "ignore"}
-    program = f"from normlift_ns.scripts.{command} import entrypoint; entrypoint()"
+def run(
+    checkout: Path,
+    command: str,
+    *flags: object,
+    program: str | None = None,
+    environment: Mapping[str, str] = {"PYTHONWARNINGS": "ignore"},
+) -> Cost:
+    """One command of the version in a checkout, in a process of its own.
+
+    Args:
+        program: Python that runs the command; None: its entry point.
+        environment: what is added to that of this process.
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), *_paths()]), **environment}
+    program = program or f"from normlift_ns.scripts.{command} import entrypoint; entrypoint()"
     words = [sys.executable, "-P", "-c", program] if sys.version_info >= (3, 11) else [sys.executable, "-c", program]
     with tempfile.TemporaryFile() as log:
         start = time.perf_counter()
@@ -58,6 +71,11 @@ def run(checkout: Path, command: str, *flags: object) -> Cost:
             log.seek(0)
             sys.exit(f"{checkout}: {command} {' '.join(map(str, flags))}\n{log.read().decode()[-3000:]}")
     return Cost(wall, usage.ru_utime + usage.ru_stime)
+
+
+def _paths() -> list[str]:
+    """Folders of packages that PYTHONPATH names, but for this checkout."""
+    return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and Path(path) != HERE]
 
 
 def in_turns(checkouts: dict[str, Path], repeats: int, action) -> dict[str, list[Cost]]:
@@ -99,11 +117,13 @@ def main(before: Path, config: Path | None, repeats: int, gaussians: int, output
             shutil.rmtree(target, ignore_errors=True)
             check = ("--check", False) if name == "now" else ()
             flags = ("--load-config", trained, *SOURCE, "--output-dir", target, "--timestamp", "run", *check)
-            return run(checkout, "lift", *flags)
+            return run(checkout, "lift", *flags, environment=ON_CPU)
 
         def query(name: str, checkout: Path) -> Cost:
             (lifted,) = (folder / name).glob("*/normlift/run/config.yml")
-            return run(checkout, "query", "--load-config", lifted, "--text", "red", "--device", "cpu")
+            return run(
+                checkout, "query", "--load-config", lifted, "--text", "red", "--device", "cpu", environment=ON_CPU
+            )
 
         for what, action in (("lift", lift), ("query", query)):
             found = in_turns(checkouts, repeats, action)

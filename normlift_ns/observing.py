@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from hashlib import blake2b
 from pathlib import Path
@@ -26,6 +27,8 @@ from normlift_ns.raster.settings import RasterSettings
 
 BLOCK = 16
 """Views per file of evidence: what an interrupted run may lose."""
+_READERS = 8
+"""Photographs that are read at a time."""
 _SMALLEST = 8
 """Pixels along a side of an image made smaller; fewer show nothing."""
 _KEY = "normlift_ns.block/4"
@@ -76,8 +79,7 @@ def observe_views(
     waiting: deque[View] = deque()
 
     def images() -> Iterator[tuple[Tensor, str]]:
-        for index in indices:
-            view = scene.train[index]
+        for view in _read_ahead(scene.train.__getitem__, indices):
             view = view._replace(image=render_picture(scene, view.camera)) if rendered else view
             _check_sizes(view)
             waiting.append(_smaller(view, divisor) if divisor > 1 else view)
@@ -98,6 +100,20 @@ def observe_views(
         block.features.append(found.features)
         done(view)
     return block
+
+
+def _read_ahead(read: Callable[[int], View], indices: Sequence[int]) -> Iterator[View]:
+    """The views in their order; while one is looked at, or a network loads, threads read the next ones."""
+    with ThreadPoolExecutor(_READERS, "photographs") as readers:
+        reading = deque(readers.submit(read, index) for index in indices[:_READERS])
+        try:
+            for index in [*indices[_READERS:], *[None] * len(reading)]:
+                view = reading.popleft().result()
+                if index is not None:
+                    reading.append(readers.submit(read, index))
+                yield view
+        finally:
+            readers.shutdown(cancel_futures=True)
 
 
 def _check_sizes(view: View) -> None:
