@@ -1,12 +1,12 @@
 """What a person waits for: whole commands in processes of their own, from a cold shell.
 
-    python -m benchmarks.command             questions and help, CPU seconds (5 runs each), and lifts
-    python -m benchmarks.command --quick     3 runs each
+    python -m benchmarks.command             questions and help, CPU seconds (5 runs each); on a machine with a GPU lifts
+    python -m benchmarks.command --quick     fewer runs
     python -m benchmarks.command --config outputs/.../config.yml      a run of your own in place of the fox
 
-CLIP is ViT-B-16 with random weights, which take as long as trained ones. Where there is a GPU, lifts of patches are
-timed too: a first one with empty caches of kernels, first ones with those filled (median of 3), and ones with every
-stage cached (median of 3). The error of a new text is that of its vector against open_clip in float64.
+CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts are of patches: a first one with empty
+caches of kernels, first ones with those filled (median of 3), and ones with every stage cached (median of 3). The error
+of a new text is that of its vector against open_clip in float64. What the file holds of the other kind of machine stays.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ import torch
 
 from benchmarks.captures import SHARED
 from benchmarks.overhead import HERE, run, spread
-from benchmarks.report import RESULTS, Report
+from benchmarks.report import RESULTS, Metric, Report, hardware
 from normlift_ns.core.disk.arrays import load_arrays
 
 FOX = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
@@ -61,19 +63,25 @@ def lifted(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, 
     """Lifts into folder/NAME, kernels cached in folder/kernels; seconds of every stage, and `wall` of the process."""
     seconds, kernels = folder / "seconds.json", folder / "kernels"
     environment = {"SECONDS_FILE": str(seconds), "TRITON_CACHE_DIR": f"{kernels}/t", "NUMBA_CACHE_DIR": f"{kernels}/n"}
-    given = ("--load-config", trained, "--output-dir", folder / name, "--overwrite", *flags)
+    given = ("--load-config", trained, "--output-dir", folder / name, *flags)
     cost = run(HERE, "lift", *given, program=LIFT, environment=environment)
-    return {**json.loads(seconds.read_text()), "wall": cost.wall}
+    taken = {**json.loads(seconds.read_text()), "wall": cost.wall}
+    print(name, *(f"{stage} {value:.2f}" for stage, value in taken.items()), flush=True)
+    return taken
+
+
+def make_weights(folder: Path, texts: Sequence[str]) -> tuple[object, ...]:
+    """Weights of a CLIP model, and rows.pt with the vectors of some texts in float64; the flags that name the model."""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", WEIGHTS, MODEL, str(folder), *texts], check=True)
+    return ("--encoder-model", MODEL, "--encoder-pretrained", folder / "weights.safetensors")
 
 
 def add_questions(report: Report, trained: Path, folder: Path, repeats: int) -> None:
     texts = [f"a thing of kind {i}" for i in range(repeats)]
-    subprocess.run([sys.executable, "-W", "ignore", "-c", WEIGHTS, MODEL, str(folder), *texts], check=True)
+    clip = make_weights(folder, texts)
     exact = torch.load(folder / "rows.pt", weights_only=True).numpy()
-    clip = ("--encoder-model", MODEL, "--encoder-pretrained", folder / "weights.safetensors")
-    few = ("--regions", "grid", "--region-count", 4, *clip) if not torch.cuda.is_available() else clip
     lifted(trained, folder, "colour", "--encoder", "colour", "--timestamp", "run")
-    lifted(trained, folder, "clip", *few, "--timestamp", "run")
+    lifted(trained, folder, "clip", "--regions", "grid", "--region-count", 4, *clip, "--timestamp", "run")
     runs = {name: next((folder / name).glob("*/normlift/run/config.yml")) for name in ("colour", "clip")}
 
     def ask(name: str, text: str) -> float:
@@ -97,11 +105,11 @@ def add_questions(report: Report, trained: Path, folder: Path, repeats: int) -> 
         report.add(f"{name}_cpu_s_spread", spread(seconds), "s, half of the distance between the quartiles")
 
 
-def add_lifts(report: Report, trained: Path, folder: Path) -> None:
-    clip = ("--regions", "patches", "--encoder-model", MODEL, "--encoder-pretrained", folder / "weights.safetensors")
-    cold = lifted(trained, folder, "cold", *clip)
-    first = [lifted(trained, folder, f"first{i}", *clip) for i in range(3)]
-    cached = [lifted(trained, folder, "cold", *clip) for _ in range(3)]
+def add_lifts(report: Report, trained: Path, folder: Path, repeats: int) -> None:
+    flags = ("--regions", "patches", *make_weights(folder, ["fox"]))
+    cold = lifted(trained, folder, "cold", *flags)
+    first = [lifted(trained, folder, f"first{i}", *flags) for i in range(repeats)]
+    cached = [lifted(trained, folder, "cold", *flags) for _ in range(repeats)]
 
     def add(name: str, seconds: list[float]) -> None:
         report.add(name, statistics.median(seconds), f"s, {min(seconds):.4g} to {max(seconds):.4g}")
@@ -120,19 +128,30 @@ def add_lifts(report: Report, trained: Path, folder: Path) -> None:
             add(f"{kind}.{stage}_s", [taken[stage] for taken in group])
 
 
-def main(trained: Path, repeats: int, output: Path) -> None:
-    report = Report("command_gpu" if torch.cuda.is_available() else "command")
+def joined(report: Report, file: Path) -> Report:
+    """The report, every unit with its machine, and what a file of it holds besides."""
+    here = [replace(metric, unit=f"{metric.unit}; {hardware()}") for metric in report.metrics]
+    before = [Metric(**row) for row in json.loads(file.read_text())["metrics"]] if file.is_file() else []
+    keys = {metric.key for metric in here}
+    return replace(
+        report, metrics=sorted([*here, *(row for row in before if row.key not in keys)], key=lambda m: m.key)
+    )
+
+
+def main(trained: Path, quick: bool, output: Path) -> None:
+    report = Report("command")
     with tempfile.TemporaryDirectory() as name:
-        add_questions(report, trained.absolute(), Path(name), repeats)
         if torch.cuda.is_available():
-            add_lifts(report, trained.absolute(), Path(name))
-    report.write(output)
+            add_lifts(report, trained.absolute(), Path(name), 2 if quick else 3)
+        else:
+            add_questions(report, trained.absolute(), Path(name), 3 if quick else 5)
+    joined(report, output / "command.json").write(output)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=Path, default=FOX, help="config.yml of a trained run; by default the fox")
-    parser.add_argument("--quick", action="store_true", help="3 runs each")
+    parser.add_argument("--quick", action="store_true", help="fewer runs")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
-    main(arguments.config, 3 if arguments.quick else 5, arguments.output)
+    main(arguments.config, arguments.quick, arguments.output)

@@ -79,8 +79,8 @@ def observe_views(
     waiting: deque[View] = deque()
 
     def images() -> Iterator[tuple[Tensor, str]]:
-        for view in _read_ahead(scene.train.__getitem__, indices):
-            view = view._replace(image=render_picture(scene, view.camera)) if rendered else view
+        for read in _read_ahead(scene.train.__getitem__, indices):
+            view = read._replace(image=render_picture(scene, read.camera)) if rendered else read
             _check_sizes(view)
             waiting.append(_smaller(view, divisor) if divisor > 1 else view)
             check_undistorted(source, view, waiting[-1])

@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import torch
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
@@ -17,10 +17,11 @@ from torch.nn.functional import normalize
 
 from normlift_ns.core.disk.digests import file_digest
 from normlift_ns.encoders.batches import Batches
+from normlift_ns.encoders.clip.architectures import model_config, open_clip_part
 from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
 from normlift_ns.encoders.clip.network import ClipNetwork, load_clip
 from normlift_ns.encoders.clip.text_tower import ENSEMBLE
-from normlift_ns.encoders.clip.weights import check_names, import_open_clip
+from normlift_ns.encoders.clip.weights import check_names
 from normlift_ns.encoders.texts.prompts import check_prompts
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
@@ -97,7 +98,7 @@ class OpenClipEncoder:
 
         for number, rows in enumerate(self._crops.across(encode, crops())):
             del seen[number]
-            none = torch.empty(0, import_open_clip().get_model_config(self.model)["embed_dim"])
+            none = torch.empty(0, cast(Any, model_config(self.model))["embed_dim"])
             yield torch.stack(rows) if len(rows) > 0 else none
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -145,5 +146,5 @@ class _Seen(NamedTuple):
 
 def _templates(template: str) -> Sequence[Callable[[str], str]]:
     if template == ENSEMBLE:
-        return import_open_clip().SIMPLE_IMAGENET_TEMPLATES
+        return open_clip_part("zero_shot_metadata").SIMPLE_IMAGENET_TEMPLATES
     return [lambda text: template.replace("{}", text)]

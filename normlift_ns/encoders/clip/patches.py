@@ -21,8 +21,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate, linear, normalize
 
 from normlift_ns.encoders.batches import Batches
+from normlift_ns.encoders.clip.architectures import model_config
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.weights import import_open_clip
 from normlift_ns.encoders.regions import resample_nearest
 from normlift_ns.encoders.source import ViewFeatures, check_image
 from normlift_ns.errors import InputError
@@ -31,7 +31,7 @@ from normlift_ns.options import DEFAULT_MODEL
 
 def why_not_dense(model: str) -> str | None:
     """Why an OpenCLIP architecture has no value path to follow; None if it has one."""
-    vision = import_open_clip().get_model_config(model)["vision_cfg"]
+    vision = (model_config(model) or {"vision_cfg": {}})["vision_cfg"]
     if "timm_model_name" in vision:
         return "its image encoder is timm's"
     if not isinstance(vision.get("layers"), int):

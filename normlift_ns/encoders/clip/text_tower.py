@@ -1,21 +1,16 @@
 """The text tower of CLIP in plain torch, for a question that nobody has asked before.
 
-Importing open_clip takes ten seconds, of torchvision and transformers for the most part, and a text needs neither. Most
-of its architectures have one kind of text tower: a causal transformer over byte pairs, read at the end of the text.
-Those are computed here, from the same weights, with open_clip's own tokenizer; the others are left to open_clip.
+Most architectures of open_clip have one kind of text tower: a causal transformer over byte pairs, read at the end of
+the text. Those are computed here, from the same weights, with open_clip's own tokenizer, so that nobody waits for the
+rest of it; other kinds are left to open_clip.
 """
 
 from __future__ import annotations
 
-import importlib
-import json
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -24,13 +19,13 @@ from safetensors import safe_open
 from torch import Tensor
 from torch.nn.functional import gelu, layer_norm, linear, normalize, scaled_dot_product_attention
 
+from normlift_ns.encoders.clip.architectures import model_config, open_clip_part
 from normlift_ns.encoders.texts.prompts import check_prompts
 from normlift_ns.encoders.weights import FOREIGN_ERRORS, hub_file
 
 ENSEMBLE = "ensemble"
 _PLAIN = {"context_length", "vocab_size", "width", "heads", "layers"}
 """What the configuration of a plain text tower says; any other key means another kind."""
-_PARTS = "_normlift_ns_open_clip"
 _BATCH = 64
 
 
@@ -88,7 +83,7 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     machine, or where anything is not as expected: `OpenClipEncoder` knows what to do then, or says what is wrong.
     """
     try:
-        config = _config(model)
+        config = model_config(model) or {}
         sizes = config["text_cfg"]
         found = _weights_at_hand(model, pretrained)
         if found is None or not set(sizes) <= _PLAIN or config.get("custom_text"):
@@ -110,35 +105,6 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     quick_gelu = config.get("quick_gelu", False) or published.get("quick_gelu", False)
     weights = {name: weight.to(device, torch.float32) for name, weight in weights.items()}
     return TextTower(tokenizer, templates, weights, sizes["heads"], sizes["layers"], quick_gelu, device)
-
-
-def open_clip_part(name: str) -> ModuleType:
-    """A module of open_clip without the rest of the package, unless that has been imported already.
-
-    Raises:
-        ImportError: open_clip, or this module of it, is not there, or needs the rest.
-    """
-    if "open_clip" in sys.modules:
-        return importlib.import_module(f"open_clip.{name}")
-    if _PARTS not in sys.modules:
-        package = ModuleType(_PARTS)
-        package.__path__ = [str(_folder())]
-        sys.modules[_PARTS] = package
-    return importlib.import_module(f"{_PARTS}.{name}")
-
-
-def _folder() -> Path:
-    spec = find_spec("open_clip")
-    if spec is None or spec.origin is None:
-        raise ImportError("open_clip is not installed")
-    return Path(spec.origin).parent
-
-
-def _config(model: str) -> dict[str, Any]:
-    """The architecture; an error of `FOREIGN_ERRORS` where open_clip does not know it."""
-    if "open_clip" in sys.modules:  # to which people may have added their own
-        return importlib.import_module("open_clip").get_model_config(model)
-    return json.loads((_folder() / "model_configs" / f"{os.path.basename(model)}.json").read_text("utf8"))
 
 
 def _weights_at_hand(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:

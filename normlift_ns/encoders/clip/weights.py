@@ -9,6 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from normlift_ns.encoders.clip.architectures import model_config, model_names, open_clip_part
 from normlift_ns.encoders.weights import first_line, hub_file, probe
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL
@@ -36,30 +37,29 @@ def check_names(model: str, pretrained: str) -> None:
             not know.
         FileNotFoundError: what looks like a weight file does not exist.
     """
-    open_clip = import_open_clip()
-    if open_clip.get_model_config(model) is None:
-        near = ", ".join(difflib.get_close_matches(model, open_clip.list_models()) or [DEFAULT_MODEL])
+    config, tags = model_config(model), open_clip_part("pretrained")
+    if config is None:
+        near = ", ".join(difflib.get_close_matches(model, model_names()) or [DEFAULT_MODEL])
         raise InputError(
             f"unknown OpenCLIP model {model!r} (--encoder-model); near names: {near}. All of them: "
             'python -c "import open_clip; print(open_clip.list_models())"'
         )
-    tower = open_clip.get_model_config(model)["vision_cfg"].get("timm_model_name")
-    timm = importlib.import_module("timm")
-    if tower is not None and not timm.is_model(tower):
+    tower = config["vision_cfg"].get("timm_model_name")
+    if tower is not None and not (timm := importlib.import_module("timm")).is_model(tower):
         raise InputError(
             f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
             f"{timm.__version__} does not have (nerfstudio pins an old one); take a model that open_clip builds "
             f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or another timm at your own risk"
         )
     path = Path(pretrained)
-    if os.path.isfile(path) or open_clip.is_pretrained_cfg(model, pretrained):
+    if os.path.isfile(path) or tags.is_pretrained_cfg(model, pretrained):
         return
     if os.path.lexists(path):
         raise InputError(f"{pretrained} is no weight file of an OpenCLIP model (--encoder-pretrained); {REMEDY}")
     if path.suffix in _SUFFIXES or len(path.parts) > 1:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {REMEDY}")
-    tags = ", ".join(open_clip.list_pretrained_tags_by_model(model)) or "none"
-    raise InputError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; known: {tags}. Otherwise {REMEDY}")
+    known = ", ".join(tags.list_pretrained_tags_by_model(model)) or "none"
+    raise InputError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; known: {known}. Otherwise {REMEDY}")
 
 
 def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
@@ -72,16 +72,14 @@ def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
     Raises:
         FileNotFoundError: the weights are not in the local cache and cannot be downloaded.
     """
-    open_clip = import_open_clip()
-    local = Path(pretrained)
+    known, local = open_clip_part("pretrained"), Path(pretrained)
     if os.path.isfile(local):
-        tags = open_clip.list_pretrained_tags_by_model(model)
-        published = open_clip.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
+        tags = known.list_pretrained_tags_by_model(model)
+        published = known.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
         return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
-    published = open_clip.get_pretrained_cfg(model, pretrained)
+    published = known.get_pretrained_cfg(model, pretrained)
     try:
-        constants = importlib.import_module("open_clip.constants")
-        return hub_file(published, constants) or _download(published), published
+        return hub_file(published, open_clip_part("constants")) or _download(published), published
     except Exception as error:  # a download's client raises types of its own, which have nothing in common
         origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
         raise FileNotFoundError(
@@ -93,4 +91,4 @@ def find_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
 def _download(published: dict[str, Any]) -> Path:
     if published.get("hf_hub"):
         probe(importlib.import_module("huggingface_hub").constants.ENDPOINT)
-    return Path(import_open_clip().download_pretrained(published))
+    return Path(open_clip_part("pretrained").download_pretrained(published))

@@ -29,9 +29,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
-from matplotlib.colors import XKCD_COLORS, to_rgb
-from scipy.linalg import solve_triangular
-from skimage.color import rgb2lab
 
 from normlift_ns.encoders.texts.prompts import check_prompts
 from normlift_ns.errors import InputError
@@ -87,6 +84,8 @@ def refuse_template(template: str) -> None:
 
 def embed(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"]:
     """phi of CIELAB colours (D65, L* in 0..100): unit rows."""
+    from scipy.linalg import solve_triangular  # noqa: PLC0415 (as in `_names`)
+
     anchors, cholesky = _anchors()
     kernel = _kernel(anchors, shading_coordinates(lab))
     return _normalized(solve_triangular(cholesky, kernel, lower=True).T)
@@ -140,6 +139,9 @@ def _words(text: str) -> list[str]:
 def _names() -> dict[str, np.ndarray]:
     """CIELAB colour of every name. The survey has eleven names twice, as "blue green" and "blue/green": the former
     counts."""
+    from matplotlib.colors import XKCD_COLORS, to_rgb  # noqa: PLC0415 (what other encoders do without is not loaded)
+    from skimage.color import rgb2lab  # noqa: PLC0415
+
     colours = sorted(XKCD_COLORS.items(), key=lambda item: "/" in item[0], reverse=True)
     names = [" ".join(_words(name.removeprefix("xkcd:"))) for name, _ in colours]
     lab = rgb2lab(np.array([to_rgb(colour) for _, colour in colours]))
@@ -153,6 +155,8 @@ def _longest_name() -> int:
 
 @cache
 def _anchors() -> tuple[np.ndarray, np.ndarray]:
+    from skimage.color import rgb2lab  # noqa: PLC0415 (as in `_names`)
+
     level = np.linspace(0, 1, _LEVELS) ** _LEVEL_POWER
     lattice = np.stack(np.meshgrid(level, level, level, indexing="ij"), axis=-1).reshape(-1, 3)
     anchors = shading_coordinates(rgb2lab(lattice))
