@@ -104,7 +104,7 @@ def _vote(
             undecided = certain == 0
             if certain:
                 tl.store(source + i, _winner(score, member, slot, there, i, delta).to(tl.int32))
-        if FINISH:
+        if FINISH:  # noqa: SIM102 (known when the kernel is compiled, unlike the other)
             if undecided:
                 if HALVES:
                     cross = tl.zeros([GROUP, GROUP], tl.float32)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from normlift_ns import Neighbors, RefineConfig, nearest_neighbors, refine
+from normlift_ns import Neighbors, RefineConfig, nearest_neighbors, refine, unsupported
 from normlift_ns.core.refine import decay_width, spatial_order, voting_weights
 from normlift_ns.kernels.vote import any_reliable, halve, members, vote
 from tests.scenes import generator, unit_rows
@@ -156,17 +156,31 @@ def test_members_and_their_reliability(n, k):
     assert members(voters.to(DEVICE), index.to(DEVICE)).tolist() == sorted(held)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_refine_on_a_gpu_gives_one_answer_however_it_is_given():
-    means, directions, reliability = (x.cuda() for x in close_calls(3, 5000, 512, 0.3))
-    config = RefineConfig()
-    neighbors = nearest_neighbors(means, config.k)
-    whole = refine(means, directions, reliability, config, neighbors=neighbors)
-    by_block = refine(means, lambda rows: directions[rows], reliability, config, neighbors=neighbors)
-    exact = refine(means, directions.double(), reliability.double(), config, neighbors=neighbors)
-    assert torch.equal(whole, by_block)
-    assert torch.equal(whole, refine(means, directions, reliability, config, neighbors=neighbors))
-    assert (directions[whole.long()] - directions[exact.long()]).norm(dim=1).gt(1e-3).float().mean() < 1e-3
+def test_refine_with_kernels_gives_one_answer_however_directions_are_given(monkeypatch):
+    """The route of a GPU, here also through Triton's interpreter."""
+    monkeypatch.setattr("normlift_ns.core.refine.kernels_apply", lambda tensor: True)
+    monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (17, 17))
+    means, directions, reliability = (x.to(DEVICE) for x in close_calls(3, 60, 70, 0.3))
+    means[50:] += 100
+    reliability[50:] = 0
+    config, told = RefineConfig(k=9), []
+    neighbors = nearest_neighbors(means.cpu(), 18)
+    wide = Neighbors(neighbors.index.to(DEVICE), neighbors.distance.to(DEVICE), neighbors.spacing.to(DEVICE))
+    near = Neighbors(wide.index[:, :9], wide.distance[:, :9], wide.spacing)  # views: every other part of the memory
+    whole = refine(means, directions, reliability, config, neighbors=near)
+    read = refine(
+        means, lambda rows: directions[rows], reliability, config, neighbors=near, progress=lambda *x: told.append(x)
+    )
+    exact = refine(means, directions.double(), reliability.double(), config, neighbors=near)
+    assert torch.equal(whole, read)
+    assert torch.equal(whole, exact)
+    assert 10 < int((whole != torch.arange(60, device=DEVICE)).sum()) < 50
+    assert told == [(27, 60), (44, 60), (60, 60)]
+    half = refine(means, directions.half(), reliability, config, neighbors=near)
+    rounded = refine(means, directions.half().double(), reliability, config, neighbors=near)
+    assert torch.equal(half, rounded)
+    lost = unsupported(near, reliability)
+    assert lost.tolist() == [False] * 50 + [True] * 10
 
 
 @pytest.mark.parametrize(("n", "k", "dimension"), [(50, 12, 70), (20, 36, 33)])
