@@ -52,10 +52,10 @@ def _winner(score, member, slot, there, i, delta):
 
 
 @triton.jit
-def _certain(score, r, weight, slot, there, spread, delta):
+def _certain(agreed, r, weight, slot, there, spread, delta):
     """Whether no scores within their errors have another winner; see above. Not where anything is not a number."""
-    total = tl.sum(weight, axis=0)
-    share = tl.where(r > 0, score / r, 0.0) / total  # A / W
+    share = agreed / tl.sum(weight, axis=0)  # A / W
+    score = r * agreed
     error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
     low, high = score - error, score + error
     own_low = tl.sum(tl.where(slot == 0, low, 0.0), axis=0)
@@ -82,12 +82,11 @@ def _vote(
     member = tl.where(slot == 0, i, member)
     there = member >= 0
     r = tl.load(reliability + member, mask=there, other=0.0)
+    d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
+    place = tl.load(row_of + member, mask=there, other=0).to(tl.int64)
     if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else nobody can win
-        d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
-        nearest = tl.min(tl.where(r > 0, d, float("inf")), axis=0)
-        beyond = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product rounds
-        weight = r * tl.exp(-0.5 * beyond)
-        place = tl.load(row_of + member, mask=there, other=0).to(tl.int64)
+        if CERTIFY:
+            lacks = tl.load(rough + place, mask=there & (r > 0), other=0.0)
         row = place * dimension
         cosine = tl.zeros([GROUP, GROUP], tl.float32)
         for first in tl.range(0, dimension, COLUMNS, num_stages=STAGES):
@@ -95,15 +94,17 @@ def _vote(
             inside = there[:, None] & (column < dimension)[None, :]
             part = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
             cosine = tl.dot(part, tl.trans(part), cosine, input_precision=PRECISION)
+        nearest = tl.min(tl.where(r > 0, d, float("inf")), axis=0)
+        beyond = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product rounds
+        weight = r * tl.exp(-0.5 * beyond)
         undecided = True
         if CERTIFY:
-            score = r * tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
-            e = tl.max(tl.where(r > 0, tl.load(rough + place, mask=there, other=0.0), 0.0), axis=0)
-            spread = tl.exp((2.02 * e + (dimension + 16) * 1.1920929e-7) / gamma) - 1
-            certain = _certain(score, r, weight, slot, there, spread, delta)
+            agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
+            spread = tl.exp((2.02 * tl.max(lacks, axis=0) + (dimension + 16) * 1.1920929e-7) / gamma) - 1
+            certain = _certain(agreed, r, weight, slot, there, spread, delta)
             undecided = certain == 0
             if certain:
-                tl.store(source + i, _winner(score, member, slot, there, i, delta).to(tl.int32))
+                tl.store(source + i, _winner(r * agreed, member, slot, there, i, delta).to(tl.int32))
         if FINISH:  # noqa: SIM102 (known when the kernel is compiled, unlike the other)
             if undecided:
                 if HALVES:
@@ -115,8 +116,8 @@ def _vote(
                         other = tl.load(low + row[:, None] + column[None, :], mask=inside, other=0.0)
                         cross = tl.dot(some, tl.trans(other), cross)
                     cosine += (cross + tl.trans(cross)) * (1 / 2048)
-                score = r * tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
-                tl.store(source + i, _winner(score, member, slot, there, i, delta).to(tl.int32))
+                agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
+                tl.store(source + i, _winner(r * agreed, member, slot, there, i, delta).to(tl.int32))
 
 
 @triton.jit
