@@ -74,29 +74,31 @@ def refine(
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
+    neighbors = Neighbors(*(x.contiguous() for x in neighbors))
+    on_gpu = kernels_apply(means)
+    if given is not None and on_gpu and given.dtype == torch.float32:
+        given, directions = None, given.__getitem__  # the kernel needs as much memory again: a block at a time
     width = decay_width(neighbors, config)
+    decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=means.device) for _ in range(2))
     # Where no neighbour is reliable, nobody can win.
     order = spatial_order(means)
-    order = order[(_gather(reliability, neighbors.index) > 0).any(dim=1)[order]]
+    order = order[_any_reliable(neighbors, reliability)[order]]
 
     def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
             rows = directions
         else:
-            group = torch.cat([voters, neighbors.index[voters].flatten().long()])
-            read = torch.zeros(n, dtype=torch.bool, device=means.device)
-            read[group[group >= 0]] = True
-            gaussians = read.nonzero().squeeze(1)
+            gaussians = _members(voters, neighbors)
             rows = directions(gaussians)
             row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=means.device)
-        if kernels_apply(means) and rows.dtype != torch.float64 and config.k <= _MOST_IN_KERNEL:
-            _vote_on_gpu(voters, neighbors, rows, row_of, reliability, source, config, float(width))
+        if on_gpu and rows.dtype != torch.float64 and config.k <= _MOST_IN_KERNEL:
+            _vote_on_gpu(voters, neighbors, rows, row_of, reliability, source, config, decay)
         else:
             _vote(voters, neighbors, rows, row_of, reliability, source, config, width)
 
     done = n - len(order)
-    for voters in order.split(_BLOCK[means.device.type == "cuda"] if given is None else max(1, n)):
+    for voters in order.split(_BLOCK[on_gpu] if given is None else max(1, n)):
         in_parts(vote, voters, "refine on the CPU")
         done += len(voters)
         if progress is not None:
@@ -186,17 +188,21 @@ def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
     sample = sample[sample.isfinite().all(dim=1)].double()
     if len(sample) == 0:
         return torch.arange(len(means), device=means.device)
-    low, high = (sample.quantile(q, dim=0) for q in (0.01, 0.99))
+    low, high = sample.quantile(sample.new_tensor([0.01, 0.99]), dim=0)
     cell = ((means - low) / (high - low).clamp(min=1e-12) * 1023).nan_to_num(0).clamp(0, 1023).long()
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         cell = (cell | (cell << shift)) & mask
-    return (cell[:, 0] | cell[:, 1] << 1 | cell[:, 2] << 2).argsort(stable=True)
+    return (cell[:, 0] | cell[:, 1] << 1 | cell[:, 2] << 2).int().argsort(stable=True)
 
 
 def decay_width(neighbors: Neighbors, config: RefineConfig) -> Float64[Tensor, ""]:
     """sigma_d in the units of the means: times the median spacing (1 where all Gaussians are at one place)."""
     finite = neighbors.spacing[neighbors.spacing.isfinite()]
-    return config.sigma_d * (finite.median() if finite.numel() > 0 else neighbors.spacing.new_ones(()))
+    if finite.numel() == 0:
+        return config.sigma_d * neighbors.spacing.new_ones(())
+    # torch looks for a median with one block of a GPU
+    median = finite.sort().values[(finite.numel() - 1) // 2] if finite.is_cuda else finite.median()
+    return config.sigma_d * median
 
 
 def voting_weights(
@@ -223,7 +229,28 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
     >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
     [False, False, True, True]
     """
-    return (reliability <= 0) & (_gather(reliability, neighbors.index) <= 0).all(dim=1)
+    return (reliability <= 0) & ~_any_reliable(neighbors, reliability)
+
+
+def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Whether a neighbour of each Gaussian has R > 0."""
+    if kernels_apply(neighbors.index):
+        from normlift_ns.kernels.vote import any_reliable  # noqa: PLC0415 (needs triton)
+
+        return any_reliable(neighbors.index.contiguous(), reliability)
+    return (_gather(reliability, neighbors.index) > 0).any(dim=1)
+
+
+def _members(voters: Int[Tensor, " v"], neighbors: Neighbors) -> Int64[Tensor, " m"]:
+    """The voters and their neighbours, each once, ascending."""
+    if kernels_apply(neighbors.index):
+        from normlift_ns.kernels.vote import members  # noqa: PLC0415 (needs triton)
+
+        return members(voters, neighbors.index)
+    group = torch.cat([voters, neighbors.index[voters].flatten().long()])
+    read = torch.zeros(len(neighbors.index), dtype=torch.bool, device=voters.device)
+    read[group[group >= 0]] = True
+    return read.nonzero().squeeze(1)
 
 
 def _gather(values: Tensor, index: Tensor) -> Tensor:

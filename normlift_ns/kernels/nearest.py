@@ -24,6 +24,8 @@ SPARE = 4
 MOST_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
 """Distances at once, of 8 bytes and as much again for their parts."""
+_SORTED_IN_A_BLOCK = 4096
+"""Points that torch sorts with one block of a GPU, without passes over the memory."""
 _LEAVES = 2**14
 """Leaves at once: half a million points, 320 bytes each at K = 36."""
 
@@ -51,7 +53,7 @@ class Found(NamedTuple):
 
 
 def build_tree(points: Float32[Tensor, "n 3"]) -> Tree:
-    """Splits in the middle of the longest side, level by level; one sort per level."""
+    """Splits in the middle of the longest side, level by level; one sort per level, of small nodes each for itself."""
     n, device = len(points), points.device
     depth = max(0, (-(-n // LEAF) - 1).bit_length())
     size = LEAF << depth
@@ -64,8 +66,11 @@ def build_tree(points: Float32[Tensor, "n 3"]) -> Tree:
         low, high = _box(nodes)
         axis = (high - low).nan_to_num(-1).argmax(dim=1)
         along = nodes.gather(2, axis[:, None, None].expand(-1, nodes.shape[1], 1)).squeeze(2)
-        node = torch.arange(1 << level, device=device)[:, None] << 32
-        order = (node + _ascending_bits(along)).flatten().sort(stable=True).indices
+        node, bits = torch.arange(1 << level, device=device)[:, None], _ascending_bits(along)
+        if nodes.shape[1] <= _SORTED_IN_A_BLOCK:
+            order = (bits.sort(dim=1, stable=True).indices + node * nodes.shape[1]).flatten()
+        else:
+            order = ((node << 32) + bits.long()).flatten().sort(stable=True).indices
         index, padded = index[order], padded[order]
     boxes = torch.full((2 << depth, 6), torch.inf, device=device)
     low, high = _box(padded.view(1 << depth, LEAF, 3))
@@ -82,9 +87,9 @@ def _box(nodes: Float32[Tensor, "nodes m 3"]) -> tuple[Float32[Tensor, "nodes 3"
 
 
 def _ascending_bits(x: Tensor) -> Tensor:
-    """Integers 0 <= b < 2 ** 32 in the order of the numbers."""
-    bits = (x + 0.0).view(torch.int32).long()  # + 0.0: no negative zero
-    return torch.where(bits < 0, -(bits & 0x7FFFFFFF), bits) + (1 << 31)
+    """Integers of 32 bits in the order of the numbers."""
+    bits = (x + 0.0).view(torch.int32)  # + 0.0: no negative zero
+    return torch.where(bits < 0, -(bits & 0x7FFFFFFF), bits)
 
 
 @triton.jit

@@ -1,53 +1,150 @@
-"""The vote of one Gaussian per program: the cosines among its neighbours are one small matrix product."""
+"""The vote of one Gaussian per program: the cosines among its neighbours are one small matrix product.
+
+Rows u of float32 are halved: u = h + l, both of 11 bits, so that three products of tensor cores at their fastest rate,
+h h + h l + l h, give a cosine to 22 bits. Most votes need only the first. With e the largest |l| in the group, all
+products and sums exact but for roundings of 2**-23 of at most 1 each, |<h_j, h_k> - <u_j, u_k>| <= t, where
+t = 2.02 e + (D + 16) 2**-23. As d/dc log(g (1 - g)) is at most 1 / gamma, a sigmoid g whose cosine is off by t is off
+by at most f g (1 - g), f = exp(t / gamma) - 1. By Jensen's inequality the sum A of g with weights of sum W is then off
+by at most f A (1 - A / W). Where these intervals, and 3e-5 for the rounding of the sums, leave one winner, it is the
+winner; everything else adds the other products and compares again.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Float32, Int, Int32
+from jaxtyping import Bool, Float, Float16, Float32, Int, Int32, Int64
 from torch import Tensor
 
-GROUP = 64
-MOST_NEIGHBORS = GROUP - 1
-_SLICE = 64
+MOST_NEIGHBORS = 63
+Precision = Literal["certified", "first", "halves", "tf32", "tf32x3", "ieee"]
+
+
+class Tuning(NamedTuple):
+    """How one program runs."""
+
+    columns: int
+    """Of rows, held at a time."""
+    columns_later: int
+    """The same, where both halves of a row are."""
+    stages: int
+    """Parts of rows on their way."""
+    warps: int
+    registers: int | None = None
+    """Most of a thread: with fewer, more programs run at once."""
+
+
+_HALVES = Tuning(columns=64, columns_later=32, stages=3, warps=4)
+_WHOLE = Tuning(columns=64, columns_later=64, stages=3, warps=4)
+_ROWS = 16
+
+
+@triton.jit
+def _winner(score, member, slot, there, i, delta):
+    own = tl.sum(tl.where(slot == 0, score, 0.0), axis=0)
+    others = tl.where((slot > 0) & there, score, -1.0)
+    best, winner = tl.max(others, axis=0, return_indices=True, return_indices_tie_break_left=True)
+    chosen = tl.sum(tl.where(slot == winner, member, 0), axis=0)
+    return tl.where(best > own + delta, chosen, i)
+
+
+@triton.jit
+def _certain(agreed, r, weight, slot, there, spread, delta):
+    """Whether no scores within their errors have another winner; see above. Not where anything is not a number."""
+    share = agreed / tl.sum(weight, axis=0)  # A / W
+    score = r * agreed
+    error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
+    low, high = score - error, score + error
+    own_low = tl.sum(tl.where(slot == 0, low, 0.0), axis=0)
+    own_high = tl.sum(tl.where(slot == 0, high, 0.0), axis=0)
+    other = (slot > 0) & there
+    _, winner = tl.max(tl.where(other, score, -1.0), axis=0, return_indices=True, return_indices_tie_break_left=True)
+    best_low = tl.sum(tl.where(slot == winner, low, 0.0), axis=0)
+    rest_high = tl.max(tl.where(other & (slot != winner), high, -1.0), axis=0)
+    all_high = tl.max(tl.where(other, high, -1.0), axis=0)
+    wins = (best_low > rest_high) & (best_low > own_high + delta)
+    return (wins | (all_high <= own_low + delta)) & (spread < 100.0)
 
 
 @triton.jit
 def _vote(
-    order, neighbors, distance, directions, row_of, reliability, source, dimension, k, tau, gamma, width, delta,
-    GROUP: tl.constexpr, SLICE: tl.constexpr, PRECISION: tl.constexpr,
+    voters, neighbors, distance, high, low, rough, row_of, reliability, source, dimension, k, tau, gamma, width, delta,
+    GROUP: tl.constexpr, COLUMNS: tl.constexpr, COLUMNS_LATER: tl.constexpr, STAGES: tl.constexpr,
+    PRECISION: tl.constexpr, CERTIFY: tl.constexpr, FINISH: tl.constexpr, HALVES: tl.constexpr,
 ):  # fmt: skip
-    i = tl.load(order + tl.program_id(0)).to(tl.int64)
+    i = tl.load(voters + tl.program_id(0)).to(tl.int64)
     slot = tl.arange(0, GROUP)  # 0: i itself
     listed = (slot > 0) & (slot <= k)
     member = tl.load(neighbors + i * k + slot - 1, mask=listed, other=-1).to(tl.int64)
     member = tl.where(slot == 0, i, member)
     there = member >= 0
     r = tl.load(reliability + member, mask=there, other=0.0)
+    d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
+    place = tl.load(row_of + member, mask=there, other=0).to(tl.int64)
     if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else nobody can win
-        d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
+        if CERTIFY:
+            lacks = tl.load(rough + place, mask=there & (r > 0), other=0.0)
+        row = place * dimension
+        cosine = tl.zeros([GROUP, GROUP], tl.float32)
+        for first in tl.range(0, dimension, COLUMNS, num_stages=STAGES):
+            column = first + tl.arange(0, COLUMNS)
+            inside = there[:, None] & (column < dimension)[None, :]
+            part = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
+            cosine = tl.dot(part, tl.trans(part), cosine, input_precision=PRECISION)
         nearest = tl.min(tl.where(r > 0, d, float("inf")), axis=0)
         beyond = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product rounds
         weight = r * tl.exp(-0.5 * beyond)
-        row = tl.load(row_of + member, mask=there, other=0).to(tl.int64) * dimension
-        cosine = tl.zeros([GROUP, GROUP], tl.float32)
-        for first in range(0, dimension, SLICE):
-            column = first + tl.arange(0, SLICE)
-            part = tl.load(
-                directions + row[:, None] + column[None, :],
-                mask=there[:, None] & (column < dimension)[None, :],
-                other=0.0,
-            )
-            cosine = tl.dot(part, tl.trans(part), cosine, input_precision=PRECISION)
-        agree = tl.sigmoid((cosine - tau) / gamma)
-        score = r * tl.sum(agree * weight[None, :], axis=1)
-        own = tl.sum(tl.where(slot == 0, score, 0.0), axis=0)
-        others = tl.where((slot > 0) & there, score, -1.0)
-        best, winner = tl.max(others, axis=0, return_indices=True, return_indices_tie_break_left=True)
-        chosen = tl.sum(tl.where(slot == winner, member, 0), axis=0)
-        tl.store(source + i, tl.where(best > own + delta, chosen, i).to(tl.int32))
+        undecided = True
+        if CERTIFY:
+            agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
+            spread = tl.exp((2.02 * tl.max(lacks, axis=0) + (dimension + 16) * 1.1920929e-7) / gamma) - 1
+            certain = _certain(agreed, r, weight, slot, there, spread, delta)
+            undecided = certain == 0
+            if certain:
+                tl.store(source + i, _winner(r * agreed, member, slot, there, i, delta).to(tl.int32))
+        if FINISH:  # noqa: SIM102 (known when the kernel is compiled, unlike the other)
+            if undecided:
+                if HALVES:
+                    cross = tl.zeros([GROUP, GROUP], tl.float32)
+                    for first in tl.range(0, dimension, COLUMNS_LATER, num_stages=STAGES):
+                        column = first + tl.arange(0, COLUMNS_LATER)
+                        inside = there[:, None] & (column < dimension)[None, :]
+                        some = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
+                        other = tl.load(low + row[:, None] + column[None, :], mask=inside, other=0.0)
+                        cross = tl.dot(some, tl.trans(other), cross)
+                    cosine += (cross + tl.trans(cross)) * (1 / 2048)
+                agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
+                tl.store(source + i, _winner(r * agreed, member, slot, there, i, delta).to(tl.int32))
+
+
+@triton.jit
+def _halve(rows, high, low, rough, dimension, BLOCK: tl.constexpr):
+    j, column = tl.program_id(0).to(tl.int64), tl.arange(0, BLOCK)
+    inside = column < dimension
+    u = tl.load(rows + j * dimension + column, mask=inside, other=0.0)
+    h = u.to(tl.float16)
+    rest = u - h.to(tl.float32)
+    tl.store(high + j * dimension + column, h, mask=inside)
+    tl.store(low + j * dimension + column, (rest * 2048).to(tl.float16), mask=inside)
+    length = tl.sum(u * u, axis=0)
+    error = tl.sqrt(tl.sum(rest * rest, axis=0)) * 1.001
+    tl.store(rough + j, tl.where(length < 1.01, error, float("inf")))
+
+
+def halve(
+    rows: Float32[Tensor, "m d"],
+) -> tuple[Float16[Tensor, "m d"], Float16[Tensor, "m d"], Float32[Tensor, " m"]]:
+    """h, 2048 l and |l| of unit rows u = h + l; inf where a row is longer than that."""
+    high, low = (torch.empty_like(rows, dtype=torch.float16) for _ in range(2))
+    rough = torch.empty(len(rows), device=rows.device)
+    if len(rows) > 0:
+        _halve[(len(rows),)](
+            rows, high, low, rough, rows.shape[1], BLOCK=triton.next_power_of_2(rows.shape[1]), num_warps=2
+        )
+    return high, low, rough
 
 
 def vote(
@@ -63,7 +160,7 @@ def vote(
     gamma: float,
     width: float,
     delta: float,
-    precision: Literal["tf32", "tf32x3", "ieee"] = "tf32x3",
+    precision: Precision = "certified",
 ) -> None:
     """Writes to `source` whose direction each of the voters takes; formulas in `core.refine`.
 
@@ -73,10 +170,62 @@ def vote(
         directions: unit rows or 0, multiplied on tensor cores and added in float32.
         row_of: the row of a Gaussian's direction; those of voters and their neighbours are read.
         width: sigma_d, in the units of `distance`.
-        precision: of products of float32 directions: rounded to 11 bits, in three such parts, or unrounded.
+        precision: of products of float32 directions. "halves": of two halves of 11 bits each. "certified": the same
+            winners, by the first halves alone where these decide. "first": writes only the latter. "tf32", "tf32x3",
+            "ieee": rounded to 11 bits, in three such parts, or unrounded. Half-precision directions are not rounded.
     """
+    if len(voters) == 0:
+        return
+    halves = directions.dtype == torch.float32 and precision in ("certified", "first", "halves")
+    high, low, rough = halve(directions) if halves else (directions, directions, reliability)
+    tuning = _HALVES if halves else _WHOLE
+    _vote[(len(voters),)](
+        voters, neighbors, distance, high, low, rough, row_of, reliability, source,
+        directions.shape[1], neighbors.shape[1], tau, gamma, width, delta,
+        GROUP=max(16, triton.next_power_of_2(neighbors.shape[1] + 1)), COLUMNS=tuning.columns,
+        COLUMNS_LATER=tuning.columns_later, STAGES=tuning.stages, CERTIFY=halves and precision != "halves",
+        FINISH=precision != "first" or not halves, HALVES=halves,
+        PRECISION=precision if precision in ("tf32", "ieee") else "tf32x3", num_warps=tuning.warps,
+        maxnreg=tuning.registers,
+    )  # fmt: skip
+
+
+@triton.jit
+def _find_reliable(neighbors, reliability, found, n, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
+    row, slot = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
+    inside = (row < n)[:, None] & (slot < k)[None, :]
+    index = tl.load(neighbors + row[:, None] * k + slot[None, :], mask=inside, other=-1)
+    reliable = tl.load(reliability + index, mask=index >= 0, other=0.0) > 0
+    tl.store(found + row, tl.max(reliable.to(tl.int8), axis=1), mask=row < n)
+
+
+def any_reliable(neighbors: Int32[Tensor, "n k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Whether a neighbour of each Gaussian has R > 0."""
+    n, k = neighbors.shape
+    found = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
+    if n > 0:
+        _find_reliable[(triton.cdiv(n, _ROWS),)](
+            neighbors, reliability, found, n, k, ROWS=_ROWS, SLOTS=triton.next_power_of_2(k)
+        )
+    return found.bool()
+
+
+@triton.jit
+def _mark(voters, neighbors, read, count, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
+    row, slot = tl.program_id(0) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
+    i = tl.load(voters + row, mask=row < count, other=0).to(tl.int64)
+    tl.store(read + i, tl.full([ROWS], 1, tl.int8), mask=row < count)
+    inside = (row < count)[:, None] & (slot < k)[None, :]
+    index = tl.load(neighbors + i[:, None] * k + slot[None, :], mask=inside, other=-1)
+    tl.store(read + index, tl.full([ROWS, SLOTS], 1, tl.int8), mask=index >= 0)
+
+
+def members(voters: Int[Tensor, " v"], neighbors: Int32[Tensor, "n k"]) -> Int64[Tensor, " m"]:
+    """The voters and their neighbours, each once, ascending."""
+    n, k = neighbors.shape
+    read = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
     if len(voters) > 0:
-        _vote[(len(voters),)](
-            voters, neighbors, distance, directions, row_of, reliability, source, directions.shape[1],
-            neighbors.shape[1], tau, gamma, width, delta, GROUP=GROUP, SLICE=_SLICE, PRECISION=precision, num_warps=4,
-        )  # fmt: skip
+        _mark[(triton.cdiv(len(voters), _ROWS),)](
+            voters, neighbors, read, len(voters), k, ROWS=_ROWS, SLOTS=triton.next_power_of_2(k)
+        )
+    return read.nonzero().squeeze(1)

@@ -94,3 +94,15 @@ def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
     assert all(torch.equal(a, b) for a, b in zip(found, whole))
     places = len(means.unique(dim=0))
     assert told == [(first * 90 // places, 90) for first in range(5, places, 5)] + [(90, 90)]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_progress_on_a_gpu_changes_nothing(monkeypatch):
+    means, told = torch.randn(20_000, 3, generator=generator(0)).cuda(), []
+    whole = nearest_neighbors(means, 36)
+    monkeypatch.setattr("normlift_ns.kernels.nearest._LEAVES", 64)
+    found = nearest_neighbors(means, 36, progress=lambda *step: told.append(step))
+    assert all(torch.equal(a, b) for a, b in zip(found, whole))
+    assert len(told) == 16
+    assert told == sorted(told)
+    assert told[-1] == (20_000, 20_000)

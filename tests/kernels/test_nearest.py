@@ -71,6 +71,16 @@ def test_the_tree_holds_every_point_once():
     assert torch.equal(high, points.amax(0))
 
 
+def test_nodes_sorted_each_for_itself_are_the_same_tree(monkeypatch):
+    points = uneven(333).round(decimals=1)
+    points[5:9] = -0.0
+    trees = []
+    for most in (0, 64, 10**9):
+        monkeypatch.setattr(nearest, "_SORTED_IN_A_BLOCK", most)
+        trees.append(nearest.build_tree(points.to(DEVICE)))
+    assert all(torch.equal(a, b) for tree in trees[1:] for a, b in zip(tree, trees[0]))
+
+
 def test_looking_at_all_points_equals_the_cpu_where_everything_ties(monkeypatch):
     monkeypatch.setattr(nearest, "_PAIRS", 300)  # two rows at once
     points = torch.cartesian_prod(*[torch.arange(5.0)] * 3)

@@ -1,14 +1,188 @@
 """The kernel's vote against the plain one."""
 
+from typing import Any
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from normlift_ns import RefineConfig, nearest_neighbors, refine
-from normlift_ns.core.refine import decay_width, spatial_order
-from normlift_ns.kernels.vote import vote
+from normlift_ns import Neighbors, RefineConfig, nearest_neighbors, refine, unsupported
+from normlift_ns.core.refine import decay_width, spatial_order, voting_weights
+from normlift_ns.kernels.vote import any_reliable, halve, members, vote
 from tests.scenes import generator, unit_rows
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+BFLOAT16 = [torch.bfloat16] if torch.cuda.is_available() else []
+"""Triton's interpreter multiplies the bits of such numbers as if they were integers."""
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:(overflow|invalid value) encountered:RuntimeWarning"
+)  # of infinity, unused
+
+
+def cast(
+    neighbors: Neighbors, directions: torch.Tensor, reliability: torch.Tensor, config: RefineConfig, **options: Any
+) -> torch.Tensor:
+    """The kernel's winners; -1 where nothing was written."""
+    n = len(reliability)
+    every = torch.arange(n, dtype=torch.int32)
+    source = torch.full((n,), -1, dtype=torch.int32).to(DEVICE)
+    arrays = (every.long(), neighbors.index, neighbors.distance, directions, every, reliability)
+    width = float(decay_width(neighbors, config))
+    numbers = {"tau": config.tau, "gamma": config.gamma, "width": width, "delta": config.delta}
+    vote(*(x.to(DEVICE) for x in arrays), source, **numbers, **options)
+    return source.cpu()
+
+
+def exact_scores(
+    neighbors: Neighbors, directions: torch.Tensor, reliability: torch.Tensor, config: RefineConfig
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """N+ and its scores in float64, self first with Delta on top; nobody has less than nothing."""
+    rows, r = torch.arange(len(reliability)), reliability.double()
+    group = torch.cat([rows[:, None], neighbors.index], dim=1).long()
+    weight = voting_weights(neighbors, decay_width(neighbors, config), rows, r)
+    u = directions.double()[group.clamp(min=0)]
+    agree = torch.sigmoid((u @ u.transpose(1, 2) - config.tau) / config.gamma)
+    score = torch.where(group < 0, -1.0, r[group.clamp(min=0)] * (agree @ weight[:, :, None]).squeeze(2))
+    score[:, 0] += config.delta
+    return group, score
+
+
+def close_calls(seed: int, n: int, dimension: int, noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Means, directions that differ by `noise` in each of three classes, reliabilities that differ by as little."""
+    g = generator(seed)
+    means = torch.rand(n, 3, generator=g)
+    classes = unit_rows(3, dimension, seed, torch.float32)[torch.randint(0, 3, (n,), generator=g)]
+    spread = noise * torch.randn(n, dimension, generator=g) / dimension**0.5
+    reliability = 0.5 * (1 + noise * torch.rand(n, generator=g))
+    empty = torch.rand(n, generator=g) < 0.1
+    directions = torch.nn.functional.normalize(classes + spread, dim=1)
+    return means, torch.where(empty[:, None], 0.0, directions), torch.where(empty, 0.0, reliability)
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    seed=st.integers(0, 2**31),
+    k=st.sampled_from([1, 7, 15, 16, 36, 63]),
+    dimension=st.sampled_from([1, 16, 70]),
+    noise=st.sampled_from([1e-6, 1e-4, 1e-3, 1e-2, 0.3]),
+    gamma=st.sampled_from([0.003, 0.05, 0.4, 3.0]),
+    tau=st.floats(-0.5, 1.0),
+    sigma_d=st.floats(0.3, 4),
+    delta=st.sampled_from([0.0, 1e-4, 0.3]),
+    dtype=st.sampled_from([torch.float32, torch.float32, torch.float16, *BFLOAT16]),
+)
+def test_winners_are_those_of_float64_up_to_rounding(seed, k, dimension, noise, gamma, tau, sigma_d, delta, dtype):
+    means, directions, reliability = close_calls(seed, 24, dimension, noise)
+    directions, config = directions.to(dtype), RefineConfig(k=k, tau=tau, gamma=gamma, sigma_d=sigma_d, delta=delta)
+    neighbors = nearest_neighbors(means, k)
+    group, score = exact_scores(neighbors, directions, reliability, config)
+    best = score[:, 1:].max(dim=1)
+    expected = torch.where(
+        best.values > score[:, 0], group.gather(1, best.indices[:, None] + 1).squeeze(1), group[:, 0]
+    )
+    untouched = ~(score[:, 1:] > 0).any(dim=1)
+    slack = (1e-5 + 4e-6 / gamma) * best.values
+
+    found = cast(neighbors, directions, reliability, config)
+    assert torch.equal(found < 0, untouched)
+    scored = torch.where(group == found[:, None], score, -1.0).amax(dim=1)
+    assert bool((untouched | (scored >= torch.maximum(best.values, score[:, 0]) - slack)).all())
+    margin = score.topk(2, dim=1).values.diff(dim=1).squeeze(1).abs()
+    assert bool((untouched | (margin <= slack) | (found == expected)).all())
+    if dtype == torch.float32:
+        sure, full = (cast(neighbors, directions, reliability, config, precision=p) for p in ("first", "halves"))
+        assert bool(((sure < 0) | (sure == expected)).all())  # whatever the margin
+        assert bool(((sure < 0) | (sure == full)).all())
+        assert torch.equal(torch.where(sure < 0, full, sure), found)
+
+
+def test_the_first_halves_decide_what_is_clear_and_nothing_else():
+    means, directions, reliability = close_calls(5, 60, 70, 0.3)
+    config = RefineConfig(k=12)
+    neighbors = nearest_neighbors(means, 12)
+    known = any_reliable(neighbors.index.to(DEVICE), reliability.to(DEVICE)).cpu()
+    sure = cast(neighbors, directions, reliability, config, precision="first") >= 0
+    assert sure[known].float().mean() > 0.8
+    # a little softness is enough for the rounding of a half to matter
+    steep = cast(neighbors, directions, reliability, RefineConfig(k=12, gamma=1e-5), precision="first") >= 0
+    assert steep.sum() < 0.2 * sure.sum()
+    # the same twice: neither wins by rounding
+    twice = torch.cat([directions, directions]), torch.cat([reliability, reliability])
+    neighbors = nearest_neighbors(torch.cat([means, means]), 25)
+    assert not bool((cast(neighbors, *twice, RefineConfig(k=25), precision="first") >= 0).any())
+    # rows that are not unit vectors are outside of the bound
+    assert not bool((cast(neighbors, 1.2 * twice[0], twice[1], RefineConfig(k=25), precision="first") >= 0).any())
+
+
+@pytest.mark.parametrize("precision", ["certified", "halves", "tf32x3"])
+def test_ties_go_to_the_nearer(precision):
+    means = torch.zeros(6, 3)
+    r = torch.tensor([0, 0, 0.2, 0.9, 0.9, 0.1])
+    u = torch.where(r[:, None] > 0, unit_rows(1, 40, 0, torch.float32), 0.0)
+    assert cast(nearest_neighbors(means, 5), u, r, RefineConfig(k=5), precision=precision).tolist() == [
+        3,
+        3,
+        3,
+        3,
+        4,
+        3,
+    ]
+
+
+def test_halves_give_rows_of_22_bits_and_know_what_the_first_lacks():
+    rows = unit_rows(40, 300, 0, torch.float32)
+    rows[0], rows[1], rows[2, 0], rows[3, 3:] = 0, 2 * rows[1], torch.nan, 0
+    high, low, rough = (x.cpu() for x in halve(rows.to(DEVICE)))
+    whole = high.double() + low.double() / 2048
+    usable = [i for i in range(40) if i != 2]
+    assert ((whole - rows.double()).abs() <= 2.0**-22 * rows.abs() + 2.0**-36)[usable].all()
+    lacks = (rows.double() - high.double()).norm(dim=1)
+    normal = [0, *range(4, 40)]
+    assert (rough[normal] >= lacks[normal]).all()
+    assert (rough[normal] <= 1.01 * lacks[normal]).all()
+    assert rough[1].isinf()
+    assert rough[2].isinf()
+
+
+@pytest.mark.parametrize(("n", "k"), [(0, 3), (1, 1), (50, 7), (40, 36)])
+def test_members_and_their_reliability(n, k):
+    g = generator(n)
+    index = torch.randint(-1, max(n, 1), (n, k), generator=g, dtype=torch.int32)
+    index[: n // 4] = -1
+    reliability = torch.where(torch.rand(n, generator=g) < 0.9, 0.0, torch.rand(n, generator=g))
+    found = any_reliable(index.to(DEVICE), reliability.to(DEVICE)).cpu()
+    assert found.tolist() == [any(j >= 0 and reliability[j] > 0 for j in row) for row in index.tolist()]
+    voters = torch.randperm(n, generator=g)[: n // 3]
+    held = {j for i in voters.tolist() for j in (i, *index[i].tolist()) if j >= 0}
+    assert members(voters.to(DEVICE), index.to(DEVICE)).tolist() == sorted(held)
+
+
+def test_refine_with_kernels_gives_one_answer_however_directions_are_given(monkeypatch):
+    """The route of a GPU, here also through Triton's interpreter."""
+    monkeypatch.setattr("normlift_ns.core.refine.kernels_apply", lambda tensor: True)
+    monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (17, 17))
+    means, directions, reliability = (x.to(DEVICE) for x in close_calls(3, 60, 70, 0.3))
+    means[50:] += 100
+    reliability[50:] = 0
+    config, told = RefineConfig(k=9), []
+    neighbors = nearest_neighbors(means.cpu(), 18)
+    wide = Neighbors(neighbors.index.to(DEVICE), neighbors.distance.to(DEVICE), neighbors.spacing.to(DEVICE))
+    near = Neighbors(wide.index[:, :9], wide.distance[:, :9], wide.spacing)  # views: every other part of the memory
+    whole = refine(means, directions, reliability, config, neighbors=near)
+    read = refine(
+        means, lambda rows: directions[rows], reliability, config, neighbors=near, progress=lambda *x: told.append(x)
+    )
+    exact = refine(means, directions.double(), reliability.double(), config, neighbors=near)
+    assert torch.equal(whole, read)
+    assert torch.equal(whole, exact)
+    assert 10 < int((whole != torch.arange(60, device=DEVICE)).sum()) < 50
+    assert told == [(27, 60), (44, 60), (60, 60)]
+    half = refine(means, directions.half(), reliability, config, neighbors=near)
+    rounded = refine(means, directions.half().double(), reliability, config, neighbors=near)
+    assert torch.equal(half, rounded)
+    lost = unsupported(near, reliability)
+    assert lost.tolist() == [False] * 50 + [True] * 10
 
 
 @pytest.mark.parametrize(("n", "k", "dimension"), [(50, 12, 70), (20, 36, 33)])
