@@ -19,17 +19,17 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.scenes.nerfstudio.appearance import COLORS, LOADED_STEP, background, shading_degree
-from normlift_ns.scenes.nerfstudio.classes import (
+from normlift_ns.scenes.nerfstudio.classes import SplatfactoModelConfig, TrainerConfig
+from normlift_ns.scenes.nerfstudio.config import RunLocation, locate, read_config, rebased
+from normlift_ns.scenes.nerfstudio.data_classes import (
     BlenderDataParserConfig,
     FullImageDatamanagerConfig,
     NerfstudioDataParserConfig,
-    SplatfactoModelConfig,
-    TrainerConfig,
 )
-from normlift_ns.scenes.nerfstudio.config import RunLocation, locate, read_config, rebased
 from normlift_ns.scenes.nerfstudio.datasets import check_dataset
-from normlift_ns.scenes.nerfstudio.parsers import Photographs, parse
+from normlift_ns.scenes.nerfstudio.parsers import parse
 from normlift_ns.scenes.nerfstudio.poses import adjusted
+from normlift_ns.scenes.nerfstudio.splits import Photographs
 from normlift_ns.scenes.nerfstudio.views import Reading, TrainedViews
 from normlift_ns.scenes.similarity import read_dataparser_transforms
 
