@@ -59,14 +59,15 @@ def observe_views(
     indices: Sequence[int],
     source: FeatureSource,
     *,
-    rendered: bool,
+    rendered: RasterSettings | None,
     divisor: int,
     done: Callable[[View], None],
 ) -> Block:
     """Labels and features of some training views.
 
     Args:
-        rendered: look at the trained scene rendered from the cameras instead of at the photographs.
+        rendered: look at the trained scene rendered from the cameras, with these constants, instead of at the
+            photographs.
         divisor: of the size of images and cameras.
         done: called after every view, with the view as the source saw it.
     Raises:
@@ -78,7 +79,9 @@ def observe_views(
     def images() -> Iterator[tuple[Tensor, str]]:
         for index in indices:
             view = scene.train[index]
-            view = view._replace(image=render_picture(scene, view.camera)) if rendered else view
+            view = (
+                view if rendered is None else view._replace(image=render_picture(scene, view.camera, settings=rendered))
+            )
             _check_sizes(view)
             waiting.append(_smaller(view, divisor) if divisor > 1 else view)
             check_undistorted(source, view, waiting[-1])
