@@ -1,12 +1,13 @@
 """What a person waits for: whole commands in processes of their own, from a cold shell.
 
-    python -m benchmarks.command             questions and help, CPU seconds (5 runs each); on a machine with a GPU lifts
+    python -m benchmarks.command             questions and help (5 runs each), on a machine with a GPU lifts
     python -m benchmarks.command --quick     fewer runs
     python -m benchmarks.command --config outputs/.../config.yml      a run of your own in place of the fox
 
 CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts are of patches: a first one with empty
-caches of kernels, first ones with those filled (median of 3), and ones with every stage cached (median of 3). The error
-of a new text is that of its vector against open_clip in float64. What the file holds of the other kind of machine stays.
+caches of kernels, first ones with those filled (median of 3), and ones with every stage cached (median of 3). The
+error of a new text is that of its vector against open_clip in float64. What the file holds of the other kind of machine
+stays.
 """
 
 from __future__ import annotations

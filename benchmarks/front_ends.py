@@ -13,7 +13,6 @@ compiled kernels are empty.
 from __future__ import annotations
 
 import argparse
-import copy
 import json
 import os
 import subprocess
@@ -22,17 +21,25 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
-import open_clip
 import torch
-import transformers
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from benchmarks.front_end_inputs import (
+    SMALL,
+    Size,
+    injected_masks,
+    injected_sam,
+    random_clip,
+    random_sam,
+    with_copies,
+)
+from benchmarks.front_end_networks import Exact, add_networks, decode_all, going_on, seconds
 from benchmarks.report import RESULTS, Report
 from normlift_ns.encoders import source as source_module
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
@@ -44,45 +51,6 @@ from normlift_ns.encoders.sam.network import SamNetwork
 from normlift_ns.encoders.sam.rules import Suppression, mask_nms, stack_masks
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.source import RegionFeatures
-from normlift_ns.options import SamPrecision
-
-_REPEATS = 3
-
-
-@dataclass(frozen=True)
-class Size:
-    """How large everything is."""
-
-    height: int = 731
-    width: int = 988
-    masks: tuple[int, ...] = (100, 300, 1000)
-    points: int = 32
-    patches: int = 1024
-    clip: str = "ViT-B-16"
-    vision: tuple[int, int, int, int] = (1280, 32, 16, 1024)
-    """Width, layers, heads and input side of SAM's image encoder."""
-    cold: int = 50
-    """Images of the process that begins without compiled kernels."""
-
-
-SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128), 2)
-SMALL_CLIP = {
-    "embed_dim": 24,
-    "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
-    "text_cfg": {"context_length": 77, "vocab_size": 49408, "width": 32, "heads": 2, "layers": 2},
-}
-
-
-def seconds(function: Callable[[], object], device: str) -> float:
-    """Best of some runs, after one that does not count."""
-    times = []
-    for _ in range(1 + _REPEATS):
-        start = time.perf_counter()
-        function()
-        if device.startswith("cuda"):
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - start)
-    return min(times[1:])
 
 
 @contextmanager
@@ -106,56 +74,6 @@ def stopwatch(owner: Any, name: str, device: str) -> Iterator[list[float]]:
         setattr(owner, name, function)
 
 
-def random_sam(size: Size, device: str) -> Any:
-    width, layers, heads, side = size.vision
-    vision = transformers.SamVisionConfig(
-        hidden_size=width,
-        num_hidden_layers=layers,
-        num_attention_heads=heads,
-        image_size=side,
-        mlp_dim=4 * width,
-        global_attn_indexes=[(i + 1) * layers // 4 - 1 for i in range(4)] if layers > 4 else [layers - 1],
-        window_size=min(14, side // 32),
-        initializer_range=0.02,
-    )
-    prompt = transformers.SamPromptEncoderConfig(image_size=side)
-    with torch.device(device):
-        return transformers.SamModel(transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt)).eval()
-
-
-def random_clip(size: Size, folder: Path, device: str) -> OpenClipEncoder:
-    if size.clip == SMALL.clip:
-        (folder / f"{size.clip}.json").write_text(json.dumps(SMALL_CLIP))
-        open_clip.add_model_config(folder / f"{size.clip}.json")
-    torch.save(open_clip.create_model(size.clip).state_dict(), folder / "clip.pt")
-    return OpenClipEncoder(size.clip, str(folder / "clip.pt"), device=device)
-
-
-def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> Tensor:
-    """[count, H, W] masks that cover the image; with ten or more, half of the pixels lie in two or more of them."""
-    area = torch.exp(1.5 * torch.randn(count, generator=g))
-    radius = (area / area.sum() * size.height * size.width / torch.pi).sqrt().to(device)
-    centre = (torch.rand(count, 2, generator=g) * torch.tensor([size.height, size.width])).to(device)
-    x = torch.arange(size.width, device=device)
-    rows = []
-    for y in torch.arange(size.height, device=device):
-        power = (y - centre[:, :1]) ** 2 + (x - centre[:, 1:]) ** 2 - radius[:, None] ** 2
-        rows.append(power - power.amin(dim=0) < (0.6 * radius[:, None]) ** 2)
-    masks = torch.stack(rows, dim=1)
-    for i, (row, column) in enumerate(centre.long().tolist()):
-        masks[i, row, column] = True
-    return masks
-
-
-def with_copies(masks: Tensor, g: torch.Generator) -> Tensor:
-    """The masks, three in ten of them replaced by others, moved by a pixel or two."""
-    masks = masks.clone()
-    for i in torch.randperm(len(masks), generator=g)[: len(masks) * 3 // 10].tolist():
-        other, dy, dx = torch.randint(0, len(masks), (3,), generator=g).tolist()
-        masks[i] = masks[other].roll((dy % 3, dx % 3), (0, 1))
-    return masks
-
-
 def disagreements(masks: Tensor, scores: Tensor) -> float:
     """Share of masks on which the suppression and the same rules, pair by pair in float64, disagree."""
     flat = masks.flatten(1).double()
@@ -171,126 +89,6 @@ def disagreements(masks: Tensor, scores: Tensor) -> float:
             keep[j] &= not (share_i < rules.outer and share_j >= rules.inner)
             keep[i] &= not (share_j < rules.outer and share_i >= rules.inner)
     return float((mask_nms(masks, scores).cpu() != torch.tensor(keep)).float().mean())
-
-
-class Injected(SamNetwork):
-    """The network, whose answers are then replaced by blobs of three sizes around the points. The blobs are made once,
-    so that making them costs no time."""
-
-    side = 1024
-    kept: dict[tuple[float, ...], tuple[Tensor, Tensor]]
-
-    def decode(self, embedding: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        logits, _ = super().decode(embedding, points)
-        self.kept = getattr(self, "kept", {})
-        key = (len(points), *points[:1].flatten().tolist(), *points[-1:].flatten().tolist())
-        if key not in self.kept:
-            blobs, ious = self.blobs(points.to(logits.device), logits.shape[-1])
-            self.kept[key] = blobs.to(logits.dtype), ious
-        return self.kept[key]
-
-    def blobs(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        p = points[:, None, None, None, :] / self.side
-        line = (torch.arange(count, device=points.device) + 0.5) / count
-        y, x = torch.meshgrid(line, line, indexing="ij")
-        radius = torch.tensor([0.04, 0.08, 0.16], device=points.device)[:, None, None]
-        radius = radius * (1 + 0.5 * torch.sin(9 * p[..., 0] + 5 * p[..., 1]))
-        waves = torch.sin(90 * x + 17 * p[..., 0]) * torch.sin(70 * y + 23 * p[..., 1])
-        away = ((x - p[..., 0]) ** 2 + (y - p[..., 1]) ** 2).sqrt()
-        phase = 130 * p[:, 0, 0, :, 0] + 290 * p[:, 0, 0, :, 1] + torch.arange(3, device=p.device)
-        return 600 * (radius - away) + 12 * waves, 0.8 + 0.2 * torch.sin(phase)
-
-
-@dataclass(frozen=True)
-class Exact:
-    """Answers in float64, to some prompts on the first crop."""
-
-    embedding: Tensor
-    points: Tensor
-    logits: Tensor
-
-    @classmethod
-    def of(cls, model: Any, pixels: Tensor, points: Tensor) -> Exact:
-        model = copy.deepcopy(model).double()
-        with torch.no_grad():
-            embedding = model.get_image_embeddings(pixels[:1].double())
-            found = model(image_embeddings=embedding, input_points=points[None, :, None].to(pixels.device).double())
-        return cls(embedding, points, found.pred_masks[0])
-
-    def encoder_error(self, network: SamNetwork, pixels: Tensor) -> float:
-        """Length of the error of an embedding over its length."""
-        return float((network.embed(pixels[:1])[0] - self.embedding).norm() / self.embedding.norm())
-
-    def decoder_error(self, network: SamNetwork) -> float:
-        """The same of logits, for the exact embedding."""
-        found = SamNetwork.decode(network, self.embedding.float(), self.points)[0]
-        return float((found.double() - self.logits).norm() / self.logits.norm())
-
-
-def decode_all(network: SamNetwork, embeddings: list[Tensor], points: Tensor) -> None:
-    for embedding in embeddings:
-        for batch in points.split(256):
-            SamNetwork.decode(network, embedding, batch)
-
-
-def add_networks(
-    report: Report, model: Any, pixels: Tensor, points: Tensor, device: str, exact: Exact, variants: bool
-) -> None:
-    """Times of the network in other precisions and, where asked for, compiled."""
-    others: list[tuple[SamPrecision, bool]] = [
-        ("float16", False),
-        ("bfloat16", False),
-        ("float16", True),
-        ("bfloat16", True),
-    ]
-    kinds: list[tuple[SamPrecision, bool]] = [("float32", False), *(others if variants else [])]
-    for precision, compiled in kinds:
-        network = SamNetwork(model, device, precision, compiled)
-        name = f"sam_{'compiled_' * compiled}{precision}"
-        if not compiled:
-            unit, error = f"s/image, {len(pixels)} crops", exact.encoder_error(network, pixels)
-            report.add(f"{name}_encoder_s", seconds(lambda network=network: network.embed(pixels), device), unit, error)
-        embeddings, unit = network.embed(pixels), f"s/image, {len(pixels) * len(points)} prompts"
-        with going_on(name, compiled):
-            start = time.perf_counter()
-            error = exact.decoder_error(network)
-            report.add(f"{name}_first_s", time.perf_counter() - start, "first call, compilation included")
-            time_s = seconds(lambda network=network, e=embeddings: decode_all(network, e, points), device)
-            report.add(f"{name}_decoder_s", time_s, unit, error)
-    if variants:
-        for name, half, compiled in (("half", True, False), ("compiled", False, True), ("compiled_half", True, True)):
-            with going_on(name, compiled):
-                add_encoder(report, model, pixels, device, exact, name, half, compiled)
-
-
-@contextmanager
-def going_on(name: str, foreign: bool) -> Iterator[None]:
-    """Compilers raise whatever they like where they do not work; the rest of the benchmark does without them."""
-    try:
-        yield
-    except Exception as error:
-        if not foreign:
-            raise
-        print(f"{name} does not work here: {error}")
-
-
-def add_encoder(
-    report: Report, model: Any, pixels: Tensor, device: str, exact: Exact, name: str, half: bool, compiled: bool
-) -> None:
-    """Time of the image encoder with weights and residuals in float16 or without, compiled or not."""
-    encoder = copy.deepcopy(model.vision_encoder)
-    encoder = encoder.half() if half else encoder
-    run = torch.compile(encoder, dynamic=False) if compiled else encoder
-
-    @torch.no_grad()
-    def embed() -> Tensor:
-        with torch.autocast(torch.device(device).type, torch.float16, enabled=not half):
-            return run(pixels.half() if half else pixels)[0].float()
-
-    start = time.perf_counter()
-    error = float((embed()[:1] - exact.embedding).norm() / exact.embedding.norm())
-    report.add(f"sam_encoder_{name}_first_s", time.perf_counter() - start, "first call")
-    report.add(f"sam_encoder_{name}_s", seconds(embed, device), f"s/image, {len(pixels)} crops", error)
 
 
 def changed_pixels(found: Tensor, exact: Tensor) -> float:
@@ -310,15 +108,6 @@ def plain() -> Iterator[None]:
         yield
     finally:
         network_module.kernels_apply = kernels_apply
-
-
-def injected_sam(
-    size: Size, model: Any, device: str, precision: SamPrecision = "auto", compiled: bool = False
-) -> SamMasks:
-    Injected.side = size.vision[3]
-    sam = SamMasks("nobody/nothing", rules=MaskRules(points_per_side=size.points), device=device, precision=precision)
-    vars(sam)["network"] = Injected(model, device, precision, compiled)
-    return sam
 
 
 def cold(size: Size, device: str, compiled: bool) -> None:

@@ -13,22 +13,17 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks import rooms
-from benchmarks.captures import trained_scene, training_cameras
-from benchmarks.cpu import grid_labels, relative_difference
+from benchmarks.cpu import relative_difference
+from benchmarks.gpu_cases import Case, capture_case, room_case, timed
+from benchmarks.gpu_errors import evidence_error, lift_errors, vote_errors
 from benchmarks.gpu_stages import kernel_milliseconds, stage_seconds
 from benchmarks.report import RESULTS, Report
 from normlift_ns import (
-    Camera,
-    Evidence,
-    GaussianScene,
     Lifted,
     RefineConfig,
     SemanticField,
@@ -42,36 +37,7 @@ from normlift_ns.raster.backend import Job
 from normlift_ns.raster.gsplat import compiled_rasterizer, project_views
 from normlift_ns.raster.settings import RasterSettings
 
-DIMENSION, CHANNELS, GSPLAT_VIEWS, SAMPLE = 512, 32, 6, 20_000
-
-
-@dataclass(frozen=True)
-class Case:
-    name: str
-    scene: GaussianScene
-    cameras: list[Camera]
-    labels: list[torch.Tensor]
-
-    @cached_property
-    def counts(self) -> list[int]:
-        """Regions of each view."""
-        return [int(labels.max()) + 1 for labels in self.labels]
-
-    def evidence(self, **options: Any) -> Evidence:
-        return rasterize_evidence(self.scene, self.cameras, self.labels, num_regions=self.counts, **options)
-
-
-def timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Median seconds of three runs after a first one, and the result of the last."""
-    result, seconds = run(), []
-    for _ in range(3):
-        del result
-        torch.cuda.synchronize()
-        start = time.perf_counter()
-        result = run()
-        torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - start)
-    return sorted(seconds)[1], result
+DIMENSION, CHANNELS, GSPLAT_VIEWS = 512, 32, 6
 
 
 def features(rows: int, device: str = "cuda") -> torch.Tensor:
@@ -241,69 +207,6 @@ def query_field(lifted: Lifted, source: torch.Tensor) -> SemanticField:
     return SemanticField(
         lifted.scalars, source, StoredEvidence(lifted.evidence, lifted.features), {"dimension": DIMENSION}
     )
-
-
-def evidence_error(case: Case, evidence: Evidence) -> float:
-    """Relative Frobenius difference to the float64 reference, in the first view."""
-    exact = rasterize_evidence(
-        case.scene, case.cameras[:1], case.labels[:1], num_regions=case.counts[:1], dtype=torch.float64
-    )
-    return relative_difference(evidence.select_views([0]).rows, exact.rows)
-
-
-def lift_errors(case: Case, evidence: Evidence, table: torch.Tensor, lifted: Lifted) -> tuple[float, float]:
-    """Largest error of R, and of a direction, in a sample of Gaussians."""
-    rows = sample_rows(len(case.scene))
-    chosen = evidence.rows.select_rows(rows)
-    part = Evidence(
-        replace(chosen, weight=chosen.weight.double()),
-        evidence.region_view,
-        evidence.unlabeled.select_rows(rows),
-        evidence.num_views,
-    )
-    exact = lift(part, table.double())
-    reliability = (lifted.scalars.reliability[rows].double() - exact.scalars.reliability).abs().max()
-    turned = (lifted.directions(rows).double() - exact.directions()).norm(dim=1).max()
-    return float(reliability), float(turned)
-
-
-def vote_errors(case: Case, lifted: Lifted, config: RefineConfig, neighbors: Any, source: torch.Tensor) -> float:
-    """Share of a sample of Gaussians whose refined direction is off by more than 1e-3 from that of a float64 vote.
-
-    Copying another Gaussian is no error where both have the same direction, as those seen in one region only.
-    """
-    rows = sample_rows(len(case.scene))[:: SAMPLE // 2000]
-    group = torch.cat([rows[:, None], neighbors.index[rows].long()], dim=1)
-    used, local = group.unique(return_inverse=True)
-    exact = lifted.directions(used).double()
-    k = config.k
-    near = type(neighbors)(
-        torch.full((len(used), k), -1, device=used.device, dtype=torch.int32),
-        torch.full((len(used), k), torch.inf, device=used.device, dtype=torch.float64),
-        neighbors.spacing,
-    )
-    near.index[local[:, 0]] = local[:, 1:].int()
-    near.distance[local[:, 0]] = neighbors.distance[rows].double()
-    found = refine(
-        case.scene.means[used].double(), exact, lifted.scalars.reliability[used].double(), config, neighbors=near
-    )[local[:, 0]]
-    ours = torch.searchsorted(used, source[rows].long())
-    return float(((exact[found.long()] - exact[ours]).norm(dim=1) > 1e-3).float().mean())
-
-
-def sample_rows(n: int) -> torch.Tensor:
-    return torch.randint(0, n, (SAMPLE,), generator=torch.Generator().manual_seed(0)).unique().cuda()
-
-
-def room_case(name: str, n: int, views: int, regions: int = 128, scale: float = 1.0) -> Case:
-    width, height = round(rooms.WIDTH * scale), round(rooms.HEIGHT * scale)
-    labels = [rooms.voronoi_labels(regions, width, height, seed=v) for v in range(views)]
-    return Case(name, rooms.room(n), rooms.cameras(views, width, height), labels)
-
-
-def capture_case(name: str) -> Case:
-    cameras = training_cameras(name)
-    return Case(name, trained_scene(name).to("cuda"), cameras, [grid_labels(camera).cuda() for camera in cameras])
 
 
 def agreement(report: Report, cases: Sequence[Case]) -> None:

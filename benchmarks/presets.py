@@ -21,7 +21,7 @@ import torch
 from torch.nn.functional import normalize
 
 from benchmarks.captures import SHARED
-from benchmarks.gpu import Case, capture_case, timed
+from benchmarks.gpu_cases import Case, capture_case, timed
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, RefineConfig, SemanticField, lift, nearest_neighbors, refine
 from normlift_ns.core.refine import decay_width, spatial_order

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,18 @@ from normlift_ns.encoders.given import GivenFeatures, given_features
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.lifting import Export, lift_scene
+from normlift_ns.lifting import Export, drawn_by, lift_scene
 from normlift_ns.options import CANONICAL_NEGATIVES, LiftOptions, SourceOptions
 from normlift_ns.question import Question, make_question
 from normlift_ns.ranges import check_bool, check_number, check_path, check_texts
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import (
     FIELD_FOLDER,
     TEXTS_FILE,
     cache_folder,
     check_run,
     load_field,
+    recorded_rules,
     refuse_existing_run,
     run_directory,
     tidy,
@@ -40,7 +43,7 @@ from normlift_ns.scenes.match import judge, match_photographs
 from normlift_ns.scenes.nerfstudio.load import CheckedViews, NerfstudioScene, load_scene
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import is_saved_splat, open_saved_splat
-from normlift_ns.stages import Report
+from normlift_ns.stages import Report, Stages
 from normlift_ns.text_encoders import encoder_settings, given_settings, with_texts
 
 
@@ -65,8 +68,11 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
     if not run_dir.exists():
         clean(run_dir.parent)  # a lift that was killed while it replaced the run
     if config.is_file() and is_saved_splat(run_dir):
-        return open_saved_splat(run_dir, data=place, load_step=load_step)
-    return load_scene(config, data=place, load_step=load_step, by_nerfstudio=_by_nerfstudio)
+        scene = open_saved_splat(run_dir, data=place, load_step=load_step)
+    else:
+        scene = load_scene(config, data=place, load_step=load_step, by_nerfstudio=_by_nerfstudio)
+    rules = recorded_rules(run_dir)
+    return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
 
 
 def _by_nerfstudio(*run: Any) -> tuple[CheckedViews, CheckedViews]:
@@ -219,8 +225,12 @@ def lift_run(
     say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
     for remark in scene.remarks:
         say(f"Warning: {remark}")
+    how, stages = lift or LiftOptions(), Stages(report)
     if check:
-        warning = judge(match_photographs(scene), own_cameras=not isinstance(scene, SplatScene))
+        with stages("check") as step:
+            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)))
+            warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
+            step()
         if warning is not None:
             say(f"Warning: {warning}")
     if export is not None:
@@ -233,14 +243,18 @@ def lift_run(
         if len(queries) > 0:
             made.text(queries)
     field, seconds = lift_scene(
-        scene, made, lift or LiftOptions(), cache_folder(run_dir), device=device, encoder=settings, export=export,
-        report=report,
-    )  # fmt: skip
-    question = _question(field, made, queries)
-    run_dir = write_run(
-        scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
+        scene, made, how, cache_folder(run_dir), device=device, encoder=settings, export=export, report=report
     )
-    return LiftedRun(run_dir, scene, with_paths(field.to("cpu"), run_dir / FIELD_FOLDER), device, seconds)
+    seconds = {**stages.seconds, **seconds}
+    with stages("write") as step:
+        question = _question(field, made, queries)
+        run_dir = write_run(
+            scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
+        )
+        field = field.to("cpu")
+        step()
+    seconds["write"] = stages.seconds["write"]
+    return LiftedRun(run_dir, scene, with_paths(field, run_dir / FIELD_FOLDER), device, seconds)
 
 
 def _refuse_equal_stems(names: Sequence[str]) -> None:

@@ -125,9 +125,18 @@ def lift_scene(
     return LiftResult(built, stages.seconds)
 
 
+def drawn_by(scene: Scene, options: LiftOptions) -> str:
+    """The version of gsplat by whose rules a lift draws the scene.
+
+    Raises:
+        ValueError: the rules of the installed gsplat are asked for, and none is there.
+    """
+    return rules_named(options.gsplat_rules, scene.identity.get("gsplat_rules"))
+
+
 def _drawing(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Drawing:
     """How to rasterize, refused before anything has been looked at where it cannot be done."""
-    rules = rules_named(options.gsplat_rules, scene.identity.get("gsplat_rules"))
+    rules = drawn_by(scene, options)
     dtype = torch.float64 if options.precision == "double" else torch.float32
     settings = RasterSettings.of_gsplat(rules)
     power = options.weight_power
@@ -190,7 +199,7 @@ def _observe(
                     write_langsplat(seen, view.image, view.name, *export)
                 step()
 
-            rendered = options.image_source == "render"
+            rendered = drawing.settings if options.image_source == "render" else None
             chosen = used[start : start + BLOCK]
             block = observe_views(scene, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
             tables.extend(block.features)

@@ -62,14 +62,15 @@ def observe_views(
     indices: Sequence[int],
     source: FeatureSource,
     *,
-    rendered: bool,
+    rendered: RasterSettings | None,
     divisor: int,
     done: Callable[[View], None],
 ) -> Block:
     """Labels and features of some training views.
 
     Args:
-        rendered: look at the trained scene rendered from the cameras instead of at the photographs.
+        rendered: look at the trained scene rendered from the cameras, with these constants, instead of at the
+            photographs.
         divisor: of the size of images and cameras.
         done: called after every view, with the view as the source saw it.
     Raises:
@@ -80,7 +81,9 @@ def observe_views(
 
     def images() -> Iterator[tuple[Tensor, str]]:
         for read in _read_ahead(scene.train.__getitem__, indices):
-            view = read._replace(image=render_picture(scene, read.camera)) if rendered else read
+            view = (
+                read if rendered is None else read._replace(image=render_picture(scene, read.camera, settings=rendered))
+            )
             _check_sizes(view)
             waiting.append(_smaller(view, divisor) if divisor > 1 else view)
             check_undistorted(source, view, waiting[-1])

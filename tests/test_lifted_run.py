@@ -15,7 +15,11 @@ from plyfile import PlyData
 
 import normlift_ns as nl
 from normlift_ns.demo import DemoRoom
+from normlift_ns.evaluation.protocols import EvaluatedRun
 from normlift_ns.question import Question
+from normlift_ns.raster import rasterize
+from normlift_ns.raster.backend import Job
+from normlift_ns.raster.backends import choose_backend
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry, said
 
@@ -125,7 +129,8 @@ def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> No
     run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
     assert run.field.manifest["statistics"]["views"] == 4
     assert run.field.manifest["statistics"]["left_out"] == 8
-    assert run.seconds["lift"] > 0
+    assert list(run.seconds) == ["check", "features", "evidence", "lift", "store", "write"]
+    assert min(run.seconds.values()) > 0
     with pytest.raises(ValueError, match=r"features of your own, without texts; name a file of texts"):
         run.ask("left")
 
@@ -311,3 +316,35 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     assert stored is not None
     assert run.save(stored).name == "queries.safetensors"  # other tests expect it as it was
     assert torch.equal(run.render(np.int64(3)), run.render(Path("images/0003")))
+
+
+def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: Path, monkeypatch) -> None:
+    """Check, evidence, pictures, scores and another lift of the lifted run."""
+    drawn: list[nl.RasterSettings] = []
+
+    def recording(backend: str, job: Job, **how: Any) -> Any:
+        drawn.append(job.settings)
+        return choose_backend(backend, job, **how)
+
+    monkeypatch.setattr(rasterize, "choose_backend", recording)
+    half = (torch.arange(160).expand(120, 160) // 80, torch.eye(2))
+    given: Any = {"features": [half] * 12, "texts": {"left": torch.tensor([1.0, 0.0])}, "timestamp": "rules"}
+    plain, later = nl.LiftOptions(refine=False), nl.LiftOptions(refine=False, gsplat_rules="1.6")
+    run = nl.lift_run(trained, **given, lift=later, output_dir=tmp_path)
+    again = nl.lift_run(run.config, **given, lift=plain, output_dir=tmp_path / "again")
+    assert run.field.manifest["gsplat_rules"] == again.field.manifest["gsplat_rules"] == "1.6"
+    lifts = len(drawn)
+    EvaluatedRun(run.scene, run.field, run.texts, True).composited(
+        run.scene.train.cameras[0], torch.ones(len(run.field), 1)
+    )
+    run.render(0, run.ask("left"))
+    flags = ("--load-config", run.config, "--text", "left", "--render-dir", tmp_path / "pictures")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    assert lifts >= 2 * (9 + 1) and len(drawn) >= lifts + 1 + 2 + 3 * 2
+    assert set(drawn) == {nl.RasterSettings.of_gsplat("1.6")}
+
+    drawn.clear()
+    assert (
+        nl.lift_run(trained, **given, lift=plain, output_dir=tmp_path / "plain").field.manifest["gsplat_rules"] == "1.4"
+    )
+    assert set(drawn) == {nl.RasterSettings()}

@@ -27,6 +27,7 @@ from normlift_ns.evaluation.results import Evaluation
 from normlift_ns.evaluation.scannet import NYU40, SceneLabels, check_identity, evaluate_scannet, read_labels
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.raster.rasterize import rasterize_evidence, render
+from normlift_ns.raster.settings import RasterSettings
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,15 @@ class EvaluatedRun:
         """Gaussians with a direction."""
         return self.field.valid(refined=self.refined)
 
+    @property
+    def settings(self) -> RasterSettings:
+        """Constants of the rasterizer, those of the lift."""
+        return RasterSettings.recorded(self.field.manifest)
+
     def composited(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
-        """[H, W, Q] and alpha [H, W]."""
-        return render(self.scene.gaussians, camera, values, rasterize_mode=self.scene.rasterize_mode)
+        """[H, W, Q] and alpha [H, W], drawn as for the lift."""
+        how = {"rasterize_mode": self.scene.rasterize_mode, "settings": self.settings}
+        return render(self.scene.gaussians, camera, values, **how)
 
     def cameras(self) -> dict[str, Camera]:
         """Of all photographs, trained and held out, by the name of the image."""
@@ -130,9 +137,13 @@ class MaskTruth:
     settings: Mapping[str, Any]
 
 
-def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
+def mask_truth(
+    scene: Scene, folder: Path, options: MaskOptions, *, settings: RasterSettings | None = None
+) -> MaskTruth:
     """The truth of Gaussians from the masks of the training views, and that of pixels in held-out views.
 
+    Args:
+        settings: constants of the rasterizer; those of gsplat 1.4 by default.
     Raises:
         FileNotFoundError, ValueError: masks or names that are missing or damaged; the message names the file.
     """
@@ -152,6 +163,7 @@ def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
         (found.int().clamp(min=UNLABELED) for found in classes(scene.train)),
         num_regions=[count] * len(scene.train),
         rasterize_mode=scene.rasterize_mode,
+        settings=settings,
     )
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
     if not bool((truth >= 0).any()):
@@ -159,8 +171,8 @@ def mask_truth(scene: Scene, folder: Path, options: MaskOptions) -> MaskTruth:
             f"no Gaussian lies in a mask of {folder}: check that their values are those named in "
             f"{options.names or folder.parent / 'labels.json'}, and --purity and --min-weight"
         )
-    settings = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
-    return MaskTruth(names.classes, truth, list(classes(scene.held_out)), settings)
+    facts = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
+    return MaskTruth(names.classes, truth, list(classes(scene.held_out)), facts)
 
 
 def run_masks(lifted: EvaluatedRun, truth: MaskTruth) -> Evaluation:

@@ -158,9 +158,8 @@ class NormLiftModel(SplatfactoModel):
             coefficients, values = coefficients[rows], values[rows]
         rgb = view_colors(scene.means, coefficients, view, shading_degree(self.config, self.step))
         depth = scene.means @ view.world_to_camera[2, :3, None] + view.world_to_camera[2, 3]
-        image, alpha = render(
-            scene, view, torch.cat([rgb, depth, values], dim=1), rasterize_mode=self.config.rasterize_mode
-        )
+        how = {"rasterize_mode": self.config.rasterize_mode, "settings": self._settings}
+        image, alpha = render(scene, view, torch.cat([rgb, depth, values], dim=1), **how)
         alpha = alpha[:, :, None]
         background = self._get_background_color()
         expected_depth = image[:, :, 3:4] / alpha.clamp(min=1e-10)
@@ -175,8 +174,12 @@ class NormLiftModel(SplatfactoModel):
     def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
         """sum_j A_ij value_j [H, W, C], by the rules of the lift."""
         drawn, mode = values if rows is None else values[rows], self.config.rasterize_mode
-        settings = RasterSettings.recorded({} if self._field is None else self._field.manifest)
-        return render(self._scene(rows), view, drawn, rasterize_mode=mode, settings=settings)[0]
+        return render(self._scene(rows), view, drawn, rasterize_mode=mode, settings=self._settings)[0]
+
+    @property
+    def _settings(self) -> RasterSettings:
+        """Constants of the rasterizer, those of the lift."""
+        return RasterSettings.recorded({} if self._field is None else self._field.manifest)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

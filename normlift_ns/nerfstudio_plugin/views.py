@@ -172,6 +172,8 @@ def _undistorted(
     if camera.distortion_params is None or bool((camera.distortion_params == 0).all()):
         return data["image"], intrinsics, data.get("mask")
     distortion = camera.distortion_params.numpy()
+    if int(camera.camera_type) == CameraType.FISHEYE624.value:
+        _check_aria(camera, masked="mask" in data)
     try:
         matrix, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics.numpy())
     except Exception as error:  # OpenCV's errors, and what nerfstudio makes of the numbers that it gets
@@ -180,6 +182,19 @@ def _undistorted(
         raise InputError(f"its distortion {distortion.tolist()} leaves no pixel of the image")
     pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
     return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
+
+
+def _check_aria(camera: Cameras, *, masked: bool) -> None:
+    """Refuses what nerfstudio has no undistortion for, or would make enormous pictures of."""
+    if masked:
+        raise InputError("nerfstudio undistorts photographs of FISHEYE624 cameras without masks only")
+    radius = (camera.metadata or {}).get("fisheye_crop_radius")
+    width, height = int(camera.width), int(camera.height)
+    if not isinstance(radius, float) or not 0.5 <= radius <= width + height:
+        raise InputError(
+            f"its fisheye_crop_radius is {radius!r}, where nerfstudio needs the radius in pixels of the circle that a "
+            f"FISHEYE624 camera sees: a number with a decimal point, up to {width + height}"
+        )
 
 
 def by_nerfstudio(

@@ -15,6 +15,7 @@ from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError
 from normlift_ns.raster import numba_kernels as kernels
+from normlift_ns.raster import numba_lists as lists
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import Projected, project
 from normlift_ns.raster.settings import RasterSettings
@@ -81,10 +82,10 @@ def _tiles(projected: Projected, camera: Camera, settings: RasterSettings) -> tu
     max_alpha, min_alpha, least = settings.max_alpha, settings.min_alpha, settings.min_transmittance
     radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
     sizes = (camera.width, camera.height, settings.tile_size)
-    lists = kernels.assign(
+    found = lists.assign(
         means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
     )
-    return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(least)), lists
+    return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(least)), found
 
 
 def warm(*dtypes: torch.dtype) -> Thread:
@@ -109,12 +110,12 @@ def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
     whole, wholes, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
     labels, members, limits = numba.int32[:, ::1], numba.int32[::1], numba.types.UniTuple(number, 3)
     slots = numba.types.Tuple((numba.int32[::1], numba.int32[::1], numba.float64[::1]))
-    lists = (wholes, members, table, table, numbers, numba.float64[:, ::1])
+    listed = (wholes, members, table, table, numbers, numba.float64[:, ::1])
     image = number[:, :, ::1]
     return [
-        (kernels.assign, (table, table, numbers, table, whole, whole, whole, number, whole)),
+        (lists.assign, (table, table, numbers, table, whole, whole, whole, number, whole)),
         (kernels.count_labels, (labels, whole)),
-        (kernels.fill, (*lists, wholes, labels, whole, whole, limits, wholes, wholes, slots, whole)),
+        (kernels.fill, (*listed, wholes, labels, whole, whole, limits, wholes, wholes, slots, whole)),
         (kernels.merge, (wholes, wholes, slots, whole, whole)),
-        (kernels.draw, (*lists, table, image, table, whole, limits, whole)),
+        (kernels.draw, (*listed, table, image, table, whole, limits, whole)),
     ]

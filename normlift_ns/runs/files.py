@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from normlift_ns.core.disk.digests import file_digest, text_digest
-from normlift_ns.core.disk.manifest import BESIDE, MANIFEST, check_files
+from normlift_ns.core.disk.manifest import BESIDE, MANIFEST, check_files, read_manifest
 from normlift_ns.core.files import clean, refuse_existing
 from normlift_ns.errors import InputError
 
@@ -92,6 +92,19 @@ def load_field(
 
     folder = field_folder(run_dir)
     return with_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
+
+
+def recorded_rules(run_dir: Path) -> str | None:
+    """The version of gsplat by whose rules a run was lifted; None: it is no lifted one, or does not say.
+
+    Raises:
+        ValueError: the manifest of its semantic field is damaged.
+    """
+    folder = run_dir / FIELD_FOLDER
+    if not (folder / MANIFEST).exists():
+        return None
+    rules = read_manifest(folder)[0].get("gsplat_rules")
+    return None if rules is None else str(rules)
 
 
 def with_paths(field: SemanticField, folder: Path) -> SemanticField:

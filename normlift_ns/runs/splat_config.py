@@ -6,13 +6,12 @@ from pathlib import Path
 
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.scenes.nerfstudio.classes import (
-    FullImageDatamanagerConfig,
-    NerfstudioDataParserConfig,
     NormLiftModelConfig,
     TrainerConfig,
     VanillaPipelineConfig,
     ViewerConfig,
 )
+from normlift_ns.scenes.nerfstudio.data_classes import FullImageDatamanagerConfig, NerfstudioDataParserConfig
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, TRANSFORMS_FILE
 

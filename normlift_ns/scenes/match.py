@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -53,18 +54,20 @@ class Match(NamedTuple):
     """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; else 1."""
 
 
-def match_photographs(scene: Scene) -> Match:
+def match_photographs(scene: Scene, settings: RasterSettings | None = None) -> Match:
     """Renders three training views at no more than 400 pixels and compares them with their photographs.
 
+    Args:
+        settings: constants of the rasterizer, at full size; those of gsplat 1.4 by default.
     Raises:
         FileNotFoundError, ValueError: a photograph that is missing or cannot be read.
     """
-    views = _some_views(scene)
+    views, settings = _some_views(scene), settings or RasterSettings()
     in_view = max(_share_in_view(scene, small.view.camera) for small in views)
-    each = {small.view.name: _psnr(small.view, _picture(scene, small, 1.0)) for small in views}
+    each = {small.view.name: _psnr(small.view, _picture(scene, small, 1.0, settings)) for small in views}
     plain, worst = sum(each.values()) / len(each), min(each, key=lambda name: each[name])
     grey = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
-    others = {factor: _mean_psnr(scene, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
+    others = {factor: _mean_psnr(scene, views, factor, settings) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
     best = max(others, key=lambda factor: others[factor])
     return Match(plain, (worst, each[worst]), in_view, grey, best if others[best] > plain + _FOCAL_GAIN else 1.0)
 
@@ -77,7 +80,7 @@ def mean_psnr(scene: Scene) -> float:
 def focal_psnrs(scene: Scene, factors: Sequence[float]) -> list[float]:
     """PSNR in dB on the three views, with the focal lengths times each of the factors."""
     views = _some_views(scene)
-    return [_mean_psnr(scene, views, factor) for factor in factors]
+    return [_mean_psnr(scene, views, factor, RasterSettings()) for factor in factors]
 
 
 def judge(match: Match, *, own_cameras: bool) -> str | None:
@@ -159,16 +162,16 @@ def _small(view: View) -> _Small:
     return _Small(View(smaller, image.round().to(torch.uint8), mask, view.name), divisor)
 
 
-def _mean_psnr(scene: Scene, views: Sequence[_Small], factor: float) -> float:
-    return sum(_psnr(small.view, _picture(scene, small, factor)) for small in views) / len(views)
+def _mean_psnr(scene: Scene, views: Sequence[_Small], factor: float, settings: RasterSettings) -> float:
+    return sum(_psnr(small.view, _picture(scene, small, factor, settings)) for small in views) / len(views)
 
 
-def _picture(scene: Scene, small: _Small, factor: float) -> UInt8[Tensor, "h w 3"]:
+def _picture(scene: Scene, small: _Small, factor: float, settings: RasterSettings) -> UInt8[Tensor, "h w 3"]:
     """The scene, as a render at full size would be if it were made smaller."""
     camera = _zoomed(small.view.camera, factor)
     fine = small.divisor < _FINE
-    settings = RasterSettings(eps2d=RasterSettings().eps2d / small.divisor**2 if fine else _THIN)
-    return render_picture(scene, camera, settings=settings, mode=scene.rasterize_mode if fine else "antialiased")
+    smaller = replace(settings, eps2d=settings.eps2d / small.divisor**2 if fine else _THIN)
+    return render_picture(scene, camera, settings=smaller, mode=scene.rasterize_mode if fine else "antialiased")
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:

@@ -136,7 +136,8 @@ class NormLiftEval:
         if self.protocol == "lerf":
             evaluate = partial(protocols.run_lerf, labels=self.labels, options=self.lerf)
             return evaluate, partial(studies.plain_signals, labels=self.labels)
-        truth = protocols.mask_truth(next(iter(runs)).scene, self.labels[0], self.masks)
+        run = next(iter(runs))
+        truth = protocols.mask_truth(run.scene, self.labels[0], self.masks, settings=run.settings)
         return (
             lambda some: protocols.run_masks(next(iter(some)), truth),
             lambda some: studies.mask_signals(some[0], truth),

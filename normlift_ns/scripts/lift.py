@@ -184,7 +184,7 @@ def summary(run: LiftedRun, before: dict[str, float], total: float, queries: tup
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"
         table.add_row("refined", f"{numbers['refined_share']:.1%} of Gaussians; {lost}")
     seconds = {**before, **run.seconds}
-    seconds |= {"check, write": total - sum(seconds.values()), "total": total}
+    seconds |= {"other": total - sum(seconds.values()), "total": total}
     table.add_row("seconds", "  ".join(f"{name} {t:.1f}" for name, t in seconds.items()))
     cost = facts["cost"]
     gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""

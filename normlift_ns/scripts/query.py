@@ -111,12 +111,14 @@ class NormLiftQuery:
         """What draws the pictures; everything that they need is there when it is returned."""
         from normlift_ns.asking import answer  # noqa: PLC0415 (as above)
         from normlift_ns.front_door import open_run  # noqa: PLC0415
+        from normlift_ns.raster.settings import RasterSettings  # noqa: PLC0415
         from normlift_ns.viewer.pictures import save_overlays, training_cameras  # noqa: PLC0415
 
         run, folder = open_run(self.load_config, data=self.data), cast(Path, self.render_dir)
         cameras = training_cameras(run.scene, self.render_views)
         found = answer(run.field, run.scene.gaussians.means, question)
-        return lambda: save_overlays(run.scene, found, cameras, folder, overwrite=self.overwrite)
+        settings = RasterSettings.recorded(run.field.manifest)
+        return lambda: save_overlays(run.scene, found, cameras, folder, settings=settings, overwrite=self.overwrite)
 
     def _check(self) -> None:
         """Raises what can be told before anything is loaded."""

@@ -18,17 +18,25 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
 from normlift_ns.observing import spread
 from normlift_ns.raster.rasterize import render, render_picture
+from normlift_ns.raster.settings import RasterSettings
 
 _INCHES, _DPI = 6.0, 120
 
 
 def save_overlays(
-    scene: Scene, answer: Answer, cameras: dict[str, Camera], folder: Path, *, overwrite: bool = False
+    scene: Scene,
+    answer: Answer,
+    cameras: dict[str, Camera],
+    folder: Path,
+    *,
+    settings: RasterSettings | None = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Writes one PNG per camera and text: the rendered scene, and where the text is found on it.
 
     Args:
         cameras: by the name that the files get.
+        settings: constants of the rasterizer; those of gsplat 1.4 by default.
         overwrite: replace files of these names.
     Raises:
         FileExistsError: there is one, and `overwrite` is False.
@@ -41,9 +49,10 @@ def save_overlays(
         raise InputError(f"two pictures would be called {folder / twice[0]}; render one of their views at a time")
     paths = []
     for camera, files in zip(cameras.values(), names):
-        values, alpha = render(scene.gaussians, camera, answer.relevancy, rasterize_mode=scene.rasterize_mode)
+        mode = scene.rasterize_mode
+        values, alpha = render(scene.gaussians, camera, answer.relevancy, rasterize_mode=mode, settings=settings)
         relevancy = pixel_relevancy(values, alpha)
-        image = render_picture(scene, camera)
+        image = render_picture(scene, camera, settings=settings)
         for q, text in enumerate(answer.texts):
             paths.append(folder / files[q])
             with new_file(paths[-1], overwrite=overwrite) as draft:

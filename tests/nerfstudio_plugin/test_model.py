@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import urllib.error
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +17,7 @@ from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 from normlift_ns.question import Question
 from normlift_ns.raster.rasterize import render, render_picture
+from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.viewer.display import make_display
 from tests.nerfstudio_plugin.conftest import lifted_field, write
 from tests.nerfstudio_plugin.stock_run import SmallLpips, StockRun, rasterization, splatfacto_on_cpu, train_splatfacto
@@ -68,6 +69,16 @@ def test_the_run_renders_what_the_model_renders(pipeline, stock: StockRun) -> No
     run = load_scene(stock.config)
     picture = render_picture(run, run.train.cameras[2])
     torch.testing.assert_close(picture.float() / 255, _outputs(pipeline, 2)["rgb"], atol=0.51 / 255, rtol=0)
+
+
+def test_a_run_is_drawn_by_the_rules_of_its_lift(pipeline, stock: StockRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, later = pipeline.model._field, RasterSettings.of_gsplat("1.6")
+    monkeypatch.setattr(pipeline.model, "_field", replace(field, manifest={**field.manifest, "gsplat_rules": "1.6"}))
+    pipeline.model.opacities.data.fill_(9)  # alpha is cut off at 0.99 by these rules, at 0.999 by those of 1.4
+    camera, scene = load_scene(stock.config).train.cameras[2], pipeline.model._scene(None)
+    alphas = [render(scene, camera, scene.means, settings=rules)[1] for rules in (later, RasterSettings())]
+    assert (alphas[0] - alphas[1]).abs().max() > 1e-3
+    torch.testing.assert_close(_outputs(pipeline, 2)["accumulation"][:, :, 0], alphas[0], atol=1e-6, rtol=0)
 
 
 def test_colours_without_spherical_harmonics(workspace: Path, registered: None, tmp_path: Path) -> None:

@@ -44,6 +44,37 @@ def test_views_are_those_of_the_training(stock: StockRun) -> None:
     _assert_like_the_training(stock)
 
 
+def arias(folder: Path, *, masks: bool = False, **more: object) -> None:
+    """A dataset of photographs as Aria's glasses take them; `more` stands in its transforms.json."""
+    write_dataset(folder, masks=masks)
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    del meta["k1"]
+    lens = [0.02, -0.01, 0.004, 0.002, -0.001, 0.0005, 0.001, -0.0008, 0.0006, 0.0002, -0.0004, 0.0001]
+    path.write_text(json.dumps(meta | {"camera_model": "FISHEYE624", "distortion_params": lens, **more}))
+
+
+def test_cameras_of_aria_are_undistorted_as_in_the_training(tmp_path: Path) -> None:
+    arias(tmp_path / "scene", fisheye_crop_radius=15.0)
+    run = train_splatfacto(tmp_path, Path("scene"), steps=1)
+    _assert_like_the_training(run)
+    opened = load_scene(run.config)
+    view = opened.train[0]
+    assert view.image.shape == (30, 30, 3)
+    assert view.mask is not None and 0.5 < view.mask.float().mean() < 1
+    assert view.original == (WIDTH, HEIGHT)
+    assert [camera.width for camera in opened.held_out.cameras] == [30]
+    shutil.rmtree(tmp_path / "scene")
+    arias(tmp_path / "scene", masks=True, fisheye_crop_radius=15.0)
+    with pytest.raises(ValueError, match=r"FISHEYE624 cameras without masks only"):
+        _ = load_scene(run.config).train[0]
+    for radius in (None, 15, 1e9, 0.0):
+        shutil.rmtree(tmp_path / "scene")
+        arias(tmp_path / "scene", fisheye_crop_radius=radius)
+        with pytest.raises(ValueError, match=r"its fisheye_crop_radius is .*, where nerfstudio needs the radius"):
+            _ = load_scene(run.config).train.cameras
+
+
 def test_undistortion_changes_size_and_focal_length(stock: StockRun) -> None:
     run = load_scene(stock.config)
     for views in (run.train, run.held_out):

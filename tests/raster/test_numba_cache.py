@@ -3,7 +3,7 @@
 import numba
 import pytest
 
-from normlift_ns.raster.numba_kernels import _compiled
+from normlift_ns.raster.numba_compiling import compiled
 
 
 def test_without_a_place_for_a_cache_kernels_are_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -17,6 +17,6 @@ def test_without_a_place_for_a_cache_kernels_are_compiled_anew(monkeypatch: pyte
 
     with monkeypatch.context() as patch:
         patch.setattr(numba, "njit", nowhere)
-        twice = _compiled()(lambda x: 2 * x)
+        twice = compiled()(lambda x: 2 * x)
     assert twice(21) == 42
     assert asked == [True, False]

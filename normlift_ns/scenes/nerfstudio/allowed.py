@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from normlift_ns.scenes.nerfstudio.classes import NAMES, READ, EventName, Target, named
+from normlift_ns.scenes.nerfstudio.classes import NAMES, READ, EventName
+from normlift_ns.scenes.nerfstudio.targets import Target, named
 
 OBJECT_TAG = "tag:yaml.org,2002:python/object"
 _NAME_TAG, _TUPLE_TAG = "tag:yaml.org,2002:python/name:", "tag:yaml.org,2002:python/tuple"

@@ -11,15 +11,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.scenes.nerfstudio.allowed import PAIRS
-from normlift_ns.scenes.nerfstudio.classes import (
-    NAMES,
-    DataParser,
-    FullImageDatamanagerConfig,
-    OptimizerConfig,
-    SchedulerConfig,
-    SplatfactoModelConfig,
-    TrainerConfig,
-)
+from normlift_ns.scenes.nerfstudio.classes import NAMES, SplatfactoModelConfig, TrainerConfig
+from normlift_ns.scenes.nerfstudio.data_classes import DataParser, FullImageDatamanagerConfig
+from normlift_ns.scenes.nerfstudio.optimizer_classes import OptimizerConfig, SchedulerConfig
 
 _PARTS = {
     "pipeline": ("VanillaPipelineConfig", "NormLiftPipelineConfig"),

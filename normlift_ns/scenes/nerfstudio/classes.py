@@ -6,39 +6,30 @@ along what it configures; here `_target` is only the name of that.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal
 
 from normlift_ns.options import LiftOptions, RefineConfig, SourceOptions
+from normlift_ns.scenes.nerfstudio.data_classes import (
+    BlenderDataParserConfig,
+    ColmapDataParserConfig,
+    FullImageDatamanagerConfig,
+    NerfstudioDataParserConfig,
+)
+from normlift_ns.scenes.nerfstudio.optimizer_classes import (
+    AdamOptimizerConfig,
+    CosineDecaySchedulerConfig,
+    ExponentialDecaySchedulerConfig,
+    MultiStepSchedulerConfig,
+    OptimizerConfig,
+    RAdamOptimizerConfig,
+    SchedulerConfig,
+)
+from normlift_ns.scenes.nerfstudio.targets import Target, target
 
 _BASE, _DATA, _OURS = "nerfstudio.configs.base_config", "nerfstudio.data", "normlift_ns.nerfstudio_plugin"
-
-
-@dataclass(frozen=True)
-class Target:
-    """A class or function that a config names, which is neither imported nor called."""
-
-    name: str
-
-    def __deepcopy__(self, memo: object) -> Target:
-        """Itself, as a class is."""
-        return self
-
-
-TARGETS: dict[str, Target] = {}
-"""One object per name, so that a dump refers to it as to one class."""
-
-
-def named(name: str) -> Target:
-    """The target of that name."""
-    return TARGETS.setdefault(name, Target(name))
-
-
-def _target(name: str) -> Callable[[], Target]:
-    return lambda: named(name)
 
 
 class EventName(Enum):
@@ -69,7 +60,7 @@ class MachineConfig:
 class LocalWriterConfig:
     """Mirror of nerfstudio's."""
 
-    _target: Target = field(default_factory=_target("nerfstudio.utils.writer.LocalWriter"))
+    _target: Target = field(default_factory=target("nerfstudio.utils.writer.LocalWriter"))
     enable: bool = False
     stats_to_track: tuple[EventName, ...] = (
         EventName.ITER_TRAIN_TIME,
@@ -112,158 +103,10 @@ class ViewerConfig:
 
 
 @dataclass
-class NerfstudioDataParserConfig:
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target(f"{_DATA}.dataparsers.nerfstudio_dataparser.Nerfstudio"))
-    data: Path = Path()
-    scale_factor: float = 1.0
-    downscale_factor: int | None = None
-    scene_scale: float = 1.0
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
-    center_method: Literal["poses", "focus", "none"] = "poses"
-    auto_scale_poses: bool = True
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "fraction"
-    train_split_fraction: float = 0.9
-    eval_interval: int = 8
-    depth_unit_scale_factor: float = 1e-3
-    mask_color: tuple[float, float, float] | None = None
-    load_3D_points: bool = False
-
-
-@dataclass
-class ColmapDataParserConfig:
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target(f"{_DATA}.dataparsers.colmap_dataparser.ColmapDataParser"))
-    data: Path = Path()
-    scale_factor: float = 1.0
-    downscale_factor: int | None = None
-    downscale_rounding_mode: Literal["floor", "round", "ceil"] = "floor"
-    scene_scale: float = 1.0
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
-    center_method: Literal["poses", "focus", "none"] = "poses"
-    auto_scale_poses: bool = True
-    assume_colmap_world_coordinate_convention: bool = True
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    train_split_fraction: float = 0.9
-    eval_interval: int = 8
-    depth_unit_scale_factor: float = 1e-3
-    images_path: Path = Path("images")
-    masks_path: Path | None = None
-    depths_path: Path | None = None
-    colmap_path: Path = Path("colmap/sparse/0")
-    load_3D_points: bool = True
-    max_2D_matches_per_3D_point: int = 0
-
-
-@dataclass
-class BlenderDataParserConfig:
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target(f"{_DATA}.dataparsers.blender_dataparser.Blender"))
-    data: Path = Path("data/blender/lego")
-    scale_factor: float = 1.0
-    alpha_color: str | None = "white"
-    ply_path: Path | None = None
-
-
-DataParser = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
-"""Those whose data sets are read."""
-
-
-@dataclass
-class FullImageDatamanagerConfig:
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(
-        default_factory=_target(f"{_DATA}.datamanagers.full_images_datamanager.FullImageDatamanager")
-    )
-    data: Path | None = None
-    masks_on_gpu: bool = False
-    images_on_gpu: bool = False
-    dataparser: DataParser = field(default_factory=NerfstudioDataParserConfig)
-    camera_res_scale_factor: float = 1.0
-    eval_num_images_to_sample_from: int = -1
-    eval_num_times_to_repeat_images: int = -1
-    eval_image_indices: tuple[int, ...] | None = (0,)
-    cache_images: Literal["cpu", "gpu"] = "gpu"
-    cache_images_type: Literal["uint8", "float32"] = "float32"
-    max_thread_workers: int | None = None
-    train_cameras_sampling_strategy: Literal["random", "fps"] = "random"
-    train_cameras_sampling_seed: int = 42
-    fps_reset_every: int = 100
-
-
-@dataclass
-class OptimizerConfig:
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target("torch.optim.adam.Adam"))
-    lr: float = 0.0005
-    eps: float = 1e-08
-    max_norm: float | None = None
-
-
-@dataclass
-class AdamOptimizerConfig(OptimizerConfig):
-    """Mirror of nerfstudio's."""
-
-    weight_decay: float = 0
-
-
-@dataclass
-class RAdamOptimizerConfig(OptimizerConfig):
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target("torch.optim.radam.RAdam"))
-    weight_decay: float = 0
-
-
-@dataclass
-class SchedulerConfig:
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target("nerfstudio.engine.schedulers.Scheduler"))
-
-
-@dataclass
-class MultiStepSchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target("nerfstudio.engine.schedulers.MultiStepScheduler"))
-    max_steps: int = 1000000
-    gamma: float = 0.33
-    milestones: tuple[int, ...] = (500000, 750000, 900000)
-
-
-@dataclass
-class ExponentialDecaySchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target("nerfstudio.engine.schedulers.ExponentialDecayScheduler"))
-    lr_pre_warmup: float = 1e-8
-    lr_final: float | None = None
-    warmup_steps: int = 0
-    max_steps: int = 100000
-    ramp: Literal["linear", "cosine"] = "cosine"
-
-
-@dataclass
-class CosineDecaySchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's."""
-
-    _target: Target = field(default_factory=_target("nerfstudio.engine.schedulers.CosineDecayScheduler"))
-    warm_up_end: int = 5000
-    learning_rate_alpha: float = 0.05
-    max_steps: int = 300000
-
-
-@dataclass
 class CameraOptimizerConfig:
     """Mirror of nerfstudio's."""
 
-    _target: Target = field(default_factory=_target("nerfstudio.cameras.camera_optimizers.CameraOptimizer"))
+    _target: Target = field(default_factory=target("nerfstudio.cameras.camera_optimizers.CameraOptimizer"))
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
     trans_l2_penalty: float = 1e-2
     rot_l2_penalty: float = 1e-3
@@ -275,7 +118,7 @@ class CameraOptimizerConfig:
 class SplatfactoModelConfig:
     """Mirror of nerfstudio's."""
 
-    _target: Target = field(default_factory=_target("nerfstudio.models.splatfacto.SplatfactoModel"))
+    _target: Target = field(default_factory=target("nerfstudio.models.splatfacto.SplatfactoModel"))
     enable_collider: bool = True
     collider_params: dict[str, float] | None = field(default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0})
     loss_coefficients: dict[str, float] = field(default_factory=lambda: {"rgb_loss_coarse": 1.0, "rgb_loss_fine": 1.0})
@@ -317,7 +160,7 @@ class SplatfactoModelConfig:
 class NormLiftModelConfig(SplatfactoModelConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.model.NormLiftModelConfig`."""
 
-    _target: Target = field(default_factory=_target(f"{_OURS}.model.NormLiftModel"))
+    _target: Target = field(default_factory=target(f"{_OURS}.model.NormLiftModel"))
     semantics: Path | None = None
 
     @staticmethod
@@ -331,7 +174,7 @@ class NormLiftModelConfig(SplatfactoModelConfig):
 class VanillaPipelineConfig:
     """Mirror of nerfstudio's."""
 
-    _target: Target = field(default_factory=_target("nerfstudio.pipelines.base_pipeline.VanillaPipeline"))
+    _target: Target = field(default_factory=target("nerfstudio.pipelines.base_pipeline.VanillaPipeline"))
     datamanager: FullImageDatamanagerConfig = field(default_factory=FullImageDatamanagerConfig)
     model: SplatfactoModelConfig = field(default_factory=SplatfactoModelConfig)
 
@@ -340,7 +183,7 @@ class VanillaPipelineConfig:
 class NormLiftPipelineConfig(VanillaPipelineConfig):
     """Mirror of `normlift_ns.nerfstudio_plugin.pipeline.NormLiftPipelineConfig`."""
 
-    _target: Target = field(default_factory=_target(f"{_OURS}.pipeline.NormLiftPipeline"))
+    _target: Target = field(default_factory=target(f"{_OURS}.pipeline.NormLiftPipeline"))
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
     queries: tuple[str, ...] = ()
@@ -350,7 +193,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 class TrainerConfig:
     """Mirror of nerfstudio's."""
 
-    _target: Target = field(default_factory=_target("nerfstudio.engine.trainer.Trainer"))
+    _target: Target = field(default_factory=target("nerfstudio.engine.trainer.Trainer"))
     output_dir: Path = Path("outputs")
     method_name: str | None = None
     experiment_name: str | None = None

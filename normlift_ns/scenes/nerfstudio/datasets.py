@@ -13,7 +13,7 @@ from pathlib import Path
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.colmap import read_model
 from normlift_ns.scenes.image_files import read_head
-from normlift_ns.scenes.nerfstudio.classes import (
+from normlift_ns.scenes.nerfstudio.data_classes import (
     BlenderDataParserConfig,
     ColmapDataParserConfig,
     DataParser,

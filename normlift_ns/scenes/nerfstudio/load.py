@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,17 +19,17 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
 from normlift_ns.scenes.nerfstudio.appearance import COLORS, LOADED_STEP, background, shading_degree
-from normlift_ns.scenes.nerfstudio.classes import (
+from normlift_ns.scenes.nerfstudio.classes import SplatfactoModelConfig, TrainerConfig
+from normlift_ns.scenes.nerfstudio.config import RunLocation, locate, read_config, rebased
+from normlift_ns.scenes.nerfstudio.data_classes import (
     BlenderDataParserConfig,
     FullImageDatamanagerConfig,
     NerfstudioDataParserConfig,
-    SplatfactoModelConfig,
-    TrainerConfig,
 )
-from normlift_ns.scenes.nerfstudio.config import RunLocation, locate, read_config, rebased
 from normlift_ns.scenes.nerfstudio.datasets import check_dataset
-from normlift_ns.scenes.nerfstudio.parsers import Photographs, parse
+from normlift_ns.scenes.nerfstudio.parsers import parse
 from normlift_ns.scenes.nerfstudio.poses import adjusted
+from normlift_ns.scenes.nerfstudio.splits import Photographs
 from normlift_ns.scenes.nerfstudio.views import Reading, TrainedViews
 from normlift_ns.scenes.similarity import read_dataparser_transforms
 
@@ -62,6 +62,8 @@ class NerfstudioScene:
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
     """From the poses in the dataset to the scene's world: scale * (transform @ point)."""
+    identity: Mapping[str, Any]
+    """Config and step, for the manifest; of a lifted run also the rules that it was drawn by."""
     remarks: tuple[str, ...] = ()
     """What a person should know of the photographs, in whole sentences."""
 
@@ -82,11 +84,6 @@ class NerfstudioScene:
     def runs_dir(self) -> Path:
         """The folder above the runs of this experiment, outputs/ by default."""
         return self.location.output_dir
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """Config and step, for the manifest."""
-        return {"source_config": str(self.location.run_dir / "config.yml"), "source_step": self.checkpoint.step}
 
     @property
     def background(self) -> Float[Tensor, " 3"]:
@@ -168,8 +165,9 @@ def load_scene(
         train = TrainedViews(found.train, location.folder, poses, behind, reading)
         held_out = TrainedViews(found.held_out, location.folder, found.held_out.poses, behind, reading)
     remarks += train.check_files()
+    identity = {"source_config": str(location.run_dir / "config.yml"), "source_step": checkpoint.step}
     return NerfstudioScene(
-        stored, location, checkpoint, gaussians, train, held_out, found.transform, found.scale, remarks
+        stored, location, checkpoint, gaussians, train, held_out, found.transform, found.scale, identity, remarks
     )
 
 

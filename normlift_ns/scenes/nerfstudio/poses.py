@@ -3,14 +3,46 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.errors import InputError
+from normlift_ns.scenes.nerfstudio.data_classes import ColmapDataParserConfig, NerfstudioDataParserConfig
 
 _NEARLY_PARALLEL, _LEAST_TILT = 1e-6, 0.17
+
+
+def placed(
+    rows: Any, parser: NerfstudioDataParserConfig | ColmapDataParserConfig, orientation: str
+) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"], float]:
+    """Poses in the scene's world, the transform to it, and its scale.
+
+    Raises:
+        ValueError: poses that are no 4 x 4 matrices, or a method that nerfstudio does not have.
+    """
+    poses = torch.from_numpy(np.array(rows).astype(np.float32))
+    if poses.shape[1:] != (4, 4):
+        raise InputError(f"a pose has {poses.shape[1]} rows, expected 4")
+    poses, transform = orient_and_center(poses, orientation, parser.center_method)
+    scale = 1.0
+    if parser.auto_scale_poses:
+        scale /= float(torch.max(torch.abs(poses[:, :3, 3])))
+    scale *= parser.scale_factor
+    poses[:, :3, 3] *= scale
+    return poses, transform, scale
+
+
+def with_applied(transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None) -> Float[Tensor, "3 4"]:
+    """The transform from the capture's own world, where the poses in the file were moved before."""
+    if applied is None:
+        return transform
+    rows = torch.cat([torch.tensor(applied, dtype=transform.dtype), torch.tensor([[0.0, 0.0, 0.0, 1.0]])], 0)
+    return transform @ rows
 
 
 def orient_and_center(

@@ -20,7 +20,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.scenes import photographs
 from normlift_ns.scenes.frames import Intrinsics
 from normlift_ns.scenes.image_files import check_mask, read_head, remarks
-from normlift_ns.scenes.nerfstudio.parsers import Photographs
+from normlift_ns.scenes.nerfstudio.splits import Photographs
 from normlift_ns.scenes.photographs import to_camera
 
 _READ_WELL = {"RGB", "RGBA", "L", "CMYK"}
