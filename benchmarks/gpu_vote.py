@@ -32,14 +32,15 @@ from normlift_ns.kernels.vote import Tuning
 
 PRECISIONS = ("tf32x3", "halves", "certified")
 TUNINGS = (
+    Tuning(64, 32, 3, 4, 128),
     Tuning(64, 32, 3, 4),
-    Tuning(64, 64, 3, 4),
-    Tuning(64, 32, 2, 4),
-    Tuning(128, 32, 2, 4),
-    Tuning(128, 64, 2, 4),
-    Tuning(32, 32, 4, 4),
-    Tuning(64, 32, 3, 4, registers=96),
-    Tuning(128, 32, 2, 4, registers=96),
+    Tuning(64, 32, 3, 4, 96),
+    Tuning(64, 64, 3, 4, 128),
+    Tuning(64, 32, 2, 4, 128),
+    Tuning(128, 32, 2, 4, 128),
+    Tuning(128, 64, 2, 4, 128),
+    Tuning(128, 32, 2, 4, 96),
+    Tuning(32, 32, 4, 4, 128),
     Tuning(64, 32, 3, 2),
     Tuning(32, 32, 3, 2),
     Tuning(64, 32, 3, 1),

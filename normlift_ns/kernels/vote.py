@@ -37,7 +37,7 @@ class Tuning(NamedTuple):
     """Most of a thread: with fewer, more programs run at once."""
 
 
-_HALVES = Tuning(columns=64, columns_later=32, stages=3, warps=4)
+_HALVES = Tuning(columns=64, columns_later=32, stages=3, warps=4, registers=128)
 _WHOLE = Tuning(columns=64, columns_later=64, stages=3, warps=4)
 _ROWS = 16
 
