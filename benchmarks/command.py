@@ -5,9 +5,9 @@
     python -m benchmarks.command --config outputs/.../config.yml      a run of your own in place of the fox
 
 CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts are of patches: a first one with empty
-caches of kernels, first ones with those filled (median of 3), and ones with every stage cached (median of 3). The
-error of a new text is that of its vector against open_clip in float64. What the file holds of the other kind of machine
-stays.
+caches of kernels and bytecode, first ones with those filled (median of 3; pip leaves packages with their bytecode), and
+ones with every stage cached (median of 3). The error of a new text is that of its vector against open_clip in float64.
+What the file holds of the other kind of machine stays.
 """
 
 from __future__ import annotations
@@ -63,7 +63,12 @@ lift.entrypoint()
 def lifted(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, float]:
     """Lifts into folder/NAME, kernels cached in folder/kernels; seconds of every stage, and `wall` of the process."""
     seconds, kernels = folder / "seconds.json", folder / "kernels"
-    environment = {"SECONDS_FILE": str(seconds), "TRITON_CACHE_DIR": f"{kernels}/t", "NUMBA_CACHE_DIR": f"{kernels}/n"}
+    environment = {
+        "SECONDS_FILE": str(seconds),
+        "TRITON_CACHE_DIR": f"{kernels}/triton",
+        "NUMBA_CACHE_DIR": f"{kernels}/numba",
+        "PYTHONPYCACHEPREFIX": f"{kernels}/python",
+    }
     given = ("--load-config", trained, "--output-dir", folder / name, *flags)
     cost = run(HERE, "lift", *given, program=LIFT, environment=environment)
     taken = {**json.loads(seconds.read_text()), "wall": cost.wall}

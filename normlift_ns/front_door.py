@@ -228,7 +228,7 @@ def lift_run(
     how, stages = lift or LiftOptions(), Stages(report)
     if check:
         with stages("check") as step:
-            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)))
+            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)), device=device)
             warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
             step()
         if warning is not None:

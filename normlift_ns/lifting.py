@@ -29,6 +29,7 @@ from normlift_ns.options import BackendName, LiftOptions, RefineConfig
 from normlift_ns.raster.gsplat import rules_named
 from normlift_ns.raster.rasterize import backend_of
 from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.rehearsal import rehearse
 from normlift_ns.stages import Report, Stages, cost
 
 _FEW = 0.01
@@ -99,7 +100,8 @@ def lift_scene(
     used = [usable[i] for i in spread(len(usable), options.max_views)]
     if export is not None:
         refuse_equal_stems([views.names[index] for index in used])
-    evidence, features = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages)
+    ready = _get_ready(scene, gaussians, options, drawing)
+    evidence, features = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages, ready)
     with stages("lift") as step:
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
         _check_seen(evidence, lifted.scalars, source)
@@ -142,6 +144,18 @@ def _drawing(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Dr
     power = options.weight_power
     backend = backend_of(gaussians, options.backend, settings=settings, dtype=dtype, weight_power=power)
     return Drawing(rules, backend, dtype)
+
+
+def _get_ready(scene: Scene, gaussians: GaussianScene, options: LiftOptions, drawing: Drawing) -> Callable[[], None]:
+    """Has kernels compiled or loaded meanwhile; waits for them when it is called."""
+    if drawing.backend == "numba":
+        from normlift_ns.raster.numba import warm  # noqa: PLC0415 (importing numba takes a second)
+
+        return warm(drawing.dtype).join
+    if drawing.backend != "triton" or len(scene.train) == 0:
+        return lambda: None
+    how = {"settings": drawing.settings, "backend": drawing.backend, "dtype": drawing.dtype}
+    return rehearse(gaussians, scene.train.cameras[0], options, rasterize_mode=scene.rasterize_mode, **how).join
 
 
 def _check_seen(evidence: Evidence, scalars: Scalars, source: FeatureSource) -> None:
@@ -187,6 +201,7 @@ def _observe(
     cache: Path,
     export: Export | None,
     stages: Stages,
+    ready: Callable[[], None],
 ) -> tuple[Evidence, Float[Tensor, "s d"]]:
     """Evidence and feature table of some training views, block by block, so that an interrupted lift can resume."""
     seen = cached(source, cache) if options.reuse_evidence else source
@@ -204,6 +219,7 @@ def _observe(
             block = observe_views(scene, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
             tables.extend(block.features)
         with stages("evidence", len(used)) as step:
+            ready()
             evidence = block_evidence(
                 gaussians,
                 block,

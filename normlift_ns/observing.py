@@ -7,13 +7,13 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
+from xxhash import xxh3_128
 
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -31,7 +31,7 @@ _READERS = 8
 """Photographs that are read at a time."""
 _SMALLEST = 8
 """Pixels along a side of an image made smaller; fewer show nothing."""
-_KEY = "normlift_ns.block/4"
+_KEY = "normlift_ns.block/5"
 """Part of every key: to be raised when evidence changes for the same input."""
 
 
@@ -190,7 +190,7 @@ def _of_regions(evidence: Evidence, block: Block) -> Evidence:
 
 
 def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
-    key = blake2b(json.dumps(facts).encode(), digest_size=16)
+    key = xxh3_128(json.dumps(facts).encode())
     for tensor in tensors:
         key.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
         key.update(tensor.detach().cpu().contiguous().numpy().tobytes())

@@ -163,19 +163,26 @@ def render(
 
 
 def render_picture(
-    scene: Scene, camera: Camera, *, settings: RasterSettings | None = None, mode: RasterizeMode | None = None
+    scene: Scene,
+    camera: Camera,
+    *,
+    settings: RasterSettings | None = None,
+    mode: RasterizeMode | None = None,
+    gaussians: GaussianScene | None = None,
 ) -> UInt8[Tensor, "h w 3"]:
     """The trained scene as a camera sees it, sRGB on its background: by the scene's own renderer if it has one.
 
     Args:
         settings, mode: other constants and another mode than those of the training, for pictures of another size.
+        gaussians: those of the scene on the device that renders; the picture is on the CPU.
     """
     if scene.renderer is not None:
         return scene.renderer(camera)
     how = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
-    color, alpha = render(scene.gaussians, camera, scene.colors(camera), **how)
-    color = color + (1 - alpha)[:, :, None] * scene.background
-    return (color.clamp(0, 1) * 255).round().to(torch.uint8)
+    there = gaussians or scene.gaussians
+    color, alpha = render(there, camera, scene.colors(camera).to(there.means.device), **how)
+    color = color + (1 - alpha)[:, :, None] * scene.background.to(color)
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
 def _job(

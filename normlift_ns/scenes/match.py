@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.errors import InputError
 from normlift_ns.raster.rasterize import render_picture
@@ -54,20 +55,22 @@ class Match(NamedTuple):
     """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; else 1."""
 
 
-def match_photographs(scene: Scene, settings: RasterSettings | None = None) -> Match:
+def match_photographs(scene: Scene, settings: RasterSettings | None = None, *, device: str = "cpu") -> Match:
     """Renders three training views at no more than 400 pixels and compares them with their photographs.
 
     Args:
         settings: constants of the rasterizer, at full size; those of gsplat 1.4 by default.
+        device: where to render.
     Raises:
         FileNotFoundError, ValueError: a photograph that is missing or cannot be read.
     """
     views, settings = _some_views(scene), settings or RasterSettings()
+    draw = partial(_picture, scene, scene.gaussians.to(device), settings)
     in_view = max(_share_in_view(scene, small.view.camera) for small in views)
-    each = {small.view.name: _psnr(small.view, _picture(scene, small, 1.0, settings)) for small in views}
+    each = {small.view.name: _psnr(small.view, draw(small, 1.0)) for small in views}
     plain, worst = sum(each.values()) / len(each), min(each, key=lambda name: each[name])
     grey = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
-    others = {factor: _mean_psnr(scene, views, factor, settings) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
+    others = {factor: _mean_psnr(draw, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
     best = max(others, key=lambda factor: others[factor])
     return Match(plain, (worst, each[worst]), in_view, grey, best if others[best] > plain + _FOCAL_GAIN else 1.0)
 
@@ -79,8 +82,8 @@ def mean_psnr(scene: Scene) -> float:
 
 def focal_psnrs(scene: Scene, factors: Sequence[float]) -> list[float]:
     """PSNR in dB on the three views, with the focal lengths times each of the factors."""
-    views = _some_views(scene)
-    return [_mean_psnr(scene, views, factor, RasterSettings()) for factor in factors]
+    views, draw = _some_views(scene), partial(_picture, scene, scene.gaussians, RasterSettings())
+    return [_mean_psnr(draw, views, factor) for factor in factors]
 
 
 def judge(match: Match, *, own_cameras: bool) -> str | None:
@@ -162,16 +165,19 @@ def _small(view: View) -> _Small:
     return _Small(View(smaller, image.round().to(torch.uint8), mask, view.name), divisor)
 
 
-def _mean_psnr(scene: Scene, views: Sequence[_Small], factor: float, settings: RasterSettings) -> float:
-    return sum(_psnr(small.view, _picture(scene, small, factor, settings)) for small in views) / len(views)
+def _mean_psnr(draw: Callable[[_Small, float], Tensor], views: Sequence[_Small], factor: float) -> float:
+    return sum(_psnr(small.view, draw(small, factor)) for small in views) / len(views)
 
 
-def _picture(scene: Scene, small: _Small, factor: float, settings: RasterSettings) -> UInt8[Tensor, "h w 3"]:
+def _picture(
+    scene: Scene, gaussians: GaussianScene, settings: RasterSettings, small: _Small, factor: float
+) -> UInt8[Tensor, "h w 3"]:
     """The scene, as a render at full size would be if it were made smaller."""
     camera = _zoomed(small.view.camera, factor)
     fine = small.divisor < _FINE
     smaller = replace(settings, eps2d=settings.eps2d / small.divisor**2 if fine else _THIN)
-    return render_picture(scene, camera, settings=smaller, mode=scene.rasterize_mode if fine else "antialiased")
+    mode = scene.rasterize_mode if fine else "antialiased"
+    return render_picture(scene, camera, settings=smaller, mode=mode, gaussians=gaussians)
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:

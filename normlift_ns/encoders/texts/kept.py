@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float32
+from xxhash import xxh3_128
 
 from normlift_ns.core.disk.arrays import load_arrays, save_arrays
 from normlift_ns.core.disk.digests import file_digest
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
     from normlift_ns.encoders.source import TextEncoder
 
-FORMAT = "normlift_ns.encoders/2"
+FORMAT = "normlift_ns.encoders/3"
 """Part of every key: to be raised when labels or features change for the same settings."""
 _TEXT = "text"
 
@@ -32,7 +33,7 @@ _TEXT = "text"
 def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Path:
     """Where a cache keeps what was made from some content with some settings, whether it is there or not."""
     parts = (FORMAT.encode(), json.dumps(identity, sort_keys=True).encode(), *content)
-    key = blake2b(b"".join(blake2b(part).digest() for part in parts), digest_size=16).hexdigest()
+    key = blake2b(b"".join(xxh3_128(part).digest() for part in parts), digest_size=16).hexdigest()
     return folder / f"{key}.safetensors"
 
 
