@@ -158,7 +158,8 @@ STEPS = {
     "distinct": (sam_module, "_distinct"),
     "whole": (SamMasks, "_whole"),
     "clean": (sam_module, "clean_masks"),
-    "nms": (sam_module, "mask_nms"),
+    "intersections": (sam_module, "intersections"),
+    "nms": (sam_module, "suppressed"),
     "stack": (sam_module, "stack_masks"),
 }
 

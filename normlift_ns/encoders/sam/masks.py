@@ -8,7 +8,7 @@ first of them, "m" the second, "l" the third, "default" all three; each level go
 2. no side of the box at the border of a crop unless it is the border of the image too;
 3. non-maximum suppression of boxes within each crop (better predicted IoU first), then across crops (smaller first);
 4. small holes filled and small pieces dropped, then suppression of boxes again (untouched masks first);
-5. LangSplat's suppression of masks, by stability times predicted IoU: `mask_nms`.
+5. LangSplat's suppression of masks, by stability times predicted IoU: `suppressed`.
 
 What survives keeps the order of the third and fourth step, which decides where masks overlap: later ones count.
 """
@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
-from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
+from normlift_ns.encoders.sam.rules import Suppression, boxes_of, intersections, stack_masks, suppressed
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.sam.weights import check_sam, sam_identity
 from normlift_ns.errors import InputError
@@ -160,11 +160,11 @@ class SamMasks:
         found = found.at(chosen)
         masks = self._whole(found, crops, size)
         masks, changed = clean_masks(masks, rules.region_area)
-        boxes, score = boxes_of(masks), found.stability * found.predicted_iou
+        boxes, score, shared = boxes_of(masks), found.stability * found.predicted_iou, intersections(masks)
         result: dict[Level, Tensor] = {}
         for level, index in kept.items():
             last = _distinct(torch.searchsorted(chosen, index), boxes, (~changed).float(), rules)
-            result[level] = masks[last[mask_nms(masks[last], score[last], rules.suppression)]]
+            result[level] = masks[last[suppressed(shared[last][:, last], score[last], rules.suppression)]]
         return result
 
     def _candidates(self, embedding: Tensor, crop: Box, number: int, size: tuple[int, int]) -> _Candidates:

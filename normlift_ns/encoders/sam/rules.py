@@ -60,21 +60,29 @@ def mask_nms(
 ) -> Bool[Tensor, " m"]:
     """Which masks stay: those scored well enough that neither repeat a better mask nor lie inside a larger one.
 
+    Args:
+        scores: stability times predicted IoU.
+        rules: LangSplat's by default.
+    """
+    return suppressed(intersections(masks), scores, rules)
+
+
+def suppressed(
+    shared: Float64[Tensor, "m m"], scores: Float[Tensor, " m"], rules: Suppression | None = None
+) -> Bool[Tensor, " m"]:
+    """`mask_nms` of masks whose intersections are known.
+
     All masks are compared with all, also with those that go. Intersections are counted exactly and their ratios
     compared in float64. Equal scores: the earlier mask is the better one.
 
     LangSplat also asks for 1 - (inter/area_i)(inter/area_j) > 0.5 of a mask inside another, which every pair fulfils
     that passes the two tests of shares.
-
-    Args:
-        scores: stability times predicted IoU.
-        rules: LangSplat's by default.
     """
     rules = Suppression() if rules is None else rules
-    if len(masks) == 0:
-        return torch.zeros(0, dtype=torch.bool, device=masks.device)
+    if len(shared) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=shared.device)
     order = torch.sort(scores, descending=True, stable=True).indices
-    both = _intersections(masks)[order][:, order]
+    both = shared[order][:, order]
     area = both.diagonal()
     iou = both / (area[:, None] + area - both)
     repeats = (iou.triu(diagonal=1) > rules.iou).any(dim=0)
@@ -114,7 +122,7 @@ def boxes_of(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
     return torch.stack([x0, y0, x1, y1], dim=1) * (x1 >= 0)[:, None]
 
 
-def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
+def intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     """Pixels that masks share, counted exactly: float32 sums of ones are exact below 2^24 pixels."""
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
