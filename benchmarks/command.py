@@ -68,6 +68,7 @@ def lifted(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, 
         "TRITON_CACHE_DIR": f"{kernels}/triton",
         "NUMBA_CACHE_DIR": f"{kernels}/numba",
         "PYTHONPYCACHEPREFIX": f"{kernels}/python",
+        "PYTHONDONTWRITEBYTECODE": "",
     }
     given = ("--load-config", trained, "--output-dir", folder / name, *flags)
     cost = run(HERE, "lift", *given, program=LIFT, environment=environment)

@@ -158,8 +158,7 @@ STEPS = {
     "distinct": (sam_module, "_distinct"),
     "whole": (SamMasks, "_whole"),
     "clean": (sam_module, "clean_masks"),
-    "intersections": (sam_module, "intersections"),
-    "nms": (sam_module, "suppressed"),
+    "nms": (sam_module, "mask_nms"),
     "stack": (sam_module, "stack_masks"),
 }
 

@@ -8,7 +8,7 @@ first of them, "m" the second, "l" the third, "default" all three; each level go
 2. no side of the box at the border of a crop unless it is the border of the image too;
 3. non-maximum suppression of boxes within each crop (better predicted IoU first), then across crops (smaller first);
 4. small holes filled and small pieces dropped, then suppression of boxes again (untouched masks first);
-5. LangSplat's suppression of masks, by stability times predicted IoU: `suppressed`.
+5. LangSplat's suppression of masks, by stability times predicted IoU: `mask_nms`.
 
 What survives keeps the order of the third and fourth step, which decides where masks overlap: later ones count.
 """
@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
-from normlift_ns.encoders.sam.rules import Suppression, boxes_of, intersections, stack_masks, suppressed
+from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.sam.weights import check_sam, sam_identity
 from normlift_ns.errors import InputError
@@ -150,21 +150,29 @@ class SamMasks:
         cuts = [there[y0:y1, x0:x1] for x0, y0, x1, y1 in crops]
         embeddings = self.network.embed(self.network.pixels(cuts))
         parts: list[_Candidates] = []
+        alone: dict[Level, list[Tensor]] = {level: [] for level in levels}  # what stays of each crop
         for i, embedding in enumerate(embeddings):
-            found = self._candidates(embedding, crops[i], i, size)
-            stay = [_distinct(found.of(level), found.boxes, found.predicted_iou, rules) for level in levels]
-            parts.append(found.at(torch.cat(stay).unique()))
+            found, before = self._candidates(embedding, crops[i], i, size), sum(len(part.crop) for part in parts)
+            stay = {level: _distinct(found.of(level), found.boxes, found.predicted_iou, rules) for level in levels}
+            some = torch.cat(list(stay.values())).unique()
+            parts.append(found.at(some))
+            for level, index in stay.items():
+                alone[level].append(before + torch.searchsorted(some, index))
         found = _Candidates(*map(torch.cat, zip(*parts)))
-        kept: dict[Level, Tensor] = {level: _distinct_in_crops(found, level, crops, rules) for level in levels}
+        area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=self.device)
+        smaller_first = 1 / area[found.crop]
+        kept: dict[Level, Tensor] = {
+            level: _distinct(torch.cat(index), found.boxes, smaller_first, rules) for level, index in alone.items()
+        }
         chosen = torch.cat(list(kept.values())).unique()
         found = found.at(chosen)
         masks = self._whole(found, crops, size)
         masks, changed = clean_masks(masks, rules.region_area)
-        boxes, score, shared = boxes_of(masks), found.stability * found.predicted_iou, intersections(masks)
+        boxes, score = boxes_of(masks), found.stability * found.predicted_iou
         result: dict[Level, Tensor] = {}
         for level, index in kept.items():
             last = _distinct(torch.searchsorted(chosen, index), boxes, (~changed).float(), rules)
-            result[level] = masks[last[suppressed(shared[last][:, last], score[last], rules.suppression)]]
+            result[level] = masks[last[mask_nms(masks[last], score[last], rules.suppression)]]
         return result
 
     def _candidates(self, embedding: Tensor, crop: Box, number: int, size: tuple[int, int]) -> _Candidates:
@@ -245,13 +253,3 @@ def _distinct(index: Tensor, boxes: Tensor, scores: Tensor, rules: MaskRules) ->
     from torchvision.ops import nms  # noqa: PLC0415 (takes a second, and not everybody asks SAM)
 
     return index[nms(boxes[index].float(), scores[index], rules.box_iou)]
-
-
-def _distinct_in_crops(found: _Candidates, level: Level, crops: Sequence[Box], rules: MaskRules) -> Tensor:
-    """Suppression within each crop, better predicted IoU first, then across crops, smaller ones first."""
-    index = found.of(level)
-    each = [
-        _distinct(index[found.crop[index] == i], found.boxes, found.predicted_iou, rules) for i in range(len(crops))
-    ]
-    area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=index.device)
-    return _distinct(torch.cat(each), found.boxes, 1 / area[found.crop], rules)

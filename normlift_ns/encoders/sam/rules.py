@@ -13,8 +13,6 @@ from torch.nn.functional import pad
 
 _CHUNK = {"cuda": 2**29, "cpu": 2**26}
 """Elements of the largest temporary array."""
-_ADDS_IN_FLOAT32 = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 8)
-"""Whether torch.mm of half-precision matrices can return its float32 sums."""
 _FORCED = 3
 """Masks that stay, best first, where none is scored well enough."""
 
@@ -60,29 +58,21 @@ def mask_nms(
 ) -> Bool[Tensor, " m"]:
     """Which masks stay: those scored well enough that neither repeat a better mask nor lie inside a larger one.
 
-    Args:
-        scores: stability times predicted IoU.
-        rules: LangSplat's by default.
-    """
-    return suppressed(intersections(masks), scores, rules)
-
-
-def suppressed(
-    shared: Float64[Tensor, "m m"], scores: Float[Tensor, " m"], rules: Suppression | None = None
-) -> Bool[Tensor, " m"]:
-    """`mask_nms` of masks whose intersections are known.
-
     All masks are compared with all, also with those that go. Intersections are counted exactly and their ratios
     compared in float64. Equal scores: the earlier mask is the better one.
 
     LangSplat also asks for 1 - (inter/area_i)(inter/area_j) > 0.5 of a mask inside another, which every pair fulfils
     that passes the two tests of shares.
+
+    Args:
+        scores: stability times predicted IoU.
+        rules: LangSplat's by default.
     """
     rules = Suppression() if rules is None else rules
-    if len(shared) == 0:
-        return torch.zeros(0, dtype=torch.bool, device=shared.device)
+    if len(masks) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=masks.device)
     order = torch.sort(scores, descending=True, stable=True).indices
-    both = shared[order][:, order]
+    both = _intersections(masks)[order][:, order]
     area = both.diagonal()
     iou = both / (area[:, None] + area - both)
     repeats = (iou.triu(diagonal=1) > rules.iou).any(dim=0)
@@ -122,7 +112,7 @@ def boxes_of(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
     return torch.stack([x0, y0, x1, y1], dim=1) * (x1 >= 0)[:, None]
 
 
-def intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
+def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     """Pixels that masks share, counted exactly: float32 sums of ones are exact below 2^24 pixels."""
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
@@ -131,13 +121,14 @@ def intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     return both
 
 
-def _counted(part: Bool[Tensor, "m p"]) -> Float[Tensor, "m m"]:
-    """Products of all rows, added up in float32; on a GPU in tensor cores, where this version of torch lets them."""
-    if part.is_cuda and _ADDS_IN_FLOAT32:
-        half = pad(part.half(), (0, -part.shape[1] % 8))  # rows begin where tensor cores like it
-        return torch.mm(half, half.T, out_dtype=torch.float32)
-    whole = part.float()
-    return whole @ whole.T
+def _counted(part: Bool[Tensor, "m p"]) -> Tensor:
+    """Products of all rows; on a GPU in tensor cores, whole numbers of 8 bits added up in 32, where torch can."""
+    if part.is_cuda and hasattr(torch, "_int_mm"):
+        count, pixels = part.shape
+        whole = pad(part.view(torch.int8), (0, -pixels % 16, 0, max(32 - count, -count % 16)))  # what tensor cores take
+        return torch._int_mm(whole, whole.T)[:count, :count]  # pyright: ignore[reportPrivateImportUsage]
+    exact = part.float()
+    return exact @ exact.T
 
 
 def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
