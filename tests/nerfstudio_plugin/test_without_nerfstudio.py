@@ -116,6 +116,14 @@ def test_a_config_of_splats_is_nerfstudios() -> None:
     assert read.logging == type(read.logging)()
 
 
+def _remarks(views: TrainedViews | DatasetViews) -> tuple[str, ...] | str:
+    """What `check_files` returns, or the message with which it refuses."""
+    try:
+        return views.check_files()
+    except InputError as error:
+        return str(error)
+
+
 def assert_equal(datamanager: classes.FullImageDatamanagerConfig, folder: Path) -> None:
     """The views and the world of a data set are those of nerfstudio's own data manager."""
     config = classes.TrainerConfig(pipeline=classes.VanillaPipelineConfig(datamanager=datamanager))
@@ -126,14 +134,17 @@ def assert_equal(datamanager: classes.FullImageDatamanagerConfig, folder: Path) 
     assert found.scale == outputs.dataparser_scale
     for split, dataset in ((found.train, manager.train_dataset), (found.held_out, manager.eval_dataset)):
         assert split.files == dataset.image_filenames
-        assert split.masks == dataset._dataparser_outputs.mask_filenames
+        assert (split.masks or None) == dataset._dataparser_outputs.mask_filenames  # nerfstudio: None for no masks
         assert torch.equal(split.poses, dataset.cameras.camera_to_worlds)
         if len(split) > 0:
             assert split.kind == CameraType(int(dataset.cameras.camera_type[0])).name
         ours = TrainedViews(split, folder, split.poses, GREY, _reading(datamanager))
         theirs = DatasetViews(dataset, folder, dataset.cameras.camera_to_worlds, GREY)
         assert ours.names == theirs.names
-        assert ours.check_files() == theirs.check_files()
+        remarks = _remarks(ours)
+        assert remarks == _remarks(theirs)
+        if isinstance(remarks, str):  # nerfstudio rounds the sides of cameras and of photographs in two ways
+            continue
         try:
             expected = list(theirs)
         except InputError as error:  # nerfstudio's "pca" mirrors some poses, which nothing could draw

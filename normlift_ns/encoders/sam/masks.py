@@ -153,7 +153,9 @@ class SamMasks:
         alone: dict[Level, list[Tensor]] = {level: [] for level in levels}  # what stays of each crop
         for i, embedding in enumerate(embeddings):
             found, before = self._candidates(embedding, crops[i], i, size), sum(len(part.crop) for part in parts)
-            stay = {level: _distinct(found.of(level), found.boxes, found.predicted_iou, rules) for level in levels}
+            stay: dict[Level, Tensor] = {
+                level: _distinct(found.of(level), found.boxes, found.predicted_iou, rules) for level in levels
+            }
             some = torch.cat(list(stay.values())).unique()
             parts.append(found.at(some))
             for level, index in stay.items():
