@@ -47,6 +47,9 @@ class Size:
     prompts: int = 16
     rate: float = 4e-4
     seconds: float = 120.0
+    """Of training."""
+    steps: int | None = None
+    """Of training, in place of seconds: the same network on every machine."""
     pictures: int = 12
     height: int = 96
     """Of the pictures that are cut up; their width is `side`."""
@@ -55,7 +58,7 @@ class Size:
     """Of noise."""
 
 
-SMALL = Size(side=64, width=32, layers=2, batch=2, prompts=4, seconds=2.0, pictures=2, height=48, points=5, seeds=2)
+SMALL = Size(side=64, width=32, layers=2, batch=2, prompts=4, steps=5, pictures=2, height=48, points=5, seeds=2)
 
 
 class Pictures(NamedTuple):
@@ -163,7 +166,7 @@ def losses(logits: Tensor, ious: Tensor, truth: Tensor) -> Tensor:
 
 
 def train(model: Any, size: Size, device: str) -> list[float]:
-    """Trains for the time of the size; the losses."""
+    """Trains for the time or the steps of the size; the losses."""
     g = torch.Generator(device).manual_seed(0)
     network = SamNetwork(model, device, "float32")
     model.train()
@@ -186,7 +189,7 @@ def train(model: Any, size: Size, device: str) -> list[float]:
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
         values.append(float(loss.detach()))
-        share = (time.perf_counter() - start) / size.seconds
+        share = (time.perf_counter() - start) / size.seconds if size.steps is None else len(values) / size.steps
     model.eval().requires_grad_(False)
     return values
 

@@ -93,15 +93,17 @@ def hostile_json(draw: st.DrawFn, document: Any) -> bytes:
         parent, key = place
         kind = draw(st.sampled_from(("value", "value", "value", "gone", "new", "deep")))
         if kind == "value":
-            parent[key] = draw(st.sampled_from(VALUES))
+            parent[key] = deepcopy(draw(st.sampled_from(VALUES)))
         elif kind == "gone":
             del parent[key]
         elif kind == "deep":
             parent[key] = "DEEP"
         elif isinstance(parent, dict):
-            parent[draw(st.sampled_from(("", "x", "-1", "01", "1e3", "None")))] = draw(st.sampled_from(VALUES))
+            parent[draw(st.sampled_from(("", "x", "-1", "01", "1e3", "None")))] = deepcopy(
+                draw(st.sampled_from(VALUES))
+            )
         else:
-            parent.append(draw(st.sampled_from(VALUES)))
+            parent.append(deepcopy(draw(st.sampled_from(VALUES))))
     text = json.dumps(found)
     deep = draw(st.sampled_from((200, 5000, 100_000)))
     text = text.replace('"DEEP"', "[" * deep + "]" * deep)
