@@ -103,7 +103,7 @@ class Tab:
         """What the panel says."""
         return self.page.locator("body").inner_text()
 
-    def says(self, text: str, timeout: float = 20_000) -> None:
+    def says(self, text: str, timeout: float = 60_000) -> None:
         """Waits until the page shows a text."""
         self.page.get_by_text(text).first.wait_for(timeout=timeout)
 
