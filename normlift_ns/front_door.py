@@ -14,7 +14,7 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
-from normlift_ns.core.gpu import choose_device
+from normlift_ns.core.gpu import choose_device, wake
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.given import GivenFeatures, given_features
@@ -208,6 +208,7 @@ def lift_run(
         if value is not None and not isinstance(value, kind):
             raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
     device, options = choose_device(device), source or SourceOptions()
+    wake(device)
     made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
     if made is not None and len(queries) > 0:
         made.text(queries)

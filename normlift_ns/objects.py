@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int32
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components as scipy_components
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
@@ -102,6 +100,9 @@ def connected_components(
         ValueError: a reach that is not positive and finite.
     """
     check_number("reach", reach)
+    from scipy.sparse import coo_array  # noqa: PLC0415 (a lift does without)
+    from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415
+
     labels = torch.full((len(means),), -1, dtype=torch.int32)
     rows = (selected.cpu() & means.cpu().isfinite().all(dim=1)).nonzero().squeeze(1)
     if len(rows) == 0:
@@ -113,7 +114,7 @@ def connected_components(
     first, slot = np.nonzero(near)
     second = neighbors.index.numpy()[first, slot]
     graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(len(rows), len(rows)))
-    count, found = scipy_components(graph, directed=False)
+    count, found = components_of_graph(graph, directed=False)
     size, start = np.bincount(found, minlength=count), np.unique(found, return_index=True)[1]
     rank = np.empty(count, np.int32)
     rank[np.lexsort((start, -size))] = np.arange(count)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
+from threading import Thread
 from typing import TypeVar
 
 import torch
@@ -42,6 +43,12 @@ def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[
     torch.cuda.empty_cache()
     half = len(items) // 2
     return in_parts(run, items[:half], advice) + in_parts(run, items[half:], advice)
+
+
+def wake(device: str) -> None:
+    """Lets a GPU start, which takes a second, while other work goes on."""
+    if device.startswith("cuda"):
+        Thread(target=partial(torch.empty, 1, device=device), name="wake", daemon=True).start()
 
 
 def choose_device(device: str) -> str:

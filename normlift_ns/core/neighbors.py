@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int32
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from normlift_ns.core.gpu import kernels_apply
@@ -113,6 +112,8 @@ def _on_cpu(means: Float[Tensor, "n 3"], k: int, progress: Progress | None = Non
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     index, distance, spacing = np.full((n, k), -1, dtype=np.int32), np.full((n, k), np.inf), np.full(n, np.inf)
     if finite.size > 1:
+        from scipy.spatial import KDTree  # noqa: PLC0415 (a GPU does without)
+
         places, place_of = np.unique(points[finite], axis=0, return_inverse=True)
         place_of = place_of.reshape(-1)
         tree, member = KDTree(places), _members(place_of, k + 1)
@@ -144,7 +145,7 @@ def _members(place_of: np.ndarray, most: int) -> np.ndarray:
 
 
 def _rank_gaussians(
-    tree: KDTree, member: np.ndarray, first: int, near: np.ndarray, reach: np.ndarray, count: int
+    tree: Any, member: np.ndarray, first: int, near: np.ndarray, reach: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """For every place from the first one on its `count` nearest Gaussians (-1 where there are fewer) and their
     distances, sorted by (distance, index).

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import torch
 from jaxtyping import Float, Float64, Int, Int32, Int64
-from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
@@ -161,6 +160,8 @@ class SparseRows:
                 raise InputError(f"a matrix with {self.num_columns} columns needs as many rows, got {len(table)}")
             offsets = self.offsets.int() if self.weight.numel() < 2**31 else self.offsets
             arrays = (x.numpy() for x in (self.weight, self.column, offsets))
+            from scipy.sparse import csr_array  # noqa: PLC0415 (a GPU does without)
+
             product = csr_array(tuple(arrays), shape=(len(self), len(table))) @ table.numpy()
             return torch.from_numpy(product).to(table.dtype)
         # An embedding bag is exactly this product: gather rows, scale, add. It is threaded on CPU, deterministic on

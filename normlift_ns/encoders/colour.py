@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float32, Int32, UInt8
-from skimage.color import rgb2lab
 from torch import Tensor
 
 from normlift_ns.encoders.texts.colours import ColourTexts, embed
@@ -18,6 +17,8 @@ class ColourEncoder(ColourTexts):
     """Mean CIELAB colours against colour names; formulas in `texts.colours`. Needs neither weights nor a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        from skimage.color import rgb2lab  # noqa: PLC0415 (what other encoders do without is not loaded)
+
         labels = labels.cpu()
         depth, y, x = (labels >= 0).nonzero(as_tuple=True)
         lab, region = torch.from_numpy(rgb2lab(image.numpy()))[y, x], labels[depth, y, x].long()

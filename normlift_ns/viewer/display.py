@@ -8,7 +8,6 @@ from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
-from matplotlib import colormaps
 from torch import Tensor
 
 from normlift_ns.asking import Answer, pixel_relevancy
@@ -92,6 +91,8 @@ def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float
 
 def colors_of(colormap: Colormap) -> Float[Tensor, "256 3"]:
     """RGB in 0..1 of matplotlib's colour map."""
+    from matplotlib import colormaps  # noqa: PLC0415 (a lift does without)
+
     return torch.from_numpy(colormaps[colormap](torch.arange(256).numpy())[:, :3]).float()
 
 

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 _CHUNK = {"cuda": 2**29, "cpu": 2**25}
@@ -131,6 +129,9 @@ def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
 
 def _joined_by_scipy(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
     """The component of every node of a graph, in the order of their first nodes."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 (a GPU does without)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
     ones = np.ones(pairs.shape[1], dtype=bool)
     graph = coo_array((ones, tuple(pairs.numpy())), shape=(nodes, nodes))
     return torch.from_numpy(connected_components(graph, directed=False)[1]).long()
