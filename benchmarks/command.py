@@ -56,7 +56,7 @@ def summary(run, before, total, queries):
         json.dump({**before, **run.seconds, "total": total}, file)
     return shown(run, before, total, queries)
 lift.summary = summary
-lift.entrypoint()
+lift.main()
 """
 
 

@@ -15,7 +15,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.ranges import check_device, check_options
 from normlift_ns.scripts.early import check_lifted, readable_file, readable_folder, writable_file
-from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
 
 if TYPE_CHECKING:
     from normlift_ns.evaluation.protocols import EvaluatedRun
@@ -186,9 +186,14 @@ def signals_table(rows: Sequence[Row]) -> Table:
 
 
 def entrypoint() -> None:
-    """Entry point of ns-normlift-eval."""
+    """ns-normlift-eval, in a process that goes on."""
     run_command(NormLiftEval)
 
 
+def main() -> None:
+    """Entry point of ns-normlift-eval."""
+    run_process(NormLiftEval)
+
+
 if __name__ == "__main__":
-    entrypoint()
+    main()

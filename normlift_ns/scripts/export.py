@@ -13,7 +13,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import MIN_SIZE, REACH, AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
 from normlift_ns.scripts.early import check_lifted, has_question, writable_file
-from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
 
 
 @dataclass
@@ -112,9 +112,14 @@ def _table(tables: list[dict[str, Any]]) -> Table:
 
 
 def entrypoint() -> None:
-    """Entry point of ns-normlift-export."""
+    """ns-normlift-export, in a process that goes on."""
     run_command(NormLiftExport)
 
 
+def main() -> None:
+    """Entry point of ns-normlift-export."""
+    run_process(NormLiftExport)
+
+
 if __name__ == "__main__":
-    entrypoint()
+    main()

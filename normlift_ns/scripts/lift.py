@@ -19,7 +19,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.ranges import check_device, check_options
 from normlift_ns.scripts.early import check_config, check_new_run, check_source, check_splat, writable_folder
-from normlift_ns.scripts.shared import CONSOLE, plain, run_command, say
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
 
 if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene
@@ -202,9 +202,14 @@ def summary(run: LiftedRun, before: dict[str, float], total: float, queries: tup
 
 
 def entrypoint() -> None:
-    """Entry point of ns-normlift."""
+    """ns-normlift, in a process that goes on."""
     run_command(NormLift)
 
 
+def main() -> None:
+    """Entry point of ns-normlift."""
+    run_process(NormLift)
+
+
 if __name__ == "__main__":
-    entrypoint()
+    main()

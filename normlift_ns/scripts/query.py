@@ -17,7 +17,7 @@ from normlift_ns.options import AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.scripts.early import check_lifted, different, writable_file, writable_folder
-from normlift_ns.scripts.shared import run_command, say
+from normlift_ns.scripts.shared import run_command, run_process, say
 
 if TYPE_CHECKING:
     from normlift_ns.question import Question
@@ -178,9 +178,14 @@ def _write_arrays(path: Path, found: QuickAnswer, overwrite: bool) -> None:
 
 
 def entrypoint() -> None:
-    """Entry point of ns-normlift-query."""
+    """ns-normlift-query, in a process that goes on."""
     run_command(NormLiftQuery)
 
 
+def main() -> None:
+    """Entry point of ns-normlift-query."""
+    run_process(NormLiftQuery)
+
+
 if __name__ == "__main__":
-    entrypoint()
+    main()

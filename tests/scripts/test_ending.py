@@ -161,3 +161,13 @@ def test_warnings_of_ours_are_one_line(tmp_path):
     assert "Warning: [red] is left out\n" in err
     assert "elsewhere.py:7: UserWarning: foreign" in err
     assert "__init__.py" not in err
+
+
+@pytest.mark.parametrize(("body", "code"), [("print('done')", 0), ("print('done'); raise InputError('no')", 1)])
+def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(body, code, tmp_path):
+    slow = "class Slow:\n    def __del__(self):\n        print('taken down')\nkept = Slow()\n"
+    program = PROGRAM.format(body=textwrap.indent(body, " " * 8)).replace("run_command", "run_process")
+    program = slow + "import atexit; atexit.register(print, 'duty')\n" + program
+    state = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], env=state, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
