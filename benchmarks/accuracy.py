@@ -111,7 +111,8 @@ class Bench:
         """The full variant by faster lifts, as in `benchmarks.presets`."""
         means = self.world.scene.means
         read = partial(lifted.directions, dtype=torch.float16)
-        source = refine(means, read, lifted.scalars.reliability, self.config, neighbors=self.neighbors).long()
+        given = {"own": lifted.scalars.own_evidence, "neighbors": self.neighbors}
+        source = refine(means, read, lifted.scalars.reliability, self.config, **given).long()
         half = Scores(plain.cosine[source], plain.valid[source])
         views = list(range(0, observed.evidence.num_views, 2))
         columns = observed.evidence.columns_of(views)

@@ -197,8 +197,8 @@ def vote(
         GROUP=max(16, triton.next_power_of_2(neighbors.shape[1] + 1)), COLUMNS=tuning.columns,
         COLUMNS_LATER=tuning.columns_later, STAGES=tuning.stages, CERTIFY=halves and precision != "halves",
         FINISH=precision != "first" or not halves, HALVES=halves,
-        POSTERIOR=own is not None, PRECISION=precision if precision in ("tf32", "ieee") else "tf32x3", num_warps=tuning.warps,
-        maxnreg=tuning.registers,
+        PRECISION=precision if precision in ("tf32", "ieee") else "tf32x3", POSTERIOR=own is not None,
+        num_warps=tuning.warps, maxnreg=tuning.registers,
     )  # fmt: skip
 
 
