@@ -201,12 +201,11 @@ class RefineConfig:
     """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest
     one at another place, because scenes are rescaled. By default 1 for paper, 2 for posterior."""
     tau: float | None = None
-    """Cosine at which two directions half agree in the vote, in -1..1. By default 0.95 for paper, 0.95 for
-    posterior."""
+    """Cosine at which two directions half agree in the vote, in -1..1. By default 0.95."""
     gamma: float | None = None
-    """Softness of that agreement, > 0. By default 0.4 for paper, 0.4 for posterior."""
+    """Softness of that agreement, > 0. By default 0.4."""
     delta: float | None = None
-    """Margin Delta by which the best neighbour must win the vote, >= 0. By default 0 for paper, 0 for posterior."""
+    """Margin Delta by which the best neighbour must win the vote, >= 0. By default 0."""
     prior: float = 4.0
     """What all neighbours together count in a posterior vote, in views, >= 0."""
 

@@ -5,7 +5,7 @@ import inspect
 import math
 import pickle
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from decimal import Decimal, localcontext
 from itertools import pairwise
 from typing import get_args
@@ -27,6 +27,8 @@ from normlift_ns import (
     unsupported,
 )
 from normlift_ns.core.ablations import Variant
+from normlift_ns.core.refine import possible
+from normlift_ns.evaluation.votes import own_vote
 from normlift_ns.options import VOTES, VoteNumbers
 from tests.captures import needs_shared
 from tests.scenes import generator, random_evidence, unit_rows
@@ -366,14 +368,24 @@ def test_defaults_are_those_of_the_kind_of_vote_and_stand_in_the_help():
     text = " ".join(inspect.getsource(RefineConfig).split())
     for name in VoteNumbers._fields:
         values = {kind: getattr(numbers, name) for kind, numbers in VOTES.items()}
-        told = f"By default {values['paper']:g} for paper, {values['posterior']:g} for posterior."
+        each = [f"{value:g} for {kind}" for kind, value in values.items()]
+        told = (
+            f"By default {values['paper']:g}." if len(set(values.values())) == 1 else f"By default {', '.join(each)}."
+        )
         assert re.search(rf"{name}: float \| None = None .{{1,250}}{re.escape(told)}", text), name
 
 
-def test_configs_of_version_01_keep_the_papers_vote():
+def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     old = RefineConfig.__new__(RefineConfig)
     old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
     assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteNumbers(1.0, 0.95, 0.4, 0.0))
+    manifest = {"options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "beta": 2.0}}
+    own = own_vote(manifest)
+    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteNumbers(2.5, 0.9, 0.4, 0.1))
+    assert own_vote({}).config == RefineConfig()
+    told = asdict(possible(RefineConfig(vote="posterior", tau=0.5), 1000))  # what a manifest of today holds
+    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": 0.4, "sigma_d": 2.0, "tau": 0.5}
+    assert own_vote({"options": {"vote": told}}).variant == "posterior"
     new = RefineConfig(vote="posterior", sigma_d=3.0)
     assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new
 

@@ -141,7 +141,7 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     studies = evaluated(monkeypatch, workspace, "scannet", path, *flags)["studies"]
     assert studies["signals"][0]["scene"] == "scene0000_00"
     assert 0.5 < studies["signals"][0]["seen.accuracy"] < 1
-    assert [row["variant"] for row in studies["ablation"]][-1] == "full"
+    assert [row["variant"] for row in studies["ablation"]][-1] == "posterior"
     assert studies["ablation"][-1]["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
 
 
