@@ -248,7 +248,7 @@ class LiftOptions:
     weight_power: Literal[1, 2] = 1
     """1: weights A_ij as in the paper. 2: their squares."""
     refine: bool = True
-    """Repair unreliable Gaussians by a vote among neighbours."""
+    """Let a vote among neighbours repair directions: a Gaussian copies the one that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)
     tolerance: float = 1e-3
     """Largest error that storage may add to any cosine."""

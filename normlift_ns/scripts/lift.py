@@ -182,7 +182,7 @@ def summary(run: LiftedRun, before: dict[str, float], total: float, queries: tup
     table.add_row("reliability R", quantiles)
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"
-        table.add_row("refined", f"{numbers['refined_share']:.1%} of Gaussians; {lost}")
+        table.add_row("copied", f"{numbers['refined_share']:.1%} of Gaussians take a neighbour's direction; {lost}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values()), "total": total}
     table.add_row("seconds", "  ".join(f"{name} {t:.1f}" for name, t in seconds.items()))
