@@ -84,7 +84,8 @@ def test_masks_by_hand():
     a, b = torch.tensor([[1, 1], [0, 0]]).bool(), torch.tensor([[1, 0], [1, 0]]).bool()
     none = torch.zeros_like(a)
     assert (mask_iou(a, b), mask_recall(a, b)) == (1 / 3, 1 / 2)
-    assert mask_iou(none, none) == 1
+    assert math.isnan(mask_iou(none, none))
+    assert mask_iou(none, none, empty=0) == 0
     assert mask_iou(none, a) == 0
     assert math.isnan(mask_recall(a, none))
 
