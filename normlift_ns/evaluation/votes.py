@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, get_args
@@ -16,7 +16,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import refine
 from normlift_ns.core.storage import StoredDirections
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import LiftOptions, RefineConfig
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "beta": (0.25, 0.5, 1.0, 2.0, 4.0),
@@ -26,7 +26,10 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "gamma": (0.05, 0.1, 0.2, 0.4, 0.8),
     "delta": (0.0, 0.05, 0.1, 0.2, 0.3),
 }
-"""Values tried, the others as the run was lifted; beta, K and Delta as in the paper's appendix."""
+"""Values tried besides the default and those of the runs, the others as the run was lifted; beta, K and Delta as in the
+paper's appendix."""
+BETA = LiftOptions().beta
+"""The default."""
 
 
 @dataclass(frozen=True)
@@ -43,25 +46,36 @@ class Vote:
 def own_vote(manifest: Mapping[str, Any]) -> Vote:
     """The vote that a run was lifted with; the defaults where its manifest does not say."""
     options = manifest.get("options", {})
-    return Vote("full", RefineConfig(**options.get("vote", {})), options.get("beta", 1.0), {})
+    return Vote("full", RefineConfig(**options.get("vote", {})), options.get("beta", BETA), {})
 
 
-def ablation(own: Vote) -> Iterator[Vote]:
-    """The variants of the paper's table 2."""
+def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """The variants of the paper's table 2, one vote per run."""
     for variant in get_args(Variant):
-        yield replace(own, variant=variant, label={"variant": variant})
+        yield [replace(own, variant=variant, label={"variant": variant}) for own in owns]
 
 
-def sweeps(own: Vote) -> Iterator[Vote]:
-    """`SWEEPS` around the run's own values."""
+def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """`SWEEPS` around each run's own values, with the default and all own values among them and marked; one vote per
+    run.
+    """
     for parameter, values in SWEEPS.items():
-        for value in values:
-            label = {"parameter": parameter, "value": value}
-            if parameter == "beta":
-                yield replace(own, beta=value, label=label)
-            else:
-                changed: dict[str, Any] = {parameter: int(value) if parameter == "k" else value}
-                yield replace(own, config=replace(own.config, **changed), label=label)
+        default = _value(Vote("full", RefineConfig(), BETA, {}), parameter)
+        used = {_value(own, parameter) for own in owns}
+        for value in sorted({*values, default, *used}):
+            label = {"parameter": parameter, "value": value, "default": value == default, "own": value in used}
+            yield [_changed(own, parameter, value, label) for own in owns]
+
+
+def _value(vote: Vote, parameter: str) -> float:
+    return vote.beta if parameter == "beta" else getattr(vote.config, parameter)
+
+
+def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) -> Vote:
+    if parameter == "beta":
+        return replace(own, beta=value, label=label)
+    changed: dict[str, Any] = {parameter: int(value) if parameter == "k" else value}
+    return replace(own, config=replace(own.config, **changed), label=label)
 
 
 def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:

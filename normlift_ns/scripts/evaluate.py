@@ -98,8 +98,10 @@ class NormLiftEval:
             self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
             studies=studies, overwrite=self.overwrite,
         )  # fmt: skip
-        written = [self.output_path, *self._plots(studies, next(iter(evaluation.results)))]
+        written = [self.output_path, *self._plots(studies, evaluation.results)]
         CONSOLE.print(rows_table(evaluation.rows))
+        if len(evaluation.scenes) > 1:
+            CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
         CONSOLE.print(results_table(evaluation))
         for name, rows in studies.items():
             CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
@@ -143,18 +145,19 @@ class NormLiftEval:
             lambda some: studies.mask_signals(some[0], truth),
         )
 
-    def _plots(self, studies: Mapping[str, list[Row]], metric: str) -> Iterator[Path]:
-        """Figures beside the output file."""
+    def _plots(self, studies: Mapping[str, list[Row]], results: Mapping[str, float]) -> Iterator[Path]:
+        """Figures beside the output file; sweeps are of the first result."""
         from normlift_ns.evaluation.plots import plot_signals, plot_sweeps  # noqa: PLC0415
 
+        metric, result = next(iter(results.items()))
         for name in _WITH_FIGURE:
             if name not in studies:
                 continue
             path = self._figure(name)
             if name == "sweeps":
-                plot_sweeps(studies[name], metric, metric, path, overwrite=self.overwrite)
+                plot_sweeps(studies[name], metric, metric, path, result=result, overwrite=self.overwrite)
             else:
-                plot_signals(studies[name][0], path, overwrite=self.overwrite)
+                plot_signals(studies[name], path, overwrite=self.overwrite)
             yield path
 
     def _figure(self, study: str) -> Path:
