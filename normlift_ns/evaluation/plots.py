@@ -29,9 +29,7 @@ def plot_sweeps(
     _save(sweeps_figure(rows, metric, label, result), path, overwrite)
 
 
-def sweeps_figure(
-    rows: Sequence[Mapping[str, Any]], metric: str, label: str, result: float | None = None
-) -> Figure:
+def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, result: float | None = None) -> Figure:
     """One panel per parameter of `votes.SWEEPS`, the metric over its values, those of the run and the default marked.
 
     Args:

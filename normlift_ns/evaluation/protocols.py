@@ -25,11 +25,17 @@ from normlift_ns.evaluation.lerf import FrameScores, frame_rows, summarize_lerf
 from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
 from normlift_ns.evaluation.options import LANGSPLAT, LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.evaluation.results import Evaluation
-from normlift_ns.evaluation.scannet import NYU40, SHOWER_CURTAIN, SceneLabels, check_identity, evaluate_scannet, read_labels
+from normlift_ns.evaluation.scannet import (
+    NYU40,
+    SHOWER_CURTAIN,
+    SceneLabels,
+    check_identity,
+    evaluate_scannet,
+    read_labels,
+)
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.raster.rasterize import rasterize_evidence, render
 from normlift_ns.raster.settings import RasterSettings
-
 
 _CHANNELS = 64
 """Of features, composited at once."""
@@ -43,6 +49,8 @@ class EvaluatedRun:
     field: SemanticField
     texts: TextEncoder
     refined: bool
+    cache: Path | None = None
+    """Where the lift keeps 2D features."""
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
         """Of every Gaussian's direction to the texts, 0 without direction."""
@@ -74,8 +82,8 @@ class EvaluatedRun:
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
             values = factor * self.field.query(axes, refined=self.refined).float()
-            for square, camera in zip(squares, cameras):
-                square += self.composited(camera, values)[0].double().square().sum(dim=2)
+            for i, camera in enumerate(cameras):
+                squares[i] += self.composited(camera, values)[0].double().square().sum(dim=2)
         return [square.sqrt() for square in squares]
 
     def cameras(self) -> dict[str, Camera]:

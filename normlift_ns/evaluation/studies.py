@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from normlift_ns.core.metrics import classify
+from normlift_ns.evaluation.baselines import BASELINES, baseline_field
+from normlift_ns.evaluation.dense import time_sfs_way, why_not_timed
 from normlift_ns.evaluation.options import ScannetOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, label_scene, scene_names
 from normlift_ns.evaluation.results import Evaluation, mean
@@ -84,11 +87,45 @@ def _both(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
     return {kind: replace(lifted, refined=refined) for kind, refined in kinds.items()}
 
 
-def timing(runs: Sequence[EvaluatedRun]) -> list[Row]:
-    """Seconds of every stage and peak memory of every lift, as their manifests have them, and the means."""
+def baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> list[Row]:
+    """Results of the protocol for the runs and for `BASELINES` on the same features; those are not refined.
+
+    Raises:
+        ValueError, FileNotFoundError: as `seen_blocks`.
+    """
+    rows: list[Row] = []
+    for refined in (True, False):
+        name, what = ("normlift", "the run, refined") if refined else ("unrefined", "the run before the vote")
+        results = evaluate(replace(lifted, refined=refined) for lifted in runs).results
+        rows.append({"method": name, "what": what, **results})
+    for method, what in BASELINES.items():
+        others = (replace(lifted, field=baseline_field(method, lifted, device), refined=False) for lifted in runs)
+        rows.append({"method": method, "what": what, **evaluate(others).results})
+    return rows
+
+
+def timing(
+    runs: Sequence[EvaluatedRun], device: str = "cpu", tell: Callable[[str], None] = lambda text: None
+) -> list[Row]:
+    """Seconds of every stage and peak memory of every lift, as their manifests have them, and on a GPU those of SFS's
+    way and of ours on some views of each, measured now; and the means.
+
+    Args:
+        tell: told why SFS's way is left out, where it is.
+    """
     rows = []
     for lifted in runs:
-        cost = lifted.field.manifest.get("cost", {})
-        rows.append({"scene": lifted.scene.name, **cost})
-    means = {key: mean([row.get(key, float("nan")) for row in rows]) for key in rows[0] if key != "scene"}
-    return [*rows, {"scene": "mean", **means}] if len(rows) > 1 else rows
+        row = {"scene": lifted.scene.name, **lifted.field.manifest.get("cost", {})}
+        reason = why_not_timed(lifted, device)
+        if reason is None:
+            try:
+                row |= time_sfs_way(lifted, device)
+            except (ValueError, FileNotFoundError) as error:  # its features cannot be made again
+                reason = str(error)
+        if reason is not None:
+            tell(f"The timing of {lifted.scene.name} leaves out SFS's way (512 channels through gsplat): {reason}")
+        rows.append(row)
+    keys = list(dict.fromkeys(key for row in rows for key in row if key != "scene"))
+    table = [{"scene": row["scene"], **{key: row.get(key, math.nan) for key in keys}} for row in rows]
+    means = {key: mean([row[key] for row in table]) for key in keys}
+    return [*table, {"scene": "mean", **means}] if len(table) > 1 else table

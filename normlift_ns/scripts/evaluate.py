@@ -44,10 +44,11 @@ class NormLiftEval:
     """Replace the output file and the figures beside it."""
     refined: bool = True
     """Evaluate the refined directions."""
-    study: tuple[Literal["ablation", "sweeps", "signals", "timing"], ...] = ()
+    study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines"], ...] = ()
     """What to measure besides. ablation: the variants of the refinement. sweeps: every parameter of the vote around
-    the run's own. signals: Gaussians without evidence, accuracy by R and by norm, R against opacity. timing: what
-    lifting took. Holds all runs in memory."""
+    the run's own, with the default. signals: Gaussians without evidence, accuracy by R and by norm, R against opacity.
+    timing: what lifting took and, on a GPU, what SFS's way takes, 512 channels through gsplat. baselines: the ideas of
+    SFS, Occam's LGS, VALA and Dr.Splat on the features of the run, in our implementation. Holds all runs in memory."""
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look names up in instead of the encoder that the runs were lifted with."""
     data: Path | None = None
@@ -67,9 +68,10 @@ class NormLiftEval:
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
-        from normlift_ns.evaluation.studies import study_votes, timing  # noqa: PLC0415
+        from normlift_ns.evaluation.studies import baselines, study_votes, timing  # noqa: PLC0415
         from normlift_ns.evaluation.votes import ablation, sweeps  # noqa: PLC0415
         from normlift_ns.front_door import open_run  # noqa: PLC0415
+        from normlift_ns.runs.files import cache_folder  # noqa: PLC0415
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []
@@ -77,7 +79,7 @@ class NormLiftEval:
         def evaluated(config: Path) -> EvaluatedRun:
             run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
             names.append((run.scene.name, str(run.scene.checkpoint_path)))
-            return EvaluatedRun(run.scene, run.field, run.texts, self.refined)
+            return EvaluatedRun(run.scene, run.field, run.texts, self.refined, cache_folder(run.folder))
 
         # Scenes are large: one is held at a time, unless they are studied.
         runs: Iterable[EvaluatedRun] = (evaluated(config) for config in self.load_config)
@@ -90,7 +92,9 @@ class NormLiftEval:
             if name == "signals":
                 studies[name] = measure_signals(held)
             elif name == "timing":
-                studies[name] = timing(held)
+                studies[name] = timing(held, device, say)
+            elif name == "baselines":
+                studies[name] = baselines(held, evaluate, device)
             else:
                 studies[name] = study_votes(held, evaluate, {"ablation": ablation, "sweeps": sweeps}[name], device)
         experiments, checkpoints = (", ".join(values) for values in zip(*names))

@@ -152,7 +152,10 @@ def test_order_of_averages_by_hand():
 def test_scenes_are_averaged_as_the_paper_does_and_pooled_beside_it():
     rows = [row("s", "a", "egg", 1.0), row("t", "a", "egg", 0.0), row("t", "b", "egg", 0.5), row("t", "b", "cup", 0.5)]
     frames = summarize_lerf(rows, "frames", {})
-    assert [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes] == [("s", 1, 1), ("t", 2, 1 / 4)]
+    assert [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes] == [
+        ("s", 1, 1),
+        ("t", 2, 1 / 4),
+    ]
     assert frames.results["miou"] == (1 + 1 / 4) / 2
     assert frames.results["miou_pooled"] == (1 + 0 + 1 / 2) / 3  # three frames
     pairs = summarize_lerf(rows, "pairs", {}).results

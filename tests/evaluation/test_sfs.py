@@ -51,27 +51,29 @@ SHAPED = {
 }
 
 
+def random_map(seed: int) -> np.ndarray:
+    """Of one of eight kinds."""
+    random = np.random.RandomState(seed)  # its numbers never change
+    height, width = random.randint(1, 140, 2)
+    kinds = (
+        lambda: random.rand(height, width),
+        lambda: random.randn(height, width) * 10 ** random.uniform(-2, 3) + 50 * random.randn(),
+        lambda: random.rand(4)[random.randint(0, 4, (height, width))] + 0.02 * random.randn(height, width),
+        lambda: np.round(random.rand(height, width) * random.randint(2, 50)) / 7,
+        lambda: np.linspace(0, 1, height * width).reshape(height, width) ** random.uniform(0.2, 4),
+        lambda: (random.rand(height, width) < 0.1 * random.rand()).astype(float),
+        lambda: 0.3 + 1e-3 * random.rand(height, width),
+        lambda: of_histogram((1 + random.randint(0, 1300, 40) * (random.rand(40) < 0.4)).tolist()),
+    )
+    return kinds[seed % len(kinds)]()
+
+
 def maps() -> Iterator[tuple[str, np.ndarray]]:
-    """Maps by name: of given histograms, and random ones of many kinds."""
+    """Maps by name: of given histograms, and random ones."""
     for name, counts in SHAPED.items():
         yield name, of_histogram(counts)
     for seed in range(48):
-        random = np.random.RandomState(seed)  # its numbers never change
-        height, width = random.randint(1, 140, 2)
-        pixels = height * width
-        yield (
-            f"random {seed}",
-            (
-                lambda: random.rand(height, width),
-                lambda: random.randn(height, width) * 10 ** random.uniform(-2, 3) + 50 * random.randn(),
-                lambda: random.rand(4)[random.randint(0, 4, (height, width))] + 0.02 * random.randn(height, width),
-                lambda: np.round(random.rand(height, width) * random.randint(2, 50)) / 7,
-                lambda: np.linspace(0, 1, pixels).reshape(height, width) ** random.uniform(0.2, 4),
-                lambda: (random.rand(height, width) < 0.1 * random.rand()).astype(float),
-                lambda: 0.3 + 1e-3 * random.rand(height, width),
-                lambda: of_histogram((1 + random.randint(0, 1300, 40) * (random.rand(40) < 0.4)).tolist()),
-            )[seed % 8](),
-        )
+        yield f"random {seed}", random_map(seed)
 
 
 def shapes() -> Iterator[tuple[str, np.ndarray]]:
