@@ -28,11 +28,12 @@ from normlift_ns.raster.rasterize import rasterize_evidence
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {
-    "sfs": "our implementation of SFS's weights A^2",
-    "occam": "our implementation of the idea of Occam's LGS: the feature at the projected centre",
-    "vala": "our implementation of the idea of VALA: geometric median of the views that see enough",
-    "drsplat": "our implementation of the idea of Dr.Splat: the 10 heaviest Gaussians of every ray",
+    "sfs": "our A^2 weights, after SFS",
+    "occam": "our centre pixels, after Occam's LGS",
+    "vala": "our gated median, after VALA",
+    "drsplat": "our 10 heaviest per ray, after Dr.Splat",
 }
+"""What each does."""
 TOP = 10
 """Gaussians of a ray that count in the idea of Dr.Splat."""
 VISIBLE = 0.1

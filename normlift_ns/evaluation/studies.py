@@ -95,7 +95,7 @@ def baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> 
     """
     rows: list[Row] = []
     for refined in (True, False):
-        name, what = ("normlift", "the run, refined") if refined else ("unrefined", "the run before the vote")
+        name, what = ("normlift", "the run, refined") if refined else ("unrefined", "the run, unrefined")
         results = evaluate(replace(lifted, refined=refined) for lifted in runs).results
         rows.append({"method": name, "what": what, **results})
     for method, what in BASELINES.items():
