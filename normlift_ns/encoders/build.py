@@ -104,7 +104,7 @@ def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> Feature
             name: Path(value) if name in paths and value is not None else value for name, value in settings.items()
         }
         options = SourceOptions(**given)
-    except (TypeError, AttributeError) as error:
+    except TypeError as error:
         raise InputError(
             f"the run's manifest names options for its features that this version does not know ({error}); lift again "
             "with: ns-normlift"

@@ -101,7 +101,7 @@ def feature_maps(block: Block, device: torch.device | str) -> Iterable[Float[Ten
     """Feature of every pixel of every view, the sum over levels; 0 without a region."""
     for labels, regions, features in zip(block.labels, block.regions, block.features):
         table = torch.nn.functional.pad(features.to(device), (0, 0, 1, 0))  # row 0: none
-        of_cell = sum(table[level.to(device).long() + 1] for level in regions)
+        of_cell = torch.stack([table[level.to(device).long() + 1] for level in regions]).sum(0)
         rows = torch.nn.functional.pad(of_cell, (0, 0, 1, 0))
         yield rows[labels.to(device).long().clamp(min=-1) + 1]
 

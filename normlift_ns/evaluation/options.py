@@ -26,8 +26,8 @@ class ScannetOptions:
     without_direction: WithoutDirection = "first"
     """Class of Gaussians without a direction: wall (first, as in published scripts) or no class (none). The result of
     the other choice is reported beside it."""
-    shower_curtain: Literal["showercurtain", "shower curtain"] = "showercurtain"
-    """How class 28 is asked: as OpenGaussian's script spells it, or as the paper prints it."""
+    spelling: Literal["script", "paper"] = "script"
+    """How the shower curtain is asked. script: showercurtain, as in OpenGaussian's script. paper: shower curtain."""
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -27,7 +27,7 @@ from normlift_ns.evaluation.options import LANGSPLAT, LerfOptions, MaskOptions, 
 from normlift_ns.evaluation.results import Evaluation
 from normlift_ns.evaluation.scannet import (
     NYU40,
-    SHOWER_CURTAIN,
+    PAPER_SPELLING,
     SceneLabels,
     check_identity,
     evaluate_scannet,
@@ -113,7 +113,7 @@ def label_scene(
         ValueError: another number of vertices than Gaussians.
     """
     check_identity(name, len(lifted.scene.gaussians), nyu40, path)
-    asked = NYU40 | {SHOWER_CURTAIN: options.shower_curtain}
+    asked = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
     cosine = lifted.cosine(tuple(asked.values()))
     return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
 
@@ -129,7 +129,7 @@ def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: S
     scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in given]
     rule = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
     found = evaluate_scannet(scenes, **rule)
-    return replace(found, settings={**found.settings, "shower_curtain": options.shower_curtain})
+    return replace(found, settings={**found.settings, "spelling": options.spelling})
 
 
 def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:

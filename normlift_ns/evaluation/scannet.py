@@ -25,8 +25,8 @@ NYU40 = {
     33: "toilet", 34: "sink", 36: "bathtub",
 }  # fmt: skip
 """Names that are queried, bare and spelled as in OpenGaussian's script, by NYU40 id."""
-SHOWER_CURTAIN = 28
-"""The id whose name the paper prints as two words."""
+PAPER_SPELLING = {28: "shower curtain"}
+"""Names that the paper prints otherwise."""
 _LAST_ID = 40
 CLASS_SETS = {
     19: tuple(NYU40),

@@ -46,7 +46,7 @@ def study_votes(
 
 def signal_rows(names: Sequence[str], scenes: Sequence[SceneSignals]) -> list[Row]:
     """`signals` of every scene and, if there are several, of all of them pooled."""
-    rows = [{"scene": name, **signals(scene)} for name, scene in zip(names, scenes)]
+    rows: list[Row] = [{"scene": name, **signals(scene)} for name, scene in zip(names, scenes)]
     return [*rows, {"scene": POOLED, **signals(*scenes)}] if len(rows) > 1 else rows
 
 
@@ -126,6 +126,6 @@ def timing(
             tell(f"The timing of {lifted.scene.name} leaves out SFS's way (512 channels through gsplat): {reason}")
         rows.append(row)
     keys = list(dict.fromkeys(key for row in rows for key in row if key != "scene"))
-    table = [{"scene": row["scene"], **{key: row.get(key, math.nan) for key in keys}} for row in rows]
+    table: list[Row] = [{"scene": row["scene"], **{key: row.get(key, math.nan) for key in keys}} for row in rows]
     means = {key: mean([row[key] for row in table]) for key in keys}
     return [*table, {"scene": "mean", **means}] if len(table) > 1 else table

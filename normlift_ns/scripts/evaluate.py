@@ -54,7 +54,7 @@ class NormLiftEval:
     data: Path | None = None
     """Where the dataset is now, if it was moved; for one run."""
     device: str = "auto"
-    """auto, cpu or cuda: where the text encoder runs, and the votes of --study."""
+    """auto, cpu or cuda: where the text encoder and --study run."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)

@@ -161,7 +161,8 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     path = workspace / "scene0000_00_vh_clean_2.labels.ply"
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
     colours = [*room.names, *["black", "white", "grey", "beige", "magenta", "lime"]]
-    vectors = stand_ins(workspace / "names.npz", dict(zip(NYU40.values(), colours)))
+    names = [*NYU40.values(), "shower curtain"]
+    vectors = stand_ins(workspace / "names.npz", dict(zip(names, [*colours, "cyan"])))
     document = evaluated(monkeypatch, workspace, "scannet", path, "--text-vectors", vectors)
     results = document["results"]
     assert document["settings"]["scenes"] == ["scene0000_00"]
@@ -169,6 +170,10 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     assert results["miou_19"] > 0.5
     assert results["miou_10"] >= results["miou_19"] - 0.2
     assert {row["class"] for row in document["rows"] if row["classes"] == 19} == {NYU40[i] for i in ids}
+    assert document["settings"]["spelling"] == "script"
+    spelled = evaluated(monkeypatch, workspace, "scannet", path, "--spelling", "paper", "--text-vectors", vectors)
+    assert spelled["settings"]["spelling"] == "paper"
+    assert spelled["results"]["miou_19"] > results["miou_19"] - 0.2  # that name is found too
     flags = ("--study", "signals", "ablation", "--text-vectors", vectors)
     studies = evaluated(monkeypatch, workspace, "scannet", path, *flags)["studies"]
     assert studies["signals"][0]["scene"] == "scene0000_00"
