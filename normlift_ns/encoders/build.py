@@ -98,12 +98,8 @@ def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> Feature
             "the run does not say how its regions and features were made: they were given from Python, or an earlier "
             "version lifted it; lift again with: ns-normlift"
         )
-    paths = ("regions_dir", "features_dir", "text_vectors")
     try:
-        given = {
-            name: Path(value) if name in paths and value is not None else value for name, value in settings.items()
-        }
-        options = SourceOptions(**given)
+        options = SourceOptions(**_restored(settings))
     except TypeError as error:
         raise InputError(
             f"the run's manifest names options for its features that this version does not know ({error}); lift again "
@@ -117,6 +113,12 @@ def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> Feature
             "with: ns-normlift"
         )
     return source
+
+
+def _restored(settings: object) -> dict[str, Any]:
+    if not isinstance(settings, Mapping):
+        raise TypeError(f"found {type(settings).__name__}, expected an object")
+    return {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
 
 
 def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
