@@ -17,6 +17,7 @@ from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field
 from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
 from normlift_ns.evaluation.protocols import EvaluatedRun
+from normlift_ns.evaluation.studies import timing
 from normlift_ns.evaluation.views import seen_blocks
 from normlift_ns.lifting import lift_scene
 from normlift_ns.observing import of_regions
@@ -186,3 +187,65 @@ def test_channels_through_gsplat_are_the_sums_of_evidence(lifted):
         cells = rasterize_evidence(scene, block.cameras, block.labels, num_regions=counts)
         expected = of_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
         assert torch.allclose(found, expected.float(), rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
+def test_sfs_way_is_timed_beside_ours(lifted):
+    if not compiled_gsplat():
+        pytest.skip("gsplat's compiled part is missing")
+    (row,) = timing([lifted], "cuda")
+    assert row["timed_views"] == 4
+    assert row["dense512_over_evidence_lift"] == pytest.approx(row["dense512_s"] / row["evidence_lift_s"])
+    assert row["dense512_all_views_s"] == row["dense512_s"] > 0  # all four
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", BASELINES)
+def test_ideas_are_the_same_on_a_gpu(lifted, name):
+    here, there = (baseline_field(name, lifted, device) for device in ("cpu", "cuda"))
+    cosine = (here.directions(refined=False) * there.directions(refined=False)).sum(1)
+    assert (cosine[here.valid(refined=False)] > 1 - 1e-3).float().mean() > 0.98
+    assert (here.valid(refined=False) == there.valid(refined=False)).float().mean() > 0.99
+
+
+def test_what_is_left_out_is_said(lifted):
+    told = []
+    (row,) = timing([lifted], "cpu", told.append)
+    assert "dense512_s" not in row
+    assert row["total_s"] == pytest.approx(sum(value for key, value in row.items() if key.endswith("_s")) / 2)
+    assert told == [
+        "The timing of made leaves out SFS's way (512 channels through gsplat): it needs a GPU, for which gsplat is "
+        "compiled; this is --device cpu"
+    ]
+    cost = {key: value for key, value in lifted.field.manifest["cost"].items() if key != "store_s"}
+    older = replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, "cost": cost}))
+    table = timing([lifted, older], "cpu")
+    assert [row["scene"] for row in table] == ["made", "made", "mean"]
+    assert table[2]["store_s"] == lifted.field.manifest["cost"]["store_s"]  # the other does not say
+
+
+def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
+    """The loop over views and channels, with gsplat's compiled functions replaced by dense products."""
+    seen = observations(lifted)[:2]
+    weights = iter([weights for _, weights, _ in seen])
+    names = ("means2d", "conics", "opacities", "offsets", "members")
+
+    def project_views(job: Job, cameras: list[Camera]) -> SimpleNamespace:
+        return SimpleNamespace(**{**dict.fromkeys(names), "members": next(weights)})
+
+    def forward(*drawing: Any) -> tuple[Any, Tensor, Any]:
+        return None, torch.zeros(1, HEIGHT, WIDTH, 1), None
+
+    def backward(*given: Any) -> tuple[Any, ...]:
+        gradient = given[13]
+        assert gradient.shape == (1, HEIGHT, WIDTH, 32)
+        return None, None, None, (given[10] @ gradient.flatten(0, 2))[None]
+
+    monkeypatch.setattr("normlift_ns.evaluation.dense.project_views", project_views)
+    monkeypatch.setattr("normlift_ns.evaluation.dense.compiled_rasterizer", lambda: (forward, backward))
+    g = generator(0)
+    maps = [torch.rand(HEIGHT, WIDTH, 45, generator=g, dtype=torch.float64) for _ in seen]
+    job = Job(lifted.scene.gaussians, False, RasterSettings(), torch.float32)
+    found = dense_sums(job, [camera for camera, _, _ in seen], maps, 45)
+    expected = sum(w @ features.flatten(0, 1) for (_, w, _), features in zip(seen, maps))
+    assert torch.allclose(found.double(), expected, rtol=1e-5, atol=1e-5)
