@@ -60,11 +60,16 @@ def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
     run.
     """
     for parameter, values in SWEEPS.items():
-        default = _value(Vote("full", RefineConfig(), BETA, {}), parameter)
+        default = default_of(parameter)
         used = {_value(own, parameter) for own in owns}
         for value in sorted({*values, default, *used}):
             label = {"parameter": parameter, "value": value, "default": value == default, "own": value in used}
             yield [_changed(own, parameter, value, label) for own in owns]
+
+
+def default_of(parameter: str) -> float:
+    """The default of one of the parameters of `SWEEPS`."""
+    return _value(Vote("full", RefineConfig(), BETA, {}), parameter)
 
 
 def _value(vote: Vote, parameter: str) -> float:
