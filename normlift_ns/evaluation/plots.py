@@ -41,17 +41,20 @@ def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, re
     figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
     for one, parameter in zip(axes, parameters):
         some = sorted((row for row in rows if row["parameter"] == parameter), key=lambda row: row["value"])
-        names, values = [f"{row['value']:g}" for row in some], [row[metric] for row in some]
-        one.plot(names, values, marker="o", markersize=4)
+        values = [row[metric] for row in some]
+        one.plot(range(len(some)), values, marker="o", markersize=4)
+        one.set_xticks(range(len(some)), [f"{row['value']:g}" for row in some])
         for mark, style in _MARKS.items():
             chosen = [i for i, row in enumerate(some) if row.get(mark)]
-            one.plot([names[i] for i in chosen], [values[i] for i in chosen], linestyle="none", **style)
+            if len(chosen) > 0:
+                one.plot(chosen, [values[i] for i in chosen], linestyle="none", **style)
         if result is not None:
             one.axhline(result, color="tab:grey", linestyle="--", label="result")
         one.set_xlabel(parameter, parse_math=False)
         one.grid(alpha=0.3)
     axes[0].set_ylabel(label, parse_math=False)
-    axes[0].legend(fontsize="small")
+    if len(axes[0].get_legend_handles_labels()[0]) > 0:
+        axes[0].legend(fontsize="small")
     return figure
 
 

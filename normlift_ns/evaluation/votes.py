@@ -30,6 +30,8 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 paper's appendix."""
 BETA = LiftOptions().beta
 """The default."""
+OWN: Variant = "full"
+"""The variant that runs are lifted with."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Vote:
 def own_vote(manifest: Mapping[str, Any]) -> Vote:
     """The vote that a run was lifted with; the defaults where its manifest does not say."""
     options = manifest.get("options", {})
-    return Vote("full", RefineConfig(**options.get("vote", {})), options.get("beta", BETA), {})
+    return Vote(OWN, RefineConfig(**options.get("vote", {})), options.get("beta", BETA), {})
 
 
 def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
@@ -69,7 +71,7 @@ def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
 
 def default_of(parameter: str) -> float:
     """The default of one of the parameters of `SWEEPS`."""
-    return _value(Vote("full", RefineConfig(), BETA, {}), parameter)
+    return _value(Vote(OWN, RefineConfig(), BETA, {}), parameter)
 
 
 def _value(vote: Vote, parameter: str) -> float:

@@ -188,7 +188,8 @@ def signals_table(rows: Sequence[Row]) -> Table:
     """One column per scene."""
     table = Table("signal", *(Column(plain(row.get("scene", "value"))) for row in rows), title="signals")
     for name in (key for key in rows[0] if key != "scene"):
-        table.add_row(name, *(f"{row[name]:.3f}" for row in rows))
+        digits = ".3g" if name.endswith("_p") else ".3f"  # p-values may be tiny
+        table.add_row(name, *(f"{row[name]:{digits}}" for row in rows))
     return table
 
 

@@ -17,9 +17,10 @@ def test_sweeps_mark_the_default_and_the_run_and_draw_the_result():
     of_k, of_beta = sweeps_figure(rows[::-1], "miou", "miou", 0.45).axes[::-1]
     assert [x.get_xlabel() for x in (of_k, of_beta)] == ["k", "beta"]
     curve, default, own, result = of_k.lines
-    assert (list(curve.get_xdata()), list(curve.get_ydata())) == (["12", "36"], [0.4, 0.5])
-    assert (list(default.get_xdata()), list(default.get_ydata())) == (["36"], [0.5])
-    assert (list(own.get_xdata()), list(own.get_ydata())) == (["12"], [0.4])
+    assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([0, 1], [0.4, 0.5])
+    assert [x.get_text() for x in of_k.get_xticklabels()] == ["12", "36"]
+    assert (list(default.get_xdata()), list(default.get_ydata())) == ([1], [0.5])
+    assert (list(own.get_xdata()), list(own.get_ydata())) == ([0], [0.4])
     assert list(result.get_ydata()) == [0.45, 0.45]
     assert {x.get_text() for x in of_beta.get_legend().get_texts()} == {"default", "of the run", "result"}
 
