@@ -221,6 +221,30 @@ def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
     assert cleaned["results"]["miou"] != results["miou"]
 
 
+def test_several_scenes_are_averaged_and_pooled(workspace, room, monkeypatch, capsys):
+    """One run under two names, with two frames and one."""
+    wanted = ("sky blue", "bright blue", "dark green")
+    for scene, stems in (("kitchen", ("0000", "0008")), ("hall", ("0000",))):
+        for stem in stems:
+            instance = workspace / "room" / "instance" / f"{stem}.png"
+            write_polygons(workspace / "two" / scene, instance, room.names, wanted)
+    words = {**{name: name for name in wanted}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
+    config, output = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml", workspace / "two.json"
+    labels = (workspace / "two" / "kitchen", workspace / "two" / "hall")
+    flags = ("--protocol", "lerf", "--load-config", config, config, "--labels", *labels, "--output-path", output)
+    flags += ("--text-vectors", stand_ins(workspace / "words.npz", words), "--study", "signals")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 0
+    document = json.loads(output.read_text())
+    kitchen, hall = document["scenes"]
+    assert (kitchen["scene"], kitchen["frames"], hall["scene"], hall["frames"]) == ("kitchen", 2, "hall", 1)
+    results = document["results"]
+    assert results["miou"] == pytest.approx((kitchen["miou"] + hall["miou"]) / 2)
+    assert results["miou_pooled"] == pytest.approx((2 * kitchen["miou"] + hall["miou"]) / 3)
+    assert kitchen["miou"] != hall["miou"]
+    assert [row["scene"] for row in document["studies"]["signals"]] == ["kitchen", "hall", "all scenes"]
+    assert "kitchen" in said(capsys)
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
