@@ -13,8 +13,8 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.lift import lift
 from normlift_ns.errors import InputError
+from normlift_ns.evaluation.baselines import seen_blocks
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.evaluation.views import seen_blocks
 from normlift_ns.observing import Block, of_regions
 from normlift_ns.raster.backend import Job
 from normlift_ns.raster.gsplat import check, compiled_rasterizer, project_views

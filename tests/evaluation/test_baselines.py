@@ -14,11 +14,10 @@ from torch import Tensor
 
 from normlift_ns import Camera, LiftOptions, RasterSettings, SourceOptions, View, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field
+from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks
 from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
 from normlift_ns.evaluation.protocols import EvaluatedRun
 from normlift_ns.evaluation.studies import timing
-from normlift_ns.evaluation.views import seen_blocks
 from normlift_ns.lifting import lift_scene
 from normlift_ns.observing import of_regions
 from normlift_ns.raster.backend import Job
