@@ -33,11 +33,12 @@ from normlift_ns import (
     refine,
 )
 from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.evaluation.dense import dense_sums
 from normlift_ns.raster.backend import Job
-from normlift_ns.raster.gsplat import compiled_rasterizer, project_views
+from normlift_ns.raster.gsplat import project_views
 from normlift_ns.raster.settings import RasterSettings
 
-DIMENSION, CHANNELS, GSPLAT_VIEWS = 512, 32, 6
+DIMENSION, GSPLAT_VIEWS = 512, 6
 
 
 def features(rows: int, device: str = "cuda") -> torch.Tensor:
@@ -79,17 +80,9 @@ def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
             rasterize_to_pixels(means2d, conics, colors, opacities, width, height, 16, offsets, members)
 
     def backward() -> None:
-        forward, gradients = compiled_rasterizer()
-        total = torch.zeros(n, DIMENSION, device="cuda")
-        blank = torch.zeros(1, n, CHANNELS, device="cuda")
-        for v in range(min(GSPLAT_VIEWS, len(case.cameras))):
-            means2d, conics, width, height, offsets, members = prepared(v)
-            drawing = (means2d, conics, blank, scene.opacities[None].contiguous(), None, None, width, height, 16)
-            _, alphas, last = forward(*drawing, offsets, members)
-            gradient = torch.rand(1, height, width, CHANNELS, device="cuda")
-            for first in range(0, DIMENSION, CHANNELS):
-                found = gradients(*drawing, offsets, members, alphas, last, gradient, torch.zeros_like(alphas), False)
-                total[:, first : first + CHANNELS] += found[3][0]
+        some = case.cameras[:GSPLAT_VIEWS]
+        gradient = torch.rand(some[0].height, some[0].width, DIMENSION, device="cuda")  # as large for every view
+        dense_sums(Job(scene, False, RasterSettings(), torch.float32), some, [gradient] * len(some), DIMENSION)
 
     return rgb, backward
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps
 from benchmarks.signals import STEP
 from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
+from normlift_ns.evaluation.votes import default_of
 
 DOCS = Path(__file__).parents[1] / "docs"
 FLOOR = 1e-4
@@ -24,12 +25,15 @@ def plots(found: Documents, folder: Path) -> Iterator[Path]:
     yield plot_accuracy(accuracy, folder / "accuracy.svg")
     yield plot_drift(signals, folder / "drift.svg")
     curves = ((key.split(".", 2)[1:], value) for key, value in fit.values.items() if key.startswith("curve."))
-    rows = [{"parameter": name, "value": float(at), "miou": value} for (name, at), value in curves]
+    rows = [
+        {"parameter": name, "value": float(at), "miou": value, "default": float(at) == default_of(name, "paper")}
+        for (name, at), value in curves
+    ]
     plot_sweeps(rows, "miou", "mIoU on held-out damage, points", folder / "sensitivity.svg", overwrite=True)
     yield folder / "sensitivity.svg"
     start = f"tabletop.{STEP}."
     one = {k.removeprefix(start): value for k, value in signals.values.items() if k.startswith(start)}
-    plot_signals(one, folder / "reliability.svg", overwrite=True)
+    plot_signals([one], folder / "reliability.svg", overwrite=True)
     yield folder / "reliability.svg"
 
 

@@ -27,7 +27,7 @@ from benchmarks.worlds import Words, World
 from normlift_ns import RefineConfig, lift, nearest_neighbors
 from normlift_ns.core.ablations import Variant
 from normlift_ns.core.metrics import classify
-from normlift_ns.evaluation.signals import signals
+from normlift_ns.evaluation.signals import SceneSignals, signals
 
 STEP = "hard"
 """Step of the ladder whose signals are shown."""
@@ -40,6 +40,7 @@ MIXES = tuple(i / 10 for i in range(11))
 
 def evidence_table(world: World, words: Words, report: Report) -> None:
     """`mistakes` on some steps of the ladder, and `signals` on one; means over seeds."""
+    neighbors = nearest_neighbors(world.scene.means, RefineConfig().k)
     for step in MISTAKEN:
         found = []
         for seed in range(SEEDS):
@@ -47,7 +48,11 @@ def evidence_table(world: World, words: Words, report: Report) -> None:
             lifted = lift(observed.evidence, observed.features)
             scores = lifted_scores(lifted, words.classes.to(world.truth.device))
             answer = classify(scores.cosine, scores.valid)
-            shown = signals(lifted.scalars, world.scene.opacities, world.truth, answer) if step == STEP else {}
+            shown = {}
+            if step == STEP:
+                voted = refined_scores("paper", world.scene.means, lifted, scores, neighbors)
+                answers = {"unrefined": answer, "refined": classify(voted.cosine, voted.valid)}
+                shown = signals(SceneSignals(lifted.scalars, world.scene.opacities, world.truth, answers))
             found.append(shown | mistakes(lifted.scalars.reliability, world.truth, answer))
         for key in found[0]:
             report.add(f"{world.name}.{step}.{key}", float(np.mean([one[key] for one in found])), "of 1")

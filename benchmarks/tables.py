@@ -86,7 +86,7 @@ def evidence(signals: Document) -> str:
     for scene in PREFIXES:
         for group, label in (("all", "all"), ("zero", "R = 0"), ("seen", "R > 0")):
             key = f"{scene}.{STEP}.{group}"
-            share, faint, right = (f"{100 * s[f'{key}.{x}']:.1f} %" for x in ("share", "faint", "accuracy"))
+            share, faint, right = (f"{100 * s[f'{key}.{x}']:.1f} %" for x in ("share", "faint", "accuracy_unrefined"))
             mean, seen = f"{s[f'{key}.opacity']:.3f}", f"{s[f'{key}.views']:.1f}"
             rows.append((f"{scene}, {label}", share, mean, faint, seen, right))
     return table(("", "share", "mean opacity", "opacity < 0.1", "views", "accuracy"), rows)

@@ -7,25 +7,20 @@ with `refine_variant`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from typing import NamedTuple, get_args
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from benchmarks.damage import Observed
 from benchmarks.worlds import World
 from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, rasterize_evidence
 from normlift_ns.core.ablations import Variant, variant_config, variant_reliability, variant_source
 from normlift_ns.core.refine import decay_width, voting_weights
-from normlift_ns.core.sparse import SparseRows, row_offsets
+from normlift_ns.evaluation import baselines
 
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
-TOP = 10
-"""Gaussians per ray of "top-k registration"."""
-VISIBLE = 0.1
-"""Share of its heaviest view below which "gated geometric median" leaves a view of a Gaussian out."""
 
 
 class Scores(NamedTuple):
@@ -82,80 +77,26 @@ def _average(reliability: Tensor, scores: Scores, neighbors: Neighbors, config: 
     return Scores(cosine, valid)
 
 
-# Other methods on the same evidence; each is our implementation of the idea, not the authors' code.
+# Other methods on the same evidence, as `--study baselines` has them.
 
 
 def centre_evidence(world: World) -> Evidence:
-    """Occam's LGS: in every view a Gaussian takes the feature at its projected centre, with its weight in that view."""
-    weights, cells = world.evidence.view_weights(), world.cells
-    row, view = weights.row_index(), weights.column.long()
-    cell = torch.full((len(row),), -1, dtype=torch.int64)
-    rows, views = row.cpu(), view.cpu()
-    means = world.scene.means.cpu().double()
-    for v, camera in enumerate(world.cameras):
-        here = (views == v).nonzero().squeeze(1)
-        pose = camera.world_to_camera.double()
-        place = (means[rows[here]] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.double().T
-        x, y = (place[:, i] / place[:, 2].clamp(min=1e-6) for i in (0, 1))
-        inside = (place[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        x, y = (c.clamp(0, size - 1).long() for c, size in ((x, camera.width), (y, camera.height)))
-        cell[here] = torch.where(inside, cells.of_pixel[v, y, x].long(), -1)
-    cell = cell.to(row.device)
-    kept = cell >= 0
-    found = SparseRows.from_coo(row[kept], cell[kept], weights.weight[kept].to(world.evidence.rows.weight), len(means))
-    return replace(world.evidence, rows=found)
+    """The idea of Occam's LGS on the cells of a world."""
+    return baselines.centre_evidence(world.scene.means, world.cameras, list(world.cells.of_pixel), world.evidence)
 
 
-def top_evidence(world: World, top: int = TOP) -> Evidence:
-    """Dr.Splat: a ray counts for the `top` Gaussians of largest weight only."""
-    parts, size = [], len(world.scene)
-    for camera, cells in zip(world.cameras, world.cells.of_pixel):
-        of_pixel = cells.flatten().to(world.scene.means.device)
-        pixels = torch.arange(len(of_pixel), dtype=torch.int32).view(cells.shape)
-        weights = rasterize_evidence(world.scene, [camera], [pixels], num_regions=[len(of_pixel)]).rows
-        by_pixel = SparseRows.from_coo(weights.column.long(), weights.row_index(), weights.weight, len(of_pixel))
-        order = by_pixel.weight.argsort(descending=True)
-        order = order[by_pixel.row_index()[order].argsort(stable=True)]
-        pixel = by_pixel.row_index()[order]
-        keep = torch.arange(len(order), device=order.device) - by_pixel.offsets[pixel] < top
-        gaussian, pixel, weight = by_pixel.column[order[keep]].long(), pixel[keep], by_pixel.weight[order[keep]]
-        found = SparseRows.from_coo(gaussian, of_pixel[pixel].long(), weight, size)
-        parts.append((found.row_index(), found.column, found.weight))
-    rows = SparseRows.stack(parts, size, world.scene.means.device)
-    return replace(world.evidence, rows=rows)
+def top_evidence(world: World, top: int = baselines.TOP) -> Evidence:
+    """The idea of Dr.Splat on the cells of a world."""
+    rasterize = partial(rasterize_evidence, world.scene)
+    return baselines.top_evidence(rasterize, world.cameras, list(world.cells.of_pixel), world.evidence, top)
 
 
-def median_scores(observed: Observed, classes: Tensor, gaussians: Tensor | None = None, *, steps: int = 10) -> Scores:
-    """VALA: views that hardly see a Gaussian are left out, the others give the geometric median by cosine distance
-    (Weiszfeld iterations with weights E / (1 - cosine), renormalised to the sphere).
-    """
-    rows, table = observed.evidence.rows, observed.features
-    n, device = len(rows), table.device
+def median_scores(observed: Observed, classes: Tensor, gaussians: Tensor | None = None) -> Scores:
+    """The idea of VALA, of some or all Gaussians."""
+    n, device = len(observed.evidence.rows), observed.features.device
     cosine = torch.zeros(n, len(classes), device=device)
     valid = torch.zeros(n, dtype=torch.bool, device=device)
-    chosen = torch.arange(n, device=device) if gaussians is None else gaussians
-    for block in chosen.split(2**12):
-        part = rows.select_rows(block)
-        row, column = part.row_index(), part.column.long()
-        view_key = row * observed.evidence.num_views + observed.evidence.region_view[column].long()
-        keys, group = view_key.unique(return_inverse=True)
-        view_weight = torch.zeros(len(keys), device=device).index_add_(0, group, part.weight)
-        heaviest = torch.zeros(len(block), device=device).scatter_reduce_(
-            0, keys // observed.evidence.num_views, view_weight, "amax"
-        )
-        keep = view_weight[group] >= VISIBLE * heaviest[row]
-        row, column, weight = row[keep], column[keep], part.weight[keep]
-        seen = table[column]
-        u = _weighted_sum(row, weight, seen, len(block))
-        for _ in range(steps):
-            distance = (1 - (u[row] * seen).sum(1)).clamp(min=1e-4)
-            u = _weighted_sum(row, weight / distance, seen, len(block))
+    for block, u in baselines.iter_medians(observed.evidence, observed.features, gaussians):
         cosine[block] = u @ classes.T
         valid[block] = (u != 0).any(1)
     return Scores(cosine, valid)
-
-
-def _weighted_sum(row: Tensor, weight: Tensor, values: Tensor, count: int) -> Tensor:
-    offsets = row_offsets(row, count)
-    product = SparseRows(offsets, torch.arange(len(row), device=row.device, dtype=torch.int32), weight)
-    return normalize(product.matmul(values), dim=1)

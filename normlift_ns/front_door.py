@@ -16,7 +16,7 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
 from normlift_ns.core.gpu import choose_device, wake
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
-from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.given import GivenFeatures, given_features
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
@@ -246,6 +246,8 @@ def lift_run(
     field, seconds = lift_scene(
         scene, made, how, cache_folder(run_dir), device=device, encoder=settings, export=export, report=report
     )
+    if features is None:
+        field = replace(field, manifest={**field.manifest, "source": source_settings(options, device)})
     seconds = {**stages.seconds, **seconds}
     with stages("write") as step:
         question = _question(field, made, queries)

@@ -119,11 +119,11 @@ def lift_scene(
             "gsplat_rules": drawing.rules,
             "backend": drawing.backend,
             "statistics": {**counts, **_statistics(lifted.scalars), **shares},
-            "cost": cost(stages.seconds, device),
         }
         rule = {"tolerance": options.tolerance, "storage": options.storage}
         built = SemanticField.build(lifted, gaussians.means, copied, provenance=provenance, **rule)
         step()
+    built = replace(built, manifest={**built.manifest, "cost": cost(stages.seconds, device)})
     return LiftResult(built, stages.seconds)
 
 

@@ -156,7 +156,7 @@ def block_evidence(
     if evidence is not None:
         for _ in block.cameras:
             done()
-        return _of_regions(evidence.to(gaussians.means.device), block)
+        return of_regions(evidence.to(gaussians.means.device), block)
     evidence = rasterize_evidence(
         gaussians,
         block.cameras,
@@ -170,7 +170,7 @@ def block_evidence(
         progress=lambda *_: done(),
     )
     evidence.save(path, key=path.stem)
-    return _of_regions(evidence, block)
+    return of_regions(evidence, block)
 
 
 def _kept(path: Path) -> Evidence | None:
@@ -181,7 +181,8 @@ def _kept(path: Path) -> Evidence | None:
         return None
 
 
-def _of_regions(evidence: Evidence, block: Block) -> Evidence:
+def of_regions(evidence: Evidence, block: Block) -> Evidence:
+    """Evidence of the regions of a block, from that of its cells."""
     counts = torch.tensor([0, *(len(rows) for rows in block.features)])
     first = counts.cumsum(0).tolist()
     columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]

@@ -58,7 +58,7 @@ FOREIGN = {
     "front_door": {"torch", "jaxtyping"},
     "method_configs": {"nerfstudio"},
     "plugin": set(),
-    "evaluation": BASE | {"cv2", "msgspec", "skimage", "matplotlib"},
+    "evaluation": BASE | {"cv2", "msgspec", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
     "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser", "yaml", "prompt_toolkit"},
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -79,10 +80,14 @@ def classify(
     return torch.where(valid, best, NO_CLASS if without_direction == "none" else 0)
 
 
-def mask_iou(found: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"]) -> float:
-    """|found and truth| / |found or truth|, in 0..1; two empty masks agree: 1."""
+def mask_iou(found: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, empty: float = math.nan) -> float:
+    """|found and truth| / |found or truth|, in 0..1.
+
+    Args:
+        empty: the result for two empty masks, of which the formula says nothing: NaN, or 0 in SFS's code.
+    """
     union = int((found | truth).sum())
-    return int((found & truth).sum()) / union if union > 0 else 1.0
+    return int((found & truth).sum()) / union if union > 0 else empty
 
 
 def mask_recall(found: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"]) -> float:
@@ -103,14 +108,33 @@ def localized(score: Float[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, any_pe
     return bool(truth.flatten()[int(peak.flatten().int().argmax())])
 
 
+class Correlation(NamedTuple):
+    """A rank correlation."""
+
+    value: float
+    """In -1..1; NaN where one side is constant."""
+    p: float
+    """Probability of a correlation at least as strong among independent points, two-sided; NaN likewise."""
+
+
+def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
+    """Spearman's rank correlation, ties at their mean rank."""
+    return _correlation(stats.spearmanr, a, b)
+
+
+def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
+    """Kendall's tau-b, in n log n steps."""
+    return _correlation(stats.kendalltau, a, b)
+
+
 def spearman(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
-    """Rank correlation, ties at their mean rank, in -1..1; NaN where one side is constant."""
-    return _statistic(stats.spearmanr, a, b)
+    """The value of `spearman_test`."""
+    return spearman_test(a, b).value
 
 
 def kendall(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
-    """Kendall's tau-b, in -1..1; NaN where one side is constant."""
-    return _statistic(stats.kendalltau, a, b)
+    """The value of `kendall_test`."""
+    return kendall_test(a, b).value
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:
@@ -137,7 +161,8 @@ def bin_means(
     return tuple(torch.stack([x.double()[part].mean() for part in parts]) for x in (key, values))  # type: ignore[return-value]
 
 
-def _statistic(correlate: Callable[..., Any], a: Tensor, b: Tensor) -> float:
+def _correlation(correlate: Callable[..., Any], a: Tensor, b: Tensor) -> Correlation:
     if not all(len(x) > 1 and bool((x != x[0]).any()) for x in (a, b)):
-        return float("nan")
-    return float(correlate(*(x.detach().cpu().double().numpy() for x in (a, b))).statistic)
+        return Correlation(math.nan, math.nan)
+    found = correlate(*(x.detach().cpu().double().numpy() for x in (a, b)))
+    return Correlation(float(found.statistic), float(found.pvalue))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, get_args
 
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
@@ -59,6 +63,62 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
     level: Any = options.level or "l"
     texts = make_texts(options, device)
     return LangSplat(options.features_dir, texts, level, options.features_missing, options.regions_resample)
+
+
+_PATHS = ("regions_dir", "features_dir", "text_vectors")
+"""Options that are paths."""
+
+
+def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
+    """The options of a lift for its manifest, ready for JSON: "auto" decided, files by their absolute paths."""
+    if options.features == "none":
+        options = replace(options, regions=resolve_regions(options, device))
+    settings = {**asdict(options), "encoder_pretrained": _absolute(options.encoder_pretrained)}
+    settings["sam_model"] = None if options.sam_model is None else _absolute(options.sam_model)
+    return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in settings.items()}
+
+
+def _absolute(weights: str) -> str:
+    return os.path.abspath(weights) if os.path.exists(weights) else weights
+
+
+def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:
+    """The features that a field was lifted from, to be made again.
+
+    Args:
+        device: as in `make_encoder`.
+    Raises:
+        ValueError: the manifest does not name them, because they were the user's own or the version was an earlier
+            one; or what it names gives other features now.
+        FileNotFoundError: files that it names are gone.
+    """
+    settings = manifest.get("source")
+    if settings is None:
+        raise InputError(
+            "the run does not say how its regions and features were made: they were given from Python, or an earlier "
+            "version lifted it; lift again with: ns-normlift"
+        )
+    try:
+        options = SourceOptions(**_restored(settings))
+    except TypeError as error:
+        raise InputError(
+            f"the run's manifest names options for its features that this version does not know ({error}); lift again "
+            "with: ns-normlift"
+        ) from error
+    source = make_source(options, device)
+    wanted, found = (json.dumps(x, sort_keys=True) for x in (manifest.get("features"), source.identity))
+    if wanted != found:
+        raise InputError(
+            f"the run was lifted from other features than its options give now: {wanted} then, {found} now; lift again "
+            "with: ns-normlift"
+        )
+    return source
+
+
+def _restored(settings: object) -> dict[str, Any]:
+    if not isinstance(settings, Mapping):
+        raise TypeError(f"found {type(settings).__name__}, expected an object")
+    return {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
 
 
 def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:

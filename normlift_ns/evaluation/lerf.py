@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from skimage.filters import threshold_otsu
 from torch import Tensor
 
 from normlift_ns.core.metrics import localized, mask_iou, mask_recall
 from normlift_ns.evaluation.lerf_labels import LabeledFrame
-from normlift_ns.evaluation.options import Average, Masking
+from normlift_ns.evaluation.options import LANGSPLAT, Average, Masking
 from normlift_ns.evaluation.results import Evaluation, mean
+from normlift_ns.evaluation.sfs import cleaned, histogram_threshold
 
-_HISTOGRAM_BINS, _LEAST_PEAK = 40, 600
-_BOX, _THRESHOLD, _MAJORITY = 30, 0.4, 7
+_BOX, _THRESHOLD, _REACH = 30, 0.4, 3
+"""LangSplat's: side of the box filter, threshold, and half the side of the window of the majority."""
 
 
 class FrameScores(NamedTuple):
@@ -42,51 +43,32 @@ def found_mask(
     """The pixels that a prompt is found in.
 
     Args:
-        masking: "background": score above every background word by the margin. "auto": SFS's threshold from the
-            histogram of the scores; it is told the number of true instances. "langsplat": the relevancy, scaled to
-            0..1 over the image, must exceed 0.7 (0.4 after 2 x - 1), by the majority in 7 x 7 pixels.
+        masking: "background": score above every background word by the margin. "auto": the score reaches SFS's
+            threshold from the histogram of scores, which is told the number of true instances. "langsplat" and
+            "langsplat_composited": the relevancy, scaled to 0..1 over the image, exceeds 0.7 (0.4 after 2 x - 1), by
+            the majority of pixels.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin
     if masking == "auto":
-        return score > histogram_threshold(score, instances)
-    low, high = score.min(), score.max()
-    scaled = (2 * (score - low) / (high - low + 1e-9) - 1).clamp(0, 1)
-    above = (scaled > _THRESHOLD).numpy().astype(np.float32)
-    share = cv2.blur(above, (_MAJORITY, _MAJORITY), borderType=cv2.BORDER_REFLECT)
-    return torch.from_numpy(share > 0.5)
+        return score >= histogram_threshold(score, instances)
+    above = score - score.min()
+    return _majority((2 * (above / (above.max() + 1e-9)) - 1).clamp(0, 1) > _THRESHOLD)
 
 
-def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
-    """SFS's rule: the valley left of the k-th peak from the right, k the number of instances, of a 40-bin histogram;
-    peaks hold at least 600 pixels. Without so many peaks: the mean of Otsu's threshold and the 75th percentile.
+def _majority(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """What more than half of the pixels at most 3 rows and columns away are, as LangSplat counts them: without the last
+    row and the last column of the image.
     """
-    values = score.double().numpy().ravel()
-    counts, edges = np.histogram(values, bins=_HISTOGRAM_BINS)
-    padded = np.concatenate([[-1], counts, [-1]])
-    peaks = [i for i in range(_HISTOGRAM_BINS) if counts[i] >= _LEAST_PEAK and padded[i] < counts[i] >= padded[i + 2]]
-    if len(peaks) < max(1, instances) or np.ptp(values) == 0:
-        otsu = threshold_otsu(values) if np.ptp(values) > 0 else values[0]
-        return float((otsu + np.percentile(values, 75)) / 2)
-    valley = peaks[-max(1, instances)]
-    while valley > 0 and counts[valley - 1] <= counts[valley]:
-        valley -= 1
-    return float((edges[valley] + edges[valley + 1]) / 2)
+    sums = torch.nn.functional.pad(mask.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
 
+    def window(size: int) -> tuple[Tensor, Tensor]:
+        places = torch.arange(size)
+        return (places - _REACH).clamp(min=0), (places + _REACH + 1).clamp(max=size - 1)
 
-def cleaned(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """As SFS's code does after thresholding: opened and closed by 3 x 3 pixels, the largest 8-connected component, its
-    holes filled.
-    """
-    square = np.ones((3, 3), np.uint8)
-    image = mask.numpy().astype(np.uint8)
-    image = cv2.morphologyEx(cv2.morphologyEx(image, cv2.MORPH_OPEN, square), cv2.MORPH_CLOSE, square)
-    count, labels, facts, _ = cv2.connectedComponentsWithStats(image, connectivity=8)
-    if count < 2:
-        return torch.zeros_like(mask)
-    largest = (labels == 1 + facts[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
-    outlines, _ = cv2.findContours(largest, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return torch.from_numpy(cv2.drawContours(largest, outlines, -1, (1,), cv2.FILLED)).bool()
+    (top, bottom), (left, right) = (window(size) for size in mask.shape)
+    inside = sums[bottom][:, right] - sums[top][:, right] - sums[bottom][:, left] + sums[top][:, left]
+    return 2 * inside > (bottom - top)[:, None] * (right - left)
 
 
 def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
@@ -100,13 +82,13 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
 
 
 def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: bool) -> list[dict[str, Any]]:
-    """IoU, recall and whether the peak is in the mask (masking "langsplat": any peak, in any box), per category."""
+    """IoU, recall and whether the peak is in the mask (LangSplat's maskings: any peak, in any box), per category."""
     rows = []
-    frame = scores.frame
+    frame, langsplat = scores.frame, masking in LANGSPLAT
     for q, (category, truth) in enumerate(frame.masks.items()):
         score, inside = scores.prompts[:, :, q], truth
         peaks = score
-        if masking == "langsplat":
+        if langsplat:
             peaks, score = box_filtered(score)
             inside = in_boxes(frame.boxes[category], *truth.shape)
         instances = len(frame.boxes[category])
@@ -116,9 +98,9 @@ def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: b
             {
                 "frame": frame.stem,
                 "category": category,
-                "iou": mask_iou(found, truth),
+                "iou": mask_iou(found, truth, empty=math.nan if langsplat else 0.0),
                 "accuracy": mask_recall(found, truth),
-                "localized": float(localized(peaks, inside, any_peak=masking == "langsplat")),
+                "localized": float(localized(peaks, inside, any_peak=langsplat)),
             }
         )
     return rows
@@ -134,18 +116,41 @@ def in_boxes(boxes: Sequence[tuple[float, float, float, float]], height: int, wi
 
 
 def summarize_lerf(rows: Sequence[dict[str, Any]], average: Average, settings: dict[str, Any]) -> Evaluation:
-    """miou, macc and loc_acc.
+    """miou, macc and loc_acc of every scene and their means over scenes, as the paper averages; with _pooled: over the
+    frames, pairs or categories of all scenes together.
 
     Args:
+        rows: of `frame_rows`, each with its scene.
         average: "frames": over the categories of a frame, then over frames (SFS's code). "pairs": over all pairs of
             frame and category (LangSplat's). "categories": over the frames of a category, then over categories.
     """
-    key = {"frames": "frame", "categories": "category", "pairs": None}[average]
-    groups: dict[Any, list[dict[str, Any]]] = {}
-    for i, row in enumerate(rows):
-        groups.setdefault(i if key is None else row[key], []).append(row)
-    names = {"miou": "iou", "macc": "accuracy", "loc_acc": "localized"}
-    results = {
-        name: mean([mean([row[field] for row in group]) for group in groups.values()]) for name, field in names.items()
-    }
-    return Evaluation(results, rows, {"protocol": "lerf", "average": average, **settings})
+    by_scene = _grouped(rows, lambda row: row["scene"])
+    scenes = [
+        {"scene": scene, "frames": len({row["frame"] for row in some}), **_averages(some, average)}
+        for scene, some in by_scene.items()
+    ]
+    pooled = {f"{name}_pooled": value for name, value in _averages(rows, average).items()}
+    results = {name: mean([scene[name] for scene in scenes]) for name in _METRICS} | pooled
+    return Evaluation(results, rows, {"protocol": "lerf", "average": average, **settings}, scenes)
+
+
+_METRICS = {"miou": "iou", "macc": "accuracy", "loc_acc": "localized"}
+
+
+def _averages(rows: Sequence[Mapping[str, Any]], average: Average) -> dict[str, float]:
+    key: Callable[[Mapping[str, Any]], Hashable] = {
+        "frames": lambda row: (row["scene"], row["frame"]),
+        "categories": lambda row: row["category"],
+        "pairs": id,
+    }[average]
+    groups = _grouped(rows, key).values()
+    return {name: mean([mean([row[of] for row in group]) for group in groups]) for name, of in _METRICS.items()}
+
+
+def _grouped(
+    rows: Sequence[Mapping[str, Any]], key: Callable[[Mapping[str, Any]], Hashable]
+) -> dict[Hashable, list[Mapping[str, Any]]]:
+    groups: dict[Hashable, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups

@@ -9,7 +9,9 @@ from typing import Literal
 from normlift_ns.options import WithoutDirection
 from normlift_ns.ranges import check_options
 
-Masking = Literal["background", "auto", "langsplat"]
+Masking = Literal["background", "auto", "langsplat", "langsplat_composited"]
+LANGSPLAT: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
+"""Those of the relevancy."""
 Average = Literal["frames", "pairs", "categories"]
 MARGIN = 0.02
 """By which a score must exceed every background word (section "Mask thresholding" of the paper; SFS's code has 0)."""
@@ -24,6 +26,8 @@ class ScannetOptions:
     without_direction: WithoutDirection = "first"
     """Class of Gaussians without a direction: wall (first, as in published scripts) or no class (none). The result of
     the other choice is reported beside it."""
+    spelling: Literal["script", "paper"] = "script"
+    """How the shower curtain is asked. script: showercurtain, as in OpenGaussian's script. paper: shower curtain."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -35,14 +39,16 @@ class LerfOptions:
 
     masking: Masking = "background"
     """How a mask is cut from scores. background: above all background words by the margin. auto: SFS's threshold from
-    the histogram. langsplat: LERF's relevancy, scaled."""
+    the histogram. langsplat: LERF's relevancy of each pixel's unit feature, scaled, as LangSplat does.
+    langsplat_composited: the same of composited scores, not divided by the length of the pixel's feature."""
     margin: float = MARGIN
     """Of --masking background. SFS's code has 0."""
     average: Average = "frames"
-    """What is averaged first. frames: the categories of a frame, then frames. pairs: all frames and categories alike.
-    categories: the frames of a category, then categories."""
+    """What is averaged first in a scene. frames: the categories of a frame, then frames. pairs: all frames and
+    categories alike. categories: the frames of a category, then categories. Then scenes are averaged."""
     clean: bool = False
-    """Open, close, keep the largest component and fill its holes. SFS's code does so; the paper does not say."""
+    """Open, close, keep the largest component and fill its holes, as SFS's code does, which empties the border of the
+    image. The paper does not say."""
     scale: Literal["unit", "norm"] = "unit"
     """What is composited. unit: cosines. norm: cosines times ||f||, as in SFS, whose features are not normalised."""
 

@@ -13,45 +13,90 @@ from normlift_ns.core.files import new_file
 
 
 def plot_sweeps(
-    rows: Sequence[Mapping[str, Any]], metric: str, label: str, path: Path, *, overwrite: bool = False
+    rows: Sequence[Mapping[str, Any]],
+    metric: str,
+    label: str,
+    path: Path,
+    *,
+    result: float | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """One panel per parameter of `votes.SWEEPS`, the metric over its values.
+    """Writes `sweeps_figure`.
 
     Args:
-        rows: with parameter, value and the metric.
-        label: of the metric's axis.
         overwrite: replace a file of that name.
+    """
+    _save(sweeps_figure(rows, metric, label, result), path, overwrite)
+
+
+def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, result: float | None = None) -> Figure:
+    """One panel per parameter of `votes.SWEEPS`, the metric over its values, those of the run and the default marked.
+
+    Args:
+        rows: with parameter, value, the metric and, where they are marked, default and own.
+        label: of the metric's axis.
+        result: main result of the run, a line across all panels.
     """
     parameters = list(dict.fromkeys(row["parameter"] for row in rows))
     figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
     for one, parameter in zip(axes, parameters):
-        points = sorted((row["value"], row[metric]) for row in rows if row["parameter"] == parameter)
-        one.plot([f"{x:g}" for x, _ in points], [y for _, y in points], marker="o", markersize=4)
+        some = sorted((row for row in rows if row["parameter"] == parameter), key=lambda row: row["value"])
+        values = [row[metric] for row in some]
+        one.plot(range(len(some)), values, marker="o", markersize=4)
+        one.set_xticks(range(len(some)), [f"{row['value']:g}" for row in some])
+        for mark, style in _MARKS.items():
+            chosen = [i for i, row in enumerate(some) if row.get(mark)]
+            if len(chosen) > 0:
+                one.plot(chosen, [values[i] for i in chosen], linestyle="none", **style)
+        if result is not None:
+            one.axhline(result, color="tab:grey", linestyle="--", label="result")
         one.set_xlabel(parameter, parse_math=False)
         one.grid(alpha=0.3)
     axes[0].set_ylabel(label, parse_math=False)
-    _save(figure, path, overwrite)
+    if len(axes[0].get_legend_handles_labels()[0]) > 0:
+        axes[0].legend(fontsize="small")
+    return figure
 
 
-def plot_signals(found: Mapping[str, Any], path: Path, *, overwrite: bool = False) -> None:
-    """Accuracy in tenths by R and by ||f||, where there is a truth, and the histogram of R with R = 0 apart."""
-    bins = {name: [found[k] for k in found if k.startswith(f"{name}.bin")] for name in ("reliability", "norm")}
-    figure, axes = _figure((9, 3.5), 1, 2)
-    for name, label in (("reliability", "R"), ("norm", "||f||")):
-        if len(bins[name]) > 0:
-            axes[0].plot(range(1, len(bins[name]) + 1), [100 * x for x in bins[name]], marker="o", label=f"by {label}")
-    axes[0].set_xlabel("tenth of the Gaussians, ascending")
-    axes[0].set_ylabel("accuracy, %")
-    axes[0].legend()
-    counts = {float(k.removeprefix("histogram.")): 100 * x for k, x in found.items() if k.startswith("histogram.")}
-    axes[1].bar(list(counts), list(counts.values()), width=1 / len(counts), align="edge", label="R > 0")
-    axes[1].bar([-2 / len(counts)], [100 * found["zero.share"]], width=1 / len(counts), color="tab:red", label="R = 0")
-    axes[1].set_xlabel("R")
-    axes[1].set_ylabel("Gaussians, %")
-    axes[1].legend()
-    for one in axes:
-        one.grid(axis="y", alpha=0.3)
-    _save(figure, path, overwrite)
+_MARKS: dict[str, dict[str, Any]] = {
+    "default": {"marker": "D", "color": "tab:orange", "label": "default"},
+    "own": {"marker": "o", "color": "black", "markerfacecolor": "none", "markersize": 11, "label": "of the run"},
+}
+
+
+def plot_signals(rows: Sequence[Mapping[str, Any]], path: Path, *, overwrite: bool = False) -> None:
+    """Writes `signals_figure`.
+
+    Args:
+        overwrite: replace a file of that name.
+    """
+    _save(signals_figure(rows), path, overwrite)
+
+
+def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """A line of panels per row of the study, that is per scene: accuracy of unrefined answers in tenths by R and by
+    ||f||, where there is a truth, and the histogram of R with R = 0 apart.
+    """
+    figure, axes = _figure((9, 3.5 * len(rows)), len(rows), 2)
+    for found, curves, histogram in zip(rows, axes[::2], axes[1::2]):
+        for name, label in (("reliability", "R"), ("norm", "||f||")):
+            bins = [100 * x for key, x in found.items() if key.startswith(f"{name}.bin")]
+            if len(bins) > 0:
+                curves.plot(range(1, len(bins) + 1), bins, marker="o", label=f"by {label}")
+        curves.set_title(found.get("scene", ""), parse_math=False)
+        curves.set_xlabel("tenth of the Gaussians, ascending")
+        curves.set_ylabel("accuracy, unrefined, %")
+        counts = {float(k.removeprefix("histogram.")): 100 * x for k, x in found.items() if k.startswith("histogram.")}
+        width = 1 / len(counts)
+        histogram.bar(list(counts), list(counts.values()), width=width, align="edge", label="R > 0")
+        histogram.bar([-2 * width], [100 * found["zero.share"]], width=width, color="tab:red", label="R = 0")
+        histogram.set_xlabel("R")
+        histogram.set_ylabel("Gaussians, %")
+        for one in (curves, histogram):
+            one.grid(axis="y", alpha=0.3)
+            if len(one.get_legend_handles_labels()[0]) > 0:
+                one.legend()
+    return figure
 
 
 def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:

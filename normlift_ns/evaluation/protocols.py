@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
@@ -22,12 +23,22 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.instance_masks import evaluate_masks, gaussian_truth, read_classes, read_names
 from normlift_ns.evaluation.lerf import FrameScores, frame_rows, summarize_lerf
 from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
-from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
+from normlift_ns.evaluation.options import LANGSPLAT, LerfOptions, MaskOptions, ScannetOptions
 from normlift_ns.evaluation.results import Evaluation
-from normlift_ns.evaluation.scannet import NYU40, SceneLabels, check_identity, evaluate_scannet, read_labels
+from normlift_ns.evaluation.scannet import (
+    NYU40,
+    PAPER_SPELLING,
+    SceneLabels,
+    check_identity,
+    evaluate_scannet,
+    read_labels,
+)
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
 from normlift_ns.raster.rasterize import rasterize_evidence, render
 from normlift_ns.raster.settings import RasterSettings
+
+_CHANNELS = 64
+"""Of features, composited at once."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +49,8 @@ class EvaluatedRun:
     field: SemanticField
     texts: TextEncoder
     refined: bool
+    cache: Path | None = None
+    """Where the lift keeps 2D features."""
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
         """Of every Gaussian's direction to the texts, 0 without direction."""
@@ -58,21 +71,50 @@ class EvaluatedRun:
         how = {"rasterize_mode": self.scene.rasterize_mode, "settings": self.settings}
         return render(self.scene.gaussians, camera, values, **how)
 
+    def feature_lengths(
+        self, cameras: Sequence[Camera], factor: Float[Tensor, "n 1"] | float = 1.0
+    ) -> list[Float[Tensor, "h w"]]:
+        """Length of the composited feature vector of every pixel, some channels at a time.
+
+        Args:
+            factor: what directions are multiplied by before they are composited.
+        """
+        squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
+        for axes in torch.eye(self.field.dimension).split(_CHANNELS):
+            values = factor * self.field.query(axes, refined=self.refined).float()
+            for i, camera in enumerate(cameras):
+                squares[i] += self.composited(camera, values)[0].double().square().sum(dim=2)
+        return [square.sqrt() for square in squares]
+
     def cameras(self) -> dict[str, Camera]:
         """Of all photographs, trained and held out, by the name of the image."""
         views = (self.scene.train, self.scene.held_out)
         return {name: camera for some in views for name, camera in zip(some.names, some.cameras)}
 
 
-def label_scene(lifted: EvaluatedRun, path: Path, nyu40: Int64[Tensor, " n"]) -> SceneLabels:
+def scene_names(labels: Sequence[Path]) -> list[str]:
+    """What the scenes of some labels are called: the name of the file or folder; the whole path where names are equal.
+
+    >>> scene_names([Path("label/ramen"), Path("a/scene0000_00_vh_clean_2.labels.ply")])
+    ['ramen', 'scene0000_00']
+    >>> scene_names([Path("a/ramen"), Path("b/ramen")])
+    ['a/ramen', 'b/ramen']
+    """
+    short = [path.name.split("_vh_clean")[0] for path in labels]
+    return [name if short.count(name) == 1 else str(path) for name, path in zip(short, labels)]
+
+
+def label_scene(
+    lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
+) -> SceneLabels:
     """What protocol scannet needs of a run.
 
     Raises:
         ValueError: another number of vertices than Gaussians.
     """
-    name = path.name.split("_vh_clean")[0]
     check_identity(name, len(lifted.scene.gaussians), nyu40, path)
-    cosine = lifted.cosine(tuple(NYU40.values()))
+    asked = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
+    cosine = lifted.cosine(tuple(asked.values()))
     return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
 
 
@@ -83,30 +125,35 @@ def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: S
         FileNotFoundError, ValueError: labels that are missing, damaged or of another number of points.
     """
     truths = [read_labels(path) for path in labels]
-    scenes = [label_scene(lifted, path, nyu40) for path, nyu40, lifted in zip(labels, truths, runs)]
-    return evaluate_scannet(scenes, min_opacity=options.min_opacity, without_direction=options.without_direction)
+    given = zip(runs, scene_names(labels), labels, truths)
+    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in given]
+    rule = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
+    found = evaluate_scannet(scenes, **rule)
+    return replace(found, settings={**found.settings, "spelling": options.spelling})
 
 
 def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
-    """Protocol lerf over one run per scene; all frames of all scenes count alike in `average`.
+    """Protocol lerf over one run per scene.
 
     Raises:
         FileNotFoundError, ValueError: labels that are missing, damaged or of other images.
     """
     files = [read_frames(folder) for folder in labels]
     rows, missing = [], []
-    for folder, given, lifted in zip(labels, files, runs):
+    for scene, given, lifted in zip(scene_names(labels), files, runs):
         cameras = lifted.cameras()
         found, absent = match_views(given, list(cameras))
-        missing += [f"{folder.name}/{stem}" for stem in absent]
-        for file, name in found.items():
-            camera = cameras[name]
-            frame = read_frame(file, camera.width, camera.height)
-            if len(frame.masks) == 0:
-                continue
-            scores = _frame_scores(lifted, camera, frame, options)
+        missing += [f"{scene}/{stem}" for stem in absent]
+        views = [(cameras[name], read_frame(f, cameras[name].width, cameras[name].height)) for f, name in found.items()]
+        views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
+        factor = lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
+        lengths: list[Tensor | None] = [None] * len(views)
+        if options.masking == "langsplat":
+            lengths = list(lifted.feature_lengths([camera for camera, _ in views], factor))
+        for (camera, frame), length in zip(views, lengths):
+            scores = _frame_scores(lifted, camera, frame, factor, length, options)
             rows += [
-                {"scene": folder.name, **row, "frame": f"{folder.name}/{frame.stem}"}
+                {"scene": scene, **row, "frame": f"{scene}/{frame.stem}"}
                 for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
             ]
     if len(rows) == 0:
@@ -115,12 +162,20 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
     return summarize_lerf(rows, options.average, settings)
 
 
-def _frame_scores(lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, options: LerfOptions) -> FrameScores:
-    prompts, langsplat = tuple(frame.masks), options.masking == "langsplat"
-    cosine = lifted.cosine((*prompts, *(CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS)))
-    if options.scale == "norm":
-        cosine = cosine * lifted.field.scalars.norm[:, None].to(cosine)
-    values, _ = lifted.composited(camera, cosine)
+def _frame_scores(
+    lifted: EvaluatedRun,
+    camera: Camera,
+    frame: LabeledFrame,
+    factor: Float[Tensor, "n 1"] | float,
+    length: Float[Tensor, "h w"] | None,
+    options: LerfOptions,
+) -> FrameScores:
+    """Composited scores, divided by the length of the pixel's feature where it is given."""
+    prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT
+    others = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
+    values, _ = lifted.composited(camera, factor * lifted.cosine((*prompts, *others)))
+    if length is not None:
+        values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
     values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
     return FrameScores(frame, relevancy(values, background, rule="lerf") if langsplat else values, background)
 

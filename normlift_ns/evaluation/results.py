@@ -22,6 +22,8 @@ class Evaluation:
     """Per class (and scene or frame), JSON types only."""
     settings: Mapping[str, Any]
     """The protocol and the reading of it."""
+    scenes: Sequence[Mapping[str, Any]] = ()
+    """Results of every scene, where `results` are their means."""
 
 
 def mean(values: Sequence[float]) -> float:
@@ -44,8 +46,8 @@ def write_evaluation(
     studies: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Writes experiment_name, method_name, checkpoint and results as ns-eval does, then settings, rows and studies;
-    NaN as null.
+    """Writes experiment_name, method_name, checkpoint and results as ns-eval does, then settings, scenes, rows and
+    studies; NaN as null.
 
     Raises:
         FileExistsError: the file is there and `overwrite` is False.
@@ -56,6 +58,7 @@ def write_evaluation(
         "checkpoint": checkpoint,
         "results": evaluation.results,
         "settings": evaluation.settings,
+        **({"scenes": evaluation.scenes} if evaluation.scenes else {}),
         "rows": evaluation.rows,
         **({"studies": studies} if studies else {}),
     }

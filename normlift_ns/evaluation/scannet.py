@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,9 @@ NYU40 = {
     10: "bookshelf", 11: "picture", 12: "counter", 14: "desk", 16: "curtain", 24: "refrigerator", 28: "showercurtain",
     33: "toilet", 34: "sink", 36: "bathtub",
 }  # fmt: skip
-"""Names that are queried, bare and spelled so, by NYU40 id."""
+"""Names that are queried, bare and spelled as in OpenGaussian's script, by NYU40 id."""
+PAPER_SPELLING = {28: "shower curtain"}
+"""Names that the paper prints otherwise."""
 _LAST_ID = 40
 CLASS_SETS = {
     19: tuple(NYU40),
@@ -132,6 +134,7 @@ def evaluate_scannet(
     """
     other: WithoutDirection = "none" if without_direction == "first" else "first"
     results, rows = {}, []
+    by_scene: list[dict[str, Any]] = [{"scene": scene.name} for scene in scenes]
     for classes, ids in CLASS_SETS.items():
         scores = {
             rule: [scene_scores(s, classes, min_opacity=min_opacity, without_direction=rule) for s in scenes]
@@ -146,6 +149,8 @@ def evaluate_scannet(
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
             results[f"macc_{classes}{suffix}"] = mean([s.macc for s in scores[rule]])
+        for row, found in zip(by_scene, scores[without_direction]):
+            row |= {f"miou_{classes}": found.miou, f"macc_{classes}": found.macc}
         for scene, found in zip(scenes, scores[without_direction]):
             rows += [
                 {"scene": scene.name, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
@@ -159,4 +164,4 @@ def evaluate_scannet(
         "missing_scenes": missing,
     }  # fmt: skip
     share = mean([float((~scene.valid).double().mean()) for scene in scenes])
-    return Evaluation({**results, "without_direction_share": share}, rows, settings)
+    return Evaluation({**results, "without_direction_share": share}, rows, settings, by_scene)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, get_args
@@ -15,7 +15,7 @@ from normlift_ns.core.ablations import Variant, linear_average, variant_config, 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.storage import StoredDirections
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import LiftOptions, RefineConfig, VoteKind
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "beta": (0.25, 0.5, 1.0, 2.0, 4.0),
@@ -25,7 +25,10 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "gamma": (0.05, 0.1, 0.2, 0.4, 0.8),
     "delta": (0.0, 0.05, 0.1, 0.2, 0.3),
 }
-"""Values tried, the others as the run was lifted; beta, K and Delta as in the paper's appendix."""
+"""Values tried besides the default and those of the runs, the others as the run was lifted; beta, K and Delta as in the
+paper's appendix."""
+BETA = LiftOptions().beta
+"""The default."""
 
 
 @dataclass(frozen=True)
@@ -44,25 +47,43 @@ def own_vote(manifest: Mapping[str, Any]) -> Vote:
     options = manifest.get("options", {})
     kind = {"vote": "paper"} if "vote" in options else {}  # version 0.1 knew no other
     config = RefineConfig(**{**kind, **options.get("vote", {})})
-    return Vote(config.vote, config, options.get("beta", 1.0), {})
+    return Vote(config.vote, config, options.get("beta", BETA), {})
 
 
-def ablation(own: Vote) -> Iterator[Vote]:
-    """The variants of the paper's table 2, and the posterior vote."""
+def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """The variants of the paper's table 2 and the posterior vote, one vote per run."""
     for variant in get_args(Variant):
-        yield replace(own, variant=variant, label={"variant": variant})
+        yield [replace(own, variant=variant, label={"variant": variant}) for own in owns]
 
 
-def sweeps(own: Vote) -> Iterator[Vote]:
-    """`SWEEPS` around the run's own values."""
+def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """`SWEEPS` around each run's own values, with the default and all own values among them and marked; one vote per
+    run.
+    """
     for parameter, values in SWEEPS.items():
-        for value in values:
-            label = {"parameter": parameter, "value": value}
-            if parameter == "beta":
-                yield replace(own, beta=value, label=label)
-            else:
-                changed: dict[str, Any] = {parameter: int(value) if parameter == "k" else value}
-                yield replace(own, config=replace(own.config, **changed), label=label)
+        default = default_of(parameter, owns[0].config.vote)
+        used = {_value(own, parameter) for own in owns}
+        for value in sorted({*values, default, *used}):
+            label = {"parameter": parameter, "value": value, "default": value == default, "own": value in used}
+            yield [_changed(own, parameter, value, label) for own in owns]
+
+
+def default_of(parameter: str, kind: VoteKind) -> float:
+    """The default of one of the parameters of `SWEEPS` in a kind of vote."""
+    return _value(Vote(kind, RefineConfig(vote=kind), BETA, {}), parameter)
+
+
+def _value(vote: Vote, parameter: str) -> float:
+    if parameter == "beta":
+        return vote.beta
+    return getattr(vote.config if parameter == "k" else vote.config.numbers, parameter)
+
+
+def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) -> Vote:
+    if parameter == "beta":
+        return replace(own, beta=value, label=label)
+    changed: dict[str, Any] = {parameter: int(value) if parameter == "k" else value}
+    return replace(own, config=replace(own.config, **changed), label=label)
 
 
 def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:

@@ -17,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.core.crash import explain
 from normlift_ns.core.files import write_text
-from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
@@ -121,9 +121,7 @@ def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
     Raises:
         ValueError, FileNotFoundError: as `make_source`; the message names the flags of ns-train.
     """
-    options: SourceOptions = config.pipeline.source  # type: ignore[attr-defined]
-    if options.features == "langsplat" and options.features_dir is None:
-        options = replace(options, features_dir=dataset_folder(config))
+    options = _source_options(config)
     try:
         return make_source(options, device)
     except FileNotFoundError as error:
@@ -133,6 +131,13 @@ def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
             f"{error}. Write them there with LangSplat's preprocessing, name their folder with "
             "--pipeline.source.features-dir, or look at the photographs instead: --pipeline.source.features none"
         ) from error
+
+
+def _source_options(config: TrainerConfig) -> SourceOptions:
+    options: SourceOptions = config.pipeline.source  # type: ignore[attr-defined]
+    if options.features == "langsplat" and options.features_dir is None:
+        return replace(options, features_dir=dataset_folder(config))
+    return options
 
 
 def _lift_at_the_end(trainer: Trainer, step: int) -> None:
@@ -167,17 +172,19 @@ def lift_trained(trainer: Trainer) -> Path:
     encoder = encoder_settings(options.source)
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"
     result = lift_scene(scene, source, options.lift, cache_folder(path.parent), device=device, encoder=encoder)
+    settings = source_settings(_source_options(trainer.config), str(pipeline.device))
+    field = replace(result.field, manifest={**result.field.manifest, "source": settings})
     folder = trainer.base_dir / FIELD_FOLDER
     files = [scene.checkpoint_path, scene.location.run_dir / "dataparser_transforms.json"]
-    result.field.save(folder, overwrite=True, beside=digests_beside(folder, files))
+    field.save(folder, overwrite=True, beside=digests_beside(folder, files))
     question = None
     if len(options.queries) > 0:
-        question = make_question(result.field, source.text, options.queries)
+        question = make_question(field, source.text, options.queries)
         save_question(folder, question)
     trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
     write_text(path, sealed(yaml.dump(trainer.config)), overwrite=True)
     with trainer.train_lock:
-        pipeline.model.attach(result.field, question)
+        pipeline.model.attach(field, question)
     viewer: Any = trainer.viewer_state
     if hasattr(viewer, "_trigger_rerender"):
         viewer._trigger_rerender()

@@ -44,16 +44,17 @@ class NormLiftEval:
     """Replace the output file and the figures beside it."""
     refined: bool = True
     """Evaluate the refined directions."""
-    study: tuple[Literal["ablation", "sweeps", "signals", "timing"], ...] = ()
+    study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines"], ...] = ()
     """What to measure besides. ablation: the variants of the refinement. sweeps: every parameter of the vote around
-    the run's own. signals: Gaussians without evidence, accuracy by R and by norm, R against opacity. timing: what
-    lifting took. Holds all runs in memory."""
+    the run's own, with the default. signals: Gaussians without evidence, accuracy by R and by norm, R against opacity.
+    timing: what lifting took and, on a GPU, what SFS's way takes, 512 channels through gsplat. baselines: the ideas of
+    SFS, Occam's LGS, VALA and Dr.Splat on the features of the run, in our implementation. Holds all runs in memory."""
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look names up in instead of the encoder that the runs were lifted with."""
     data: Path | None = None
     """Where the dataset is now, if it was moved; for one run."""
     device: str = "auto"
-    """auto, cpu or cuda: where the text encoder runs, and the votes of --study."""
+    """auto, cpu or cuda: where the text encoder and --study run."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
@@ -67,9 +68,10 @@ class NormLiftEval:
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
-        from normlift_ns.evaluation.studies import study_votes, timing  # noqa: PLC0415
+        from normlift_ns.evaluation.studies import baselines, study_votes, timing  # noqa: PLC0415
         from normlift_ns.evaluation.votes import ablation, sweeps  # noqa: PLC0415
         from normlift_ns.front_door import open_run  # noqa: PLC0415
+        from normlift_ns.runs.files import cache_folder  # noqa: PLC0415
 
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []
@@ -77,7 +79,7 @@ class NormLiftEval:
         def evaluated(config: Path) -> EvaluatedRun:
             run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
             names.append((run.scene.name, str(run.scene.checkpoint_path)))
-            return EvaluatedRun(run.scene, run.field, run.texts, self.refined)
+            return EvaluatedRun(run.scene, run.field, run.texts, self.refined, cache_folder(run.folder))
 
         # Scenes are large: one is held at a time, unless they are studied.
         runs: Iterable[EvaluatedRun] = (evaluated(config) for config in self.load_config)
@@ -90,7 +92,9 @@ class NormLiftEval:
             if name == "signals":
                 studies[name] = measure_signals(held)
             elif name == "timing":
-                studies[name] = timing(held)
+                studies[name] = timing(held, device, say)
+            elif name == "baselines":
+                studies[name] = baselines(held, evaluate, device)
             else:
                 studies[name] = study_votes(held, evaluate, {"ablation": ablation, "sweeps": sweeps}[name], device)
         experiments, checkpoints = (", ".join(values) for values in zip(*names))
@@ -98,8 +102,10 @@ class NormLiftEval:
             self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
             studies=studies, overwrite=self.overwrite,
         )  # fmt: skip
-        written = [self.output_path, *self._plots(studies, next(iter(evaluation.results)))]
+        written = [self.output_path, *self._plots(studies, evaluation.results)]
         CONSOLE.print(rows_table(evaluation.rows))
+        if len(evaluation.scenes) > 1:
+            CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
         CONSOLE.print(results_table(evaluation))
         for name, rows in studies.items():
             CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
@@ -143,18 +149,19 @@ class NormLiftEval:
             lambda some: studies.mask_signals(some[0], truth),
         )
 
-    def _plots(self, studies: Mapping[str, list[Row]], metric: str) -> Iterator[Path]:
-        """Figures beside the output file."""
+    def _plots(self, studies: Mapping[str, list[Row]], results: Mapping[str, float]) -> Iterator[Path]:
+        """Figures beside the output file; sweeps are of the first result."""
         from normlift_ns.evaluation.plots import plot_signals, plot_sweeps  # noqa: PLC0415
 
+        metric, result = next(iter(results.items()))
         for name in _WITH_FIGURE:
             if name not in studies:
                 continue
             path = self._figure(name)
             if name == "sweeps":
-                plot_sweeps(studies[name], metric, metric, path, overwrite=self.overwrite)
+                plot_sweeps(studies[name], metric, metric, path, result=result, overwrite=self.overwrite)
             else:
-                plot_signals(studies[name][0], path, overwrite=self.overwrite)
+                plot_signals(studies[name], path, overwrite=self.overwrite)
             yield path
 
     def _figure(self, study: str) -> Path:
@@ -181,7 +188,8 @@ def signals_table(rows: Sequence[Row]) -> Table:
     """One column per scene."""
     table = Table("signal", *(Column(plain(row.get("scene", "value"))) for row in rows), title="signals")
     for name in (key for key in rows[0] if key != "scene"):
-        table.add_row(name, *(f"{row[name]:.3f}" for row in rows))
+        digits = ".3g" if name.endswith("_p") else ".3f"  # p-values may be tiny
+        table.add_row(name, *(f"{row[name]:{digits}}" for row in rows))
     return table
 
 

@@ -13,11 +13,13 @@ from normlift_ns.core.metrics import (
     classify,
     confusion,
     kendall,
+    kendall_test,
     localized,
     lowest_jaccard,
     mask_iou,
     mask_recall,
     spearman,
+    spearman_test,
 )
 
 
@@ -84,7 +86,8 @@ def test_masks_by_hand():
     a, b = torch.tensor([[1, 1], [0, 0]]).bool(), torch.tensor([[1, 0], [1, 0]]).bool()
     none = torch.zeros_like(a)
     assert (mask_iou(a, b), mask_recall(a, b)) == (1 / 3, 1 / 2)
-    assert mask_iou(none, none) == 1
+    assert math.isnan(mask_iou(none, none))
+    assert mask_iou(none, none, empty=0.0) == 0
     assert mask_iou(none, a) == 0
     assert math.isnan(mask_recall(a, none))
 
@@ -118,6 +121,15 @@ def test_rank_correlations_equal_their_definitions(pairs):
     total = sum(x * y for x, y in signs)
     untied = [sum(abs(pair[side]) for pair in signs) for side in (0, 1)]
     assert found[1] == pytest.approx(total / math.sqrt(untied[0] * untied[1]), abs=1e-12)
+
+
+def test_p_values():
+    """Of 5! orders two are in perfect agreement or disagreement; Spearman's 0.9 of five is t = 3.576 with 3 degrees."""
+    order = torch.arange(5.0)
+    assert kendall_test(order, order) == pytest.approx((1.0, 2 / 120))
+    found = spearman_test(order, torch.tensor([0.0, 1, 2, 4, 3]))
+    assert found == pytest.approx((0.9, 0.0374), abs=1e-4)
+    assert all(map(math.isnan, kendall_test(order, torch.zeros(5))))
 
 
 def test_jaccard_of_the_lowest_and_bins_by_hand():

@@ -1,6 +1,7 @@
 """The LERF-OVS protocol by hand: labels, thresholds, cleaning, localisation, averages."""
 
 import json
+import math
 
 import pytest
 import torch
@@ -8,10 +9,8 @@ import torch
 from normlift_ns.evaluation.lerf import (
     FrameScores,
     box_filtered,
-    cleaned,
     found_mask,
     frame_rows,
-    histogram_threshold,
     in_boxes,
     summarize_lerf,
 )
@@ -85,32 +84,6 @@ def test_margin_over_the_best_background_word():
     assert row["iou"] == 2 / 3  # SFS's margin lets the second pixel in
 
 
-def test_histogram_threshold_is_the_valley_left_of_the_kth_peak():
-    g = torch.Generator().manual_seed(0)
-    parts = [
-        centre + 0.01 * torch.randn(count, generator=g) for centre, count in ((0.1, 9000), (0.5, 4000), (0.9, 3000))
-    ]
-    score = torch.cat(parts).view(100, 160)
-    assert 0.55 < histogram_threshold(score, 1) < 0.89
-    assert 0.12 < histogram_threshold(score, 2) < 0.49
-    flat = torch.full((10, 10), 0.3)
-    assert histogram_threshold(flat, 1) == pytest.approx(0.3)
-    background = torch.zeros(100, 160, 0)
-    assert int(found_mask(score, background, "auto", margin=0, instances=1).sum()) == 3000
-
-
-def test_cleaning_keeps_the_largest_component_without_holes():
-    mask = torch.zeros(40, 40, dtype=torch.bool)
-    mask[5:25, 5:25] = True
-    mask[12:16, 12:16] = False  # a hole that closing leaves
-    mask[30:36, 30:36] = True  # a smaller component
-    mask[2, 35] = True  # a speck
-    expected = torch.zeros_like(mask)
-    expected[5:25, 5:25] = True
-    assert torch.equal(cleaned(mask), expected)
-    assert not cleaned(torch.zeros(8, 8, dtype=torch.bool)).any()
-
-
 def test_langsplat_reading():
     relevancy = torch.zeros(90, 90)
     relevancy[30:60, 30:60] = 1.0
@@ -131,10 +104,63 @@ def test_langsplat_reading():
     assert in_boxes([(1.0, 0.0, 2.0, 1.0)], 3, 4).nonzero().tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
 
 
-def test_order_of_averages_by_hand():
-    def row(frame, category, iou):
-        return {"frame": frame, "category": category, "iou": iou, "accuracy": iou, "localized": 1.0}
+def smoothed(mask):
+    """LangSplat's majority, pixel by pixel: windows end before the last row and the last column."""
+    height, width = mask.shape
+    found = torch.zeros_like(mask)
+    for i in range(height):
+        for j in range(width):
+            window = mask[max(0, i - 3) : min(i + 4, height - 1), max(0, j - 3) : min(j + 4, width - 1)]
+            found[i, j] = 2 * int(window.sum()) > window.numel()
+    return found
 
-    rows = [row("a", "egg", 1.0), row("b", "egg", 0.0), row("b", "bowl", 0.5), row("b", "nori", 0.0)]
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_majority_is_langsplats_up_to_the_border(seed):
+    g = torch.Generator().manual_seed(seed)
+    height, width = (int(x) for x in torch.randint(2, 30, (2,), generator=g))
+    relevancy = torch.rand(height, width, generator=g)
+    scaled = (relevancy - relevancy.min()) / (relevancy - relevancy.min()).max()
+    expected = smoothed(2 * scaled - 1 > 0.4)
+    none = relevancy[..., None][..., :0]
+    assert torch.equal(found_mask(relevancy, none, "langsplat", margin=0, instances=1), expected)
+    inside = torch.zeros(20, 20)
+    inside[-2:] = 1.0
+    assert not found_mask(inside, none, "langsplat", margin=0, instances=1)[-3].any()
+
+
+def test_two_empty_masks():
+    """SFS's code gives 0; LangSplat's divides 0 by 0."""
+    nothing = torch.zeros(4, 4, dtype=torch.bool)
+    scores = FrameScores(frame_of({"egg": nothing}), torch.zeros(4, 4, 1), torch.ones(4, 4, 8))
+    assert frame_rows(scores, "background", margin=0, clean=False)[0]["iou"] == 0
+    assert math.isnan(frame_rows(scores, "langsplat", margin=0, clean=False)[0]["iou"])
+
+
+def row(scene, frame, category, iou):
+    return {
+        "scene": scene, "frame": f"{scene}/{frame}", "category": category, "iou": iou, "accuracy": iou, "localized": 1.0
+    }  # fmt: skip
+
+
+def test_order_of_averages_by_hand():
+    rows = [row("s", "a", "egg", 1.0), row("s", "b", "egg", 0.0), row("s", "b", "bowl", 0.5), row("s", "b", "nori", 0)]
     miou = {order: summarize_lerf(rows, order, {}).results["miou"] for order in ("frames", "pairs", "categories")}
     assert miou == pytest.approx({"frames": (1 + 1 / 6) / 2, "pairs": 1.5 / 4, "categories": (0.5 + 0.5 + 0) / 3})
+
+
+def test_scenes_are_averaged_as_the_paper_does_and_pooled_beside_it():
+    rows = [row("s", "a", "egg", 1.0), row("t", "a", "egg", 0.0), row("t", "b", "egg", 0.5), row("t", "b", "cup", 0.5)]
+    frames = summarize_lerf(rows, "frames", {})
+    assert [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes] == [
+        ("s", 1, 1),
+        ("t", 2, 1 / 4),
+    ]
+    assert frames.results["miou"] == (1 + 1 / 4) / 2
+    assert frames.results["miou_pooled"] == (1 + 0 + 1 / 2) / 3  # three frames
+    pairs = summarize_lerf(rows, "pairs", {}).results
+    assert (pairs["miou"], pairs["miou_pooled"]) == ((1 + 1 / 3) / 2, 2 / 4)
+    categories = summarize_lerf(rows, "categories", {}).results
+    assert (categories["miou"], categories["miou_pooled"]) == ((1 + 3 / 8) / 2, (0.5 + 0.5) / 2)
+    one = summarize_lerf(rows[1:], "frames", {}).results
+    assert one["miou"] == one["miou_pooled"]

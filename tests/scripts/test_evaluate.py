@@ -13,12 +13,15 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+import normlift_ns as nl
 from normlift_ns.core.ablations import Variant
 from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.evaluation import votes
+from normlift_ns.evaluation.baselines import BASELINES
+from normlift_ns.evaluation.instance_masks import read_names
 from normlift_ns.evaluation.scannet import NYU40
-from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES
+from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES, RefineConfig
 from normlift_ns.scripts import evaluate, lift
 from tests.scripts.conftest import run_entry, said
 
@@ -107,19 +110,50 @@ def test_studies_of_masks(workspace, monkeypatch, capsys):
     plain = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", "--refined", False)
     assert by_variant["none"]["miou_3d"] == plain["results"]["miou_3d"]
     assert len({row["miou_3d"] for row in by_variant.values()}) > 3
-    assert [(row["parameter"], row["value"]) for row in studies["sweeps"]][2] == ("k", 12)
-    assert len(studies["sweeps"]) == 5
-    own = [r["miou_3d"] for r in studies["sweeps"] if (r["parameter"], r["value"]) in (("k", 12), ("delta", 0.0))]
-    assert own == [by_variant["paper"]["miou_3d"]] * 2
+    own = [row for row in studies["sweeps"] if row["own"]]
+    assert [row["parameter"] for row in own] == ["beta", "k", "delta"]
+    assert [row["miou_3d"] for row in own] == [by_variant["paper"]["miou_3d"]] * 3
+    of_k = [(row["value"], row["default"], row["own"]) for row in studies["sweeps"] if row["parameter"] == "k"]
+    assert of_k == sorted({(6, False, False), (12, False, True), (RefineConfig().k, True, False)})
     (signals,) = studies["signals"]
     assert signals["zero.share"] == pytest.approx(document["results"]["zero_evidence_share"])
-    assert signals["zero.accuracy"] is None  # no mask tells the class of what nobody sees
+    assert signals["zero.accuracy_unrefined"] is None  # no mask tells the class of what nobody sees
+    assert signals["zero.accuracy_refined"] is None
+    assert signals["seen.accuracy_refined"] == pytest.approx(document["results"]["accuracy_3d"], abs=1e-6)
+    assert 0 <= signals["opacity.kendall_p"] <= 1
     assert signals["reliability.spearman_bins"] > 0.5
     assert sum(v for k, v in signals.items() if k.startswith("histogram.")) == pytest.approx(1 - signals["zero.share"])
     (cost,) = studies["timing"]
-    assert cost["total_s"] > cost["vote_s"] > 0
+    assert cost["vote_s"] > 0 and cost["store_s"] > 0
+    stages = ("features_s", "evidence_s", "lift_s", "neighbors_s", "vote_s", "store_s")
+    assert cost["total_s"] == pytest.approx(sum(cost[stage] for stage in stages))
     assert {p.name for p in workspace.glob("masks_*.svg")} == {"masks_sweeps.svg", "masks_signals.svg"}
-    assert "spearman_bins" in capsys.readouterr().out
+    told = said(capsys)
+    assert "spearman_bins" in told
+    assert "leaves out SFS's way (512 channels through gsplat): it needs a GPU" in told
+
+
+def test_baselines_are_lifted_from_the_features_of_the_run(workspace, monkeypatch, capsys):
+    document = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", "--study", "baselines")
+    rows = {row["method"]: row for row in document["studies"]["baselines"]}
+    assert list(rows) == ["normlift", "unrefined", "sfs", "occam", "vala", "drsplat"]
+    assert rows["normlift"]["miou_3d"] == document["results"]["miou_3d"]
+    assert [rows[name]["what"] for name in BASELINES] == list(BASELINES.values())
+    assert len({(row["miou_3d"], row["miou_2d"]) for row in rows.values()}) == 6
+    assert min(row["miou_3d"] for row in rows.values()) > 0.2
+    assert "drsplat" in said(capsys)
+
+
+def test_baselines_of_features_of_ones_own_are_refused(workspace, monkeypatch, capsys):
+    config = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml"
+    scene = nl.open_scene(config)
+    halves = [((torch.arange(c.width) * 2 // c.width).expand(c.height, -1), torch.eye(2)) for c in scene.train.cameras]
+    texts = dict.fromkeys(read_names(workspace / "room" / "labels.json").classes, torch.tensor([1.0, 1.0]))
+    run = nl.lift_run(scene, features=halves, texts=texts, output_dir=workspace / "own", timestamp="own")
+    flags = ("--protocol", "masks", "--load-config", run.config, "--labels", workspace / "room" / "instance")
+    flags += ("--output-path", workspace / "own.json", "--study", "baselines")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 1
+    assert "does not say how its regions and features were made" in said(capsys)
 
 
 def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
@@ -129,7 +163,8 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     path = workspace / "scene0000_00_vh_clean_2.labels.ply"
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
     colours = [*room.names, *["black", "white", "grey", "beige", "magenta", "lime"]]
-    vectors = stand_ins(workspace / "names.npz", dict(zip(NYU40.values(), colours)))
+    names = [*NYU40.values(), "shower curtain"]
+    vectors = stand_ins(workspace / "names.npz", dict(zip(names, [*colours, "cyan"])))
     document = evaluated(monkeypatch, workspace, "scannet", path, "--text-vectors", vectors)
     results = document["results"]
     assert document["settings"]["scenes"] == ["scene0000_00"]
@@ -137,12 +172,17 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     assert results["miou_19"] > 0.5
     assert results["miou_10"] >= results["miou_19"] - 0.2
     assert {row["class"] for row in document["rows"] if row["classes"] == 19} == {NYU40[i] for i in ids}
+    assert document["settings"]["spelling"] == "script"
+    spelled = evaluated(monkeypatch, workspace, "scannet", path, "--spelling", "paper", "--text-vectors", vectors)
+    assert spelled["settings"]["spelling"] == "paper"
+    assert spelled["results"]["miou_19"] > results["miou_19"] - 0.2  # that name is found too
     flags = ("--study", "signals", "ablation", "--text-vectors", vectors)
     studies = evaluated(monkeypatch, workspace, "scannet", path, *flags)["studies"]
     assert studies["signals"][0]["scene"] == "scene0000_00"
-    assert 0.5 < studies["signals"][0]["seen.accuracy"] < 1
+    assert 0.5 < studies["signals"][0]["seen.accuracy_unrefined"] < 1
     assert [row["variant"] for row in studies["ablation"]][-1] == "posterior"
-    assert studies["ablation"][-1]["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
+    (paper,) = (row for row in studies["ablation"] if row["variant"] == "paper")
+    assert paper["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
 
 
 def write_polygons(folder: Path, instance: Path, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
@@ -167,19 +207,45 @@ def test_lerf_with_stand_in_words(workspace, room, monkeypatch, capsys):
     vectors = stand_ins(workspace / "words.npz", words)
     assert set(CANONICAL_NEGATIVES) <= set(words)
     found = {}
-    for rule in ("background", "langsplat", "auto"):
+    for rule in ("background", "langsplat", "langsplat_composited", "auto"):
         flags = ("--masking", rule, "--text-vectors", vectors)
         found[rule] = evaluated(monkeypatch, workspace, "lerf", labels, *flags)
     results = found["background"]["results"]
     assert results["loc_acc"] > 0.6
     assert results["miou"] > 0.3
+    assert results["miou_pooled"] == results["miou"] == found["background"]["scenes"][0]["miou"]
+    assert found["langsplat"]["results"] != found["langsplat_composited"]["results"]
     assert found["background"]["settings"]["labels_without_image"] == ["room/0099"]
     assert {row["frame"] for row in found["auto"]["rows"]} <= {"room/0000", "room/0008"}
     (signals,) = evaluated(monkeypatch, workspace, "lerf", labels, *flags, "--study", "signals")["studies"]["signals"]
     assert "opacity.spearman" in signals
-    assert "all.accuracy" not in signals  # nothing tells the class of a Gaussian
+    assert "all.accuracy_refined" not in signals  # nothing tells the class of a Gaussian
     cleaned = evaluated(monkeypatch, workspace, "lerf", labels, "--clean", True, "--text-vectors", vectors)
     assert cleaned["results"]["miou"] != results["miou"]
+
+
+def test_several_scenes_are_averaged_and_pooled(workspace, room, monkeypatch, capsys):
+    """One run under two names, with two frames and one."""
+    wanted = ("sky blue", "bright blue", "dark green")
+    for scene, stems in (("kitchen", ("0000", "0008")), ("hall", ("0000",))):
+        for stem in stems:
+            instance = workspace / "room" / "instance" / f"{stem}.png"
+            write_polygons(workspace / "two" / scene, instance, room.names, wanted)
+    words = {**{name: name for name in wanted}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
+    config, output = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml", workspace / "two.json"
+    labels = (workspace / "two" / "kitchen", workspace / "two" / "hall")
+    flags = ("--protocol", "lerf", "--load-config", config, config, "--labels", *labels, "--output-path", output)
+    flags += ("--text-vectors", stand_ins(workspace / "words.npz", words), "--study", "signals")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 0
+    document = json.loads(output.read_text())
+    kitchen, hall = document["scenes"]
+    assert (kitchen["scene"], kitchen["frames"], hall["scene"], hall["frames"]) == ("kitchen", 2, "hall", 1)
+    results = document["results"]
+    assert results["miou"] == pytest.approx((kitchen["miou"] + hall["miou"]) / 2)
+    assert results["miou_pooled"] == pytest.approx((2 * kitchen["miou"] + hall["miou"]) / 3)
+    assert kitchen["miou"] != hall["miou"]
+    assert [row["scene"] for row in document["studies"]["signals"]] == ["kitchen", "hall", "all scenes"]
+    assert "kitchen" in said(capsys)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,250 @@
+"""Ideas of other methods on a run's own features, against dense sums over pixels in float64."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from normlift_ns import Camera, LiftOptions, RasterSettings, SourceOptions, View, rasterize_evidence
+from normlift_ns.encoders.build import make_source, source_settings
+from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks
+from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
+from normlift_ns.evaluation.protocols import EvaluatedRun
+from normlift_ns.evaluation.studies import timing
+from normlift_ns.lifting import lift_scene
+from normlift_ns.observing import of_regions
+from normlift_ns.raster.backend import Job
+from tests.raster.test_gpu import compiled_gsplat
+from tests.scenes import dense, generator, orbit, random_scene
+
+N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
+OPTIONS = SourceOptions(encoder="colour", regions="grid", region_count=12)
+
+
+@dataclass
+class Photographs:
+    cameras: list[Camera]
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{i}.png" for i in range(len(self.cameras))]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, index: int) -> View:
+        image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator(index), dtype=torch.uint8)
+        mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        mask[: 3 * index] = False
+        return View(self.cameras[index], image, mask, self.names[index])
+
+
+@pytest.fixture(scope="module")
+def lifted(tmp_path_factory) -> EvaluatedRun:
+    """A lifted run of a scene made by hand, whose photographs are masked in part."""
+    folder = tmp_path_factory.mktemp("cache")
+    scene: Any = SimpleNamespace(
+        gaussians=random_scene(N, dtype=torch.float32, size=0.3), train=Photographs(orbit(VIEWS)),
+        held_out=Photographs([]), rasterize_mode="classic", identity={}, name="made",
+    )  # fmt: skip
+    found = lift_scene(scene, make_source(OPTIONS), LiftOptions(refine=False, max_views=4), folder, encoder={}).field
+    manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
+    return EvaluatedRun(scene, replace(found, manifest=manifest), make_source(OPTIONS), False, folder)
+
+
+def observations(lifted: EvaluatedRun) -> list[tuple[Camera, Tensor, Tensor]]:
+    """Per view: the camera, A [N, P] in float64, and the feature of every pixel [P, D], 0 without a region."""
+    found = []
+    pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.int32).view(HEIGHT, WIDTH)
+    for block in seen_blocks(lifted, "cpu"):
+        for camera, features in zip(block.cameras, feature_maps(block, "cpu")):
+            weights = rasterize_evidence(lifted.scene.gaussians, [camera], [pixels]).rows
+            found.append((camera, dense(weights, HEIGHT * WIDTH).double(), features.flatten(0, 1).double()))
+    return found
+
+
+def of_sums(total: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(total, dim=1)
+
+
+def sfs(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
+    return of_sums(sum(weights**2 @ features for _, weights, features in seen))
+
+
+def occam(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
+    total = torch.zeros(N, seen[0][2].shape[1], dtype=torch.float64)
+    for camera, weights, features in seen:
+        weight = weights @ (features != 0).any(1).double()
+        for j, mean in enumerate(means.double()):
+            pose = camera.world_to_camera.double()
+            x, y, z = (camera.K.double() @ (pose[:3, :3] @ mean + pose[:3, 3])).tolist()
+            if z > 0 and 0 <= x / z < WIDTH and 0 <= y / z < HEIGHT:
+                total[j] += weight[j] * features[int(y / z) * WIDTH + int(x / z)]
+    return of_sums(total)
+
+
+def drsplat(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
+    total = 0
+    for _, weights, features in seen:
+        kept = weights * (weights >= weights.topk(TOP, dim=0).values[-1])
+        total = total + kept @ features
+    return of_sums(total)
+
+
+def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
+    u = torch.zeros(N, seen[0][2].shape[1], dtype=torch.float64)
+    for j in range(N):
+        views = [(weights[j][labelled], features[labelled]) for _, weights, features in seen
+                 for labelled in [(features != 0).any(1)]]  # fmt: skip
+        most = max(float(weight.sum()) for weight, _ in views)
+        used = [(weight, features) for weight, features in views if weight.sum() >= VISIBLE * most and most > 0]
+        if len(used) == 0:
+            continue
+        weight, features = (torch.cat(part) for part in zip(*used))
+        u[j] = torch.nn.functional.normalize(weight @ features, dim=0)
+        for _ in range(10):
+            far = (1 - features @ u[j]).clamp(min=1e-4)
+            u[j] = torch.nn.functional.normalize((weight / far) @ features, dim=0)
+    return u
+
+
+@pytest.mark.parametrize("method", [sfs, occam, vala, drsplat])
+def test_ideas_are_their_sums_over_pixels(lifted, method: Callable[..., Tensor]):
+    field = baseline_field(method.__name__, lifted, "cpu")
+    expected = method(observations(lifted), lifted.scene.gaussians.means)
+    valid = field.valid(refined=False)
+    assert torch.equal(valid, (expected != 0).any(1))
+    assert valid.float().mean() > 0.5
+    cosine = (field.directions(refined=False).double() * expected).sum(1)[valid]
+    # One pixel's arithmetic may fall to the other side of a border between regions.
+    assert (cosine > 1 - 1e-5).float().mean() > 0.95
+    plain = lifted.field.directions(refined=False).double()
+    assert ((plain * expected).sum(1)[valid] < 1 - 1e-4).float().mean() > 0.1  # another method
+
+
+def test_every_idea_says_whose_implementation_it_is():
+    assert all(text.startswith("our ") for text in BASELINES.values())
+
+
+def test_the_views_are_those_of_the_lift(lifted):
+    cameras = [camera for block in seen_blocks(lifted, "cpu") for camera in block.cameras]
+    every = list(map(id, lifted.scene.train.cameras))
+    assert [every.index(id(camera)) for camera in cameras] == [0, 1, 3, 4]
+    few = [camera for block in seen_blocks(lifted, "cpu", most=2) for camera in block.cameras]
+    assert [every.index(id(camera)) for camera in few] == [0, 4]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"source": None}, "does not say how its regions and features were made"),
+        ({"source": {"wings": 2}}, "options for its features that this version does not know"),
+        ({"source": [1]}, "options for its features that this version does not know"),
+        ({"source": {"encoder": 3}}, "encoder"),
+        ({"features": {"kind": "other"}}, "was lifted from other features than its options give now"),
+    ],
+)
+def test_features_that_cannot_be_made_again_are_refused(lifted, change, message):
+    other = replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, **change}))
+    with pytest.raises(ValueError, match=message):
+        baseline_field("sfs", other, "cpu")
+
+
+def test_lengths_of_pixels_are_those_of_composited_features(lifted):
+    camera, weights, _ = observations(lifted)[1]
+    features = weights.T @ lifted.field.directions(refined=False).double()
+    (length,) = lifted.feature_lengths([camera])
+    assert torch.allclose(length.flatten(), torch.linalg.vector_norm(features, dim=1), atol=1e-3)
+    norm = lifted.field.scalars.norm[:, None]
+    (scaled,) = lifted.feature_lengths([camera], norm)
+    features = weights.T @ (lifted.field.directions(refined=False) * norm).double()
+    assert torch.allclose(scaled.flatten(), torch.linalg.vector_norm(features, dim=1), atol=1e-3)
+
+
+def test_sfs_way_is_not_timed_on_a_cpu(lifted):
+    assert why_not_timed(lifted, "cpu") == "it needs a GPU, for which gsplat is compiled; this is --device cpu"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
+def test_channels_through_gsplat_are_the_sums_of_evidence(lifted):
+    if not compiled_gsplat():
+        pytest.skip("gsplat's compiled part is missing")
+    blocks = list(seen_blocks(lifted, "cuda"))
+    scene = lifted.scene.gaussians.to("cuda")
+    job = Job(scene, False, RasterSettings(), torch.float32)
+    for block in blocks:
+        dimension = block.features[0].shape[1]
+        found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), dimension)
+        counts = [regions.shape[1] for regions in block.regions]
+        cells = rasterize_evidence(scene, block.cameras, block.labels, num_regions=counts)
+        expected = of_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
+        assert torch.allclose(found, expected.float(), rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
+def test_sfs_way_is_timed_beside_ours(lifted):
+    if not compiled_gsplat():
+        pytest.skip("gsplat's compiled part is missing")
+    (row,) = timing([lifted], "cuda")
+    assert row["timed_views"] == 4
+    assert row["dense512_over_evidence_lift"] == pytest.approx(row["dense512_s"] / row["evidence_lift_s"])
+    assert row["dense512_all_views_s"] == row["dense512_s"] > 0  # all four
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", BASELINES)
+def test_ideas_are_the_same_on_a_gpu(lifted, name):
+    here, there = (baseline_field(name, lifted, device) for device in ("cpu", "cuda"))
+    cosine = (here.directions(refined=False) * there.directions(refined=False)).sum(1)
+    assert (cosine[here.valid(refined=False)] > 1 - 1e-3).float().mean() > 0.98
+    assert (here.valid(refined=False) == there.valid(refined=False)).float().mean() > 0.99
+
+
+def test_what_is_left_out_is_said(lifted):
+    told = []
+    (row,) = timing([lifted], "cpu", told.append)
+    assert "dense512_s" not in row
+    assert row["total_s"] == pytest.approx(sum(value for key, value in row.items() if key.endswith("_s")) / 2)
+    assert told == [
+        "The timing of made leaves out SFS's way (512 channels through gsplat): it needs a GPU, for which gsplat is "
+        "compiled; this is --device cpu"
+    ]
+    cost = {key: value for key, value in lifted.field.manifest["cost"].items() if key != "store_s"}
+    older = replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, "cost": cost}))
+    table = timing([lifted, older], "cpu")
+    assert [row["scene"] for row in table] == ["made", "made", "mean"]
+    assert table[2]["store_s"] == lifted.field.manifest["cost"]["store_s"]  # the other does not say
+
+
+def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
+    """The loop over views and channels, with gsplat's compiled functions replaced by dense products."""
+    seen = observations(lifted)[:2]
+    weights = iter([weights for _, weights, _ in seen])
+    names = ("means2d", "conics", "opacities", "offsets", "members")
+
+    def project_views(job: Job, cameras: list[Camera]) -> SimpleNamespace:
+        return SimpleNamespace(**{**dict.fromkeys(names), "members": next(weights)})
+
+    def forward(*drawing: Any) -> tuple[Any, Tensor, Any]:
+        return None, torch.zeros(1, HEIGHT, WIDTH, 1), None
+
+    def backward(*given: Any) -> tuple[Any, ...]:
+        gradient = given[13]
+        assert gradient.shape == (1, HEIGHT, WIDTH, 32)
+        return None, None, None, (given[10] @ gradient.flatten(0, 2))[None]
+
+    monkeypatch.setattr("normlift_ns.evaluation.dense.project_views", project_views)
+    monkeypatch.setattr("normlift_ns.evaluation.dense.compiled_rasterizer", lambda: (forward, backward))
+    g = generator(0)
+    maps = [torch.rand(HEIGHT, WIDTH, 45, generator=g, dtype=torch.float64) for _ in seen]
+    job = Job(lifted.scene.gaussians, False, RasterSettings(), torch.float32)
+    found = dense_sums(job, [camera for camera, _, _ in seen], maps, 45)
+    expected = sum(w @ features.flatten(0, 1) for (_, w, _), features in zip(seen, maps))
+    assert torch.allclose(found.double(), expected, rtol=1e-5, atol=1e-5)

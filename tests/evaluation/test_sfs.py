@@ -1,0 +1,168 @@
+"""Thresholds and cleaning equal those of Splat Feature Solver's published code.
+
+sfs_expectations.json holds what that code (metrics.py, the same in its four latest versions) answered on `maps` and
+`shapes`: how many pixels it selects, and a digest of them; null where it fails.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from normlift_ns.evaluation.lerf import found_mask
+from normlift_ns.evaluation.sfs import cleaned, histogram_threshold
+
+EXPECTED = json.loads(Path(__file__).with_name("sfs_expectations.json").read_text())
+INSTANCES = (1, 2, 3, 7)
+CHANNELS = 9
+"""Of the maps that SFS's code looks at: a prompt and eight background words, side by side in memory."""
+
+
+def of_histogram(counts: list[int]) -> np.ndarray:
+    """A map whose 40 bins between 0 and 1 have these counts; the ends are in it."""
+    found = np.repeat((np.arange(40) + 0.5) / 40, np.array(counts) - np.eye(40, dtype=int)[[0, 39]].sum(0))
+    return np.concatenate([[0.0, 1.0], found])[None]
+
+
+def bins(**counts: int) -> list[int]:
+    """Counts of 40 bins: bins(b3=700) has 700 in bin 3, and one in all others."""
+    return [counts.get(f"b{i}", 1) for i in range(40)]
+
+
+SHAPED = {
+    "two peaks": bins(b5=900, b30=700, b20=0),
+    "a plateau is two peaks": bins(b10=800, b11=800, b30=700),
+    "fewer peaks than instances": bins(b8=2000, b12=0),
+    "no valley to the left": [3000, 2000, *range(1900, 1862, -1)],
+    "rising to the right": [*range(10, 790, 20), 801],
+    "no peak": bins(b5=599, b30=599),
+    "peak in the first bin": bins(b0=5000, b20=0),
+    "peak in the last bin": bins(b39=5000, b38=0),
+    "valley of equal bins": bins(b20=4000, b15=50),
+    "all equal": [650] * 40,
+    "two plateaus": [700] * 20 + [690] * 20,
+}
+
+
+def random_map(seed: int) -> np.ndarray:
+    """Of one of eight kinds."""
+    random = np.random.RandomState(seed)  # its numbers never change
+    height, width = random.randint(1, 140, 2)
+    kinds = (
+        lambda: random.rand(height, width),
+        lambda: random.randn(height, width) * 10 ** random.uniform(-2, 3) + 50 * random.randn(),
+        lambda: random.rand(4)[random.randint(0, 4, (height, width))] + 0.02 * random.randn(height, width),
+        lambda: np.round(random.rand(height, width) * random.randint(2, 50)) / 7,
+        lambda: np.linspace(0, 1, height * width).reshape(height, width) ** random.uniform(0.2, 4),
+        lambda: (random.rand(height, width) < 0.1 * random.rand()).astype(float),
+        lambda: 0.3 + 1e-3 * random.rand(height, width),
+        lambda: of_histogram((1 + random.randint(0, 1300, 40) * (random.rand(40) < 0.4)).tolist()),
+    )
+    return kinds[seed % len(kinds)]()
+
+
+def maps() -> Iterator[tuple[str, np.ndarray]]:
+    """Maps by name: of given histograms, and random ones."""
+    for name, counts in SHAPED.items():
+        yield name, of_histogram(counts)
+    for seed in range(48):
+        yield f"random {seed}", random_map(seed)
+
+
+def shapes() -> Iterator[tuple[str, np.ndarray]]:
+    """Masks by name, of which most touch the border."""
+    for seed in range(40):
+        random = np.random.RandomState(seed)
+        height, width = random.randint(1, 40, 2)
+        mask = random.rand(height, width) < random.rand()
+        if seed % 2 == 1:
+            seeds = random.rand(height, width) < 0.1
+            mask = np.asarray(ndimage.binary_dilation(seeds, structure=np.ones((3, 3)), iterations=1 + seed % 3))
+        if seed % 5 == 0:
+            mask[: 1 + seed % 4] = True
+        yield f"mask {seed}", mask
+    yield "two of one size", np.pad(np.kron(np.array([[0, 1], [1, 0]]), np.ones((6, 6))), 3).astype(bool)
+    yield "all", np.ones((20, 30), dtype=bool)
+    yield "ring at the border", np.pad(np.zeros((14, 14)), 5, constant_values=1).astype(bool)
+
+
+def summary(mask: np.ndarray) -> list[object]:
+    """How many pixels are selected, and a digest of which."""
+    return [int(mask.sum()), hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:16]]
+
+
+def in_memory(values: np.ndarray) -> torch.Tensor:
+    """[H, W], laid out as one of `CHANNELS` scores of every pixel."""
+    every = torch.zeros(*values.shape, CHANNELS)
+    every[:, :, 0] = torch.from_numpy(values).float()
+    return every[:, :, 0]
+
+
+@pytest.mark.parametrize("instances", INSTANCES)
+def test_the_automatic_threshold_is_that_of_sfs(instances):
+    names = []
+    for name, values in maps():
+        score = in_memory(values)
+        found = found_mask(score, score[:, :, None][:, :, :0], "auto", margin=0, instances=instances)
+        expected = EXPECTED["thresholds"][name][str(instances)]
+        assert expected is None or summary(found.numpy()) == expected, (name, instances)
+        names.append(name)
+    assert names == list(EXPECTED["thresholds"])
+
+
+def test_cleaning_is_that_of_sfs():
+    for name, mask in shapes():
+        assert summary(cleaned(torch.from_numpy(mask)).numpy()) == EXPECTED["cleaned"][name], name
+
+
+def middle(i: int) -> float:
+    return (i + 0.5) / 40
+
+
+@pytest.mark.parametrize(
+    ("name", "instances", "expected"),
+    [
+        ("two peaks", 1, middle(29)),  # bins between the peaks are equal, the nearest one counts
+        ("two peaks", 2, middle(4)),
+        ("a plateau is two peaks", 2, middle(9)),  # the second from the right is bin 11; left of it, 10 is no valley
+        ("fewer peaks than instances", 3, middle(7)),
+        ("no valley to the left", 1, middle(39)),  # the only peak is the first bin
+        ("peak in the first bin", 1, middle(39)),
+        ("valley of equal bins", 1, middle(19)),
+    ],
+)
+def test_valleys_by_hand(name, instances, expected):
+    assert histogram_threshold(in_memory(of_histogram(SHAPED[name])), instances) == pytest.approx(expected, abs=1e-6)
+
+
+def test_without_a_valley_by_hand():
+    ones = np.zeros((20, 20))
+    ones[:4] = 1.0  # Otsu: after the first bin, whose centre is 1 / 80; 80 % are 0
+    assert histogram_threshold(in_memory(ones), 1) == pytest.approx((1 / 80 + 0) / 2, abs=1e-7)
+    assert histogram_threshold(in_memory(0.3 + 1e-6 * ones), 1) == pytest.approx(0.3 + 2e-7, abs=5e-8)  # the mean
+
+
+@pytest.mark.parametrize("value", [0.3, 0.1, -0.7, 0.0, 1e-30])
+@pytest.mark.parametrize("size", [(1, 1), (10, 10), (300, 301)])
+def test_a_constant_map_selects_everything(value, size):
+    score = torch.full(size, value)
+    assert found_mask(score, score[..., None][..., :0], "auto", margin=0, instances=1).all()
+
+
+def test_an_equal_pair_at_the_right_end_does_not_fail():
+    """The published code looks past the last bin here."""
+    counts = bins(b38=700, b39=700, b10=0)
+    assert histogram_threshold(in_memory(of_histogram(counts)), 1) == pytest.approx(middle(37), abs=1e-6)
+
+
+def test_more_pixels_than_torch_takes_quantiles_of():
+    values = torch.linspace(0, 1, 2**24 + 2)[None]
+    assert values.numel() > 2**24
+    assert 0 < histogram_threshold(values, 1) < 1
