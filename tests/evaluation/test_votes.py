@@ -14,10 +14,10 @@ def test_sweeps_contain_and_mark_the_default_and_the_run():
     labels = [each[0].label for each in sweeps([own])]
     for parameter, values in SWEEPS.items():
         some = [label for label in labels if label["parameter"] == parameter]
-        default = BETA if parameter == "beta" else getattr(RefineConfig(), parameter)
-        used = {"beta": 3.5, "k": 17, "tau": 0.123}.get(parameter, default)
-        assert [label["value"] for label in some] == sorted({*values, default, used})
-        assert [label["value"] for label in some if label["default"]] == [default]
+        numbers = {"beta": BETA, "k": RefineConfig().k, **RefineConfig().numbers._asdict()}
+        used = {"beta": 3.5, "k": 17, "tau": 0.123}.get(parameter, numbers[parameter])
+        assert [label["value"] for label in some] == sorted({*values, numbers[parameter], used})
+        assert [label["value"] for label in some if label["default"]] == [numbers[parameter]]
         assert [label["value"] for label in some if label["own"]] == [used]
 
 
