@@ -31,7 +31,7 @@ from normlift_ns.errors import InputError
 
 LEAST = 0.1
 """Overlaps below this, one-sided or J, count as none."""
-SEEN = 0.1
+SEEN = 0.5
 """A view sees a Gaussian whose weight in it is at least this share of the median over the view's Gaussians."""
 CHANCE, THINGS = 0.4, 0.5
 """B of regions that overlap by chance, and from which all regions are those of things."""
@@ -72,7 +72,7 @@ def consensus(
     features: Float[Tensor, "s d"],
     *,
     level: Int[Tensor, " s"] | None = None,
-    power: float = 2.0,
+    power: float = 1.0,
     sample: int = 50,
 ) -> Consensus:
     """F' of every region; formulas at the top of this file.
@@ -114,7 +114,7 @@ def consensus(
     return Consensus(out, agreement, len(chosen))
 
 
-def agreed(features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 2.0) -> Float[Tensor, "s d"]:
+def agreed(features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0) -> Float[Tensor, "s d"]:
     """F' of the regions of one level. Regions that overlap none keep their rows as they are."""
     strength = min(1.0, max(0.0, (overlaps.agreement - CHANCE) / (THINGS - CHANCE)))
     if strength == 0 or overlaps.iou.weight.numel() == 0:

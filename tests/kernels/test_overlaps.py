@@ -37,6 +37,8 @@ def test_row_maxima():
 
 @pytest.mark.parametrize("block", [2**26, 100])
 def test_consensus_by_kernels_equals_that_of_the_cpu(monkeypatch, block):
+    monkeypatch.setattr(module, "CHANCE", -1)  # as if the regions were things
+    monkeypatch.setattr(module, "THINGS", 0)
     evidence = random_evidence(120, [5, 0, 7, 4, 6], 3)
     features = unit_rows(22, 8, 3)
     expected = consensus(evidence, features)
