@@ -5,8 +5,7 @@
 
 Writes results/consensus.json. Steps are those of the ladder and three that it does not have: whole groups of things in
 one mask, and 3 views of undamaged and of mildly damaged masks. Spearman: between ten bins by R and the accuracy of the
-answers of F' in each, with R
-from the lift of F and from that of F'.
+answers of F' in each, with R from the lift of F and from that of F'.
 """
 
 from __future__ import annotations
