@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +33,7 @@ from normlift_ns.core.consensus import consensus
 from normlift_ns.demo import demo_cameras, demo_room, view_image, view_labels
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Superpixels
+from normlift_ns.encoders.source import joint_partition
 
 NOISE = (0.0, 0.05, 0.5, 1.5)
 TOLERANCES = (1e-3, 1e-2, 5e-2)
@@ -84,34 +85,29 @@ def clip_cases() -> Iterator[Case]:
 
 
 def colour_cases() -> Iterator[Case]:
-    """Mean colours of masks or superpixels."""
-    queries = ColourEncoder().text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
-    room, images = demo_room(), {}
-    cameras = {"demo": demo_cameras(), **{name: training_cameras(name) for name in ("tabletop", "fox")}}
-    images["demo"] = [view_image(room, camera) for camera in cameras["demo"]]
-    labels = {"demo": [view_labels(room, camera).int() - 1 for camera in cameras["demo"]], "tabletop": mask_labels()}
+    """Mean colours of masks, or of superpixels where there are none."""
+    encoder, room = ColourEncoder(), demo_room()
+    queries = encoder.text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
     for name, scene in (("demo", room.scene), *((name, trained_scene(name)) for name in ("tabletop", "fox"))):
-        folder = SHARED / "captures" / name / "images"
-        files = sorted(folder.iterdir()) if folder.exists() else []
-        if name == "fox":
-            # lens distortion is not taken out of the photographs: colours are a pixel off, sizes are the camera's
-            images[name] = [_read(files[i], camera) for i, camera in zip(training_indices(name), cameras[name])]
-            labels[name] = [Superpixels().labels(image, "")[0, 0] for image in images[name]]
-        elif name == "tabletop":
-            images[name] = [_read(files[i], camera) for i, camera in zip(training_indices(name), cameras[name])]
-        rows, kept = [], []
-        for image, of_view in zip(images[name], labels[name]):
-            there, compact = of_view[of_view >= 0].unique(return_inverse=True)
-            kept.append(of_view.clone())
-            kept[-1][of_view >= 0] = compact.int()
-            rows.append(ColourEncoder().encode(image, kept[-1][None]))
-        evidence = rasterize_evidence(scene, cameras[name], kept, num_regions=[len(x) for x in rows])
+        cameras = demo_cameras() if name == "demo" else training_cameras(name)
+        images = [view_image(room, x) for x in cameras] if name == "demo" else photographs(name, cameras)
+        labels = (
+            [view_labels(room, camera).int() - 1 for camera in cameras] if name == "demo"
+            else mask_labels() if name == "tabletop"
+            else [Superpixels().labels(image, "")[0, 0] for image in images]
+        )  # fmt: skip
+        labels = [joint_partition(of_view[None])[0] for of_view in labels]  # numbers without gaps
+        rows = [encoder.encode(image, of_view[None]) for image, of_view in zip(images, labels)]
+        evidence = rasterize_evidence(scene, cameras, labels, num_regions=[len(x) for x in rows])
         yield Case(f"{name}_colour", scene.means, evidence, normalize(torch.cat(rows).double(), dim=1), queries)
 
 
-def _read(path: Path, camera: Camera) -> Tensor:
-    picture = Image.open(path).convert("RGB").resize((camera.width, camera.height))
-    return torch.from_numpy(np.array(picture))
+def photographs(name: str, cameras: Sequence[Camera]) -> list[Tensor]:
+    """Of the training views, at the size of their cameras. Lens distortion stays: colours do not mind."""
+    files = sorted((SHARED / "captures" / name / "images").iterdir())
+    size = (cameras[0].width, cameras[0].height)
+    pictures = (Image.open(files[i]).convert("RGB").resize(size) for i in training_indices(name))
+    return [torch.from_numpy(np.array(picture)) for picture in pictures]
 
 
 def compare(case: Case, report: Report, table: Table) -> None:

@@ -101,9 +101,9 @@ def main(quick: bool, output: Path) -> None:
     distance = float((1 - (sampled.features * whole.features).sum(1)).mean())
     print(f"{evidence.nnz:,} entries; {len(chosen):,} Gaussians with {rows.weight.numel():,}")
     print(f"{overlaps.iou.weight.numel():,} overlaps, B {overlaps.agreement:.3f}, to 1,000 each {distance:.2e}")
+    held = torch.cuda.memory_allocated() if device == "cuda" else 0
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
-        held = torch.cuda.memory_allocated()
     tasks = {
         "sample": lambda: sampled_gaussians(evidence.rows, size, 50),
         "select": lambda: evidence.rows.select_rows(chosen),

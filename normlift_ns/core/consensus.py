@@ -162,9 +162,13 @@ def region_overlaps(
     size, view = len(region_view), region_view.long()
     views = int(view[-1]) + 1 if size > 0 else 0
     shares, visible = _shares(rows, view, views, chance)
-    parts = list(_inner_products(shares, visible, view, views))
-    area = torch.cat([torch.zeros(0, views, device=view.device, dtype=torch.float64), *(part[0] for part in parts)])
-    row, column, inner = (torch.cat([view[:0], *(part[i] for part in parts)]) for i in (1, 2, 3))
+    area = torch.zeros(size, views, dtype=rows.weight.dtype, device=view.device)  # a_sv
+    parts, first = [(view[:0], view[:0], area.new_zeros(0, dtype=torch.float64))], 0
+    for of_block, *pairs in _inner_products(shares, visible, view, views):
+        area[first : first + len(of_block)] = of_block
+        parts.append((pairs[0], pairs[1], pairs[2]))
+        first += len(of_block)
+    row, column, inner = (torch.cat(x) for x in zip(*parts))
     c, inside = inner / area[row, view[column]], inner / area[column, view[row]]
     iou = (1 / (1 / c + 1 / inside - 1)).clamp(max=1)
     kept = (iou >= LEAST).nonzero().squeeze(1)
@@ -173,7 +177,7 @@ def region_overlaps(
     starts = _starts(row * views + view[column])
     best = torch.segment_reduce(iou, "max", offsets=torch.cat([starts, starts.new_tensor([len(row)])]), initial=0.0)
     met = (best * area[row[starts], view[column[starts]]]).sum()
-    seen = area.sum() - area.gather(1, view[:, None]).sum()
+    seen = area.sum(dtype=torch.float64) - area.gather(1, view[:, None]).sum(dtype=torch.float64)
     agreement = float(met / seen) if len(row) > 0 else 0.0
     return Overlaps(SparseRows(row_offsets(row, size), column.int(), iou), inside, agreement)
 
@@ -272,7 +276,7 @@ def _dense_block(
     row, column = ((inner >= (LEAST * area)[:, view]) & (inner > 0) & (view[first:last, None] != view)).nonzero(
         as_tuple=True
     )
-    return area.double(), row + first, column, inner[row, column].double()
+    return area, row + first, column, inner[row, column].double()
 
 
 def _sparse_blocks(by_region: SparseRows, shares: SparseRows, view: Tensor, views: int) -> Iterator[_Block]:
@@ -289,7 +293,7 @@ def _sparse_blocks(by_region: SparseRows, shares: SparseRows, view: Tensor, view
         low, high = int(by_region.offsets[first]), int(by_region.offsets[last])
         offsets = (by_region.offsets[first : last + 1] - low).int()
         arrays = (by_region.weight[low:high].numpy(), by_region.column[low:high].numpy(), offsets.numpy())
-        inner = csr_array(arrays, shape=(last - first, len(shares))) @ whole
+        inner = csr_array(csr_array(arrays, shape=(last - first, len(shares))) @ whole)
         row = torch.repeat_interleave(torch.arange(last - first), torch.from_numpy(inner.indptr).long().diff())
         column, value = torch.from_numpy(inner.indices), torch.from_numpy(inner.data)
         key = row * views + view[column]  # what is seen of s in a view lies in the regions of that view
