@@ -17,7 +17,7 @@ def transposed(rows: SparseRows, columns: int) -> SparseRows:
 
 
 def test_products_are_rows_of_the_square():
-    rows = random_evidence(90, [70, 3, 40], 1, dtype=torch.float32).rows  # rows longer than what is added at a time
+    rows = random_evidence(40, [70, 3, 40], 1, dtype=torch.float32).rows  # rows longer than what is added at a time
     matrix = dense(rows, 113).double()
     turned, rows = transposed(rows, 113).to(DEVICE), rows.to(DEVICE)
     for first, last in ((0, 113), (5, 6), (100, 113)):
