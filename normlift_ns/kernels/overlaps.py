@@ -74,5 +74,5 @@ def products(a: Rows, b: Rows, columns: int, first: int, last: int) -> Float32[T
     """Rows first..last - 1 of the product A B, dense, in float32; the same bits on every run."""
     out = torch.zeros(last - first, columns, device=a.weight.device)
     arrays = (a.offsets, a.column, a.weight.float(), b.offsets, b.column, b.weight.float())
-    _products[(last - first,)](*arrays, out, first, columns, WIDTH=_WIDTH, num_warps=1)
+    _products[(last - first,)](*arrays, out, first, columns, WIDTH=_WIDTH, num_warps=1, num_stages=1)
     return out
