@@ -7,6 +7,7 @@ from threading import Thread
 
 import torch
 
+from normlift_ns.core.consensus import consensus
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.lift import lift
 from normlift_ns.core.neighbors import nearest_neighbors
@@ -42,6 +43,8 @@ def rehearse(
                 rasterize_mode=rasterize_mode, settings=settings, dtype=dtype, weight_power=options.weight_power,
             )  # fmt: skip
             features = torch.eye(_REGIONS, _DIMENSION, dtype=dtype, device=some.means.device)
+            if options.consensus:
+                consensus(evidence, features)
             lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
             if options.refine and len(some) > options.vote.k:
                 neighbors = nearest_neighbors(some.means, options.vote.k)
