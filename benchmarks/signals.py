@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.accuracy import SEEDS, mean_and_interval, scores_3d, worlds
-from benchmarks.damage import LADDER, Lengths, observe
+from benchmarks.damage import LADDER, observe
+from benchmarks.features import Lengths
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import lifted_scores, refined_scores
 from benchmarks.worlds import Words, World

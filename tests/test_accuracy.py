@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from benchmarks.accuracy import KEYS, Bench, summarize
-from benchmarks.damage import LADDER, Damage, Lengths, observe
+from benchmarks.damage import LADDER, Damage, observe
+from benchmarks.features import LENGTHS, mask_features
 from benchmarks.fit import MOST, observation
 from benchmarks.losses import coarse_evidence
 from benchmarks.report import Report
@@ -85,9 +86,8 @@ def test_truth_is_the_class_of_pure_and_heavy_gaussians(world):
 
 def test_features_have_the_geometry_that_is_documented():
     words, g = made_words(12), generator(0)
-    from benchmarks.damage import _features  # noqa: PLC0415
-
-    rows = _features(torch.arange(12).repeat(40), words, Damage(), Lengths(), g).view(40, 12, -1)
+    masks = torch.arange(12).repeat(40)
+    rows = mask_features(words, masks, torch.full_like(masks, -1), 0.0, 1.2, LENGTHS["clip"], g).view(40, 12, -1)
     same = torch.einsum("vkd,wkd->vwk", rows, rows)[torch.triu_indices(40, 40, 1).unbind()].mean()
     other = torch.einsum("vkd,vld->vkl", rows, rows)[
         :, torch.triu_indices(12, 12, 1)[0], torch.triu_indices(12, 12, 1)[1]
