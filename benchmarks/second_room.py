@@ -39,6 +39,8 @@ SEED = 7
 POINTS_PER_GAUSSIAN = 12
 STRAYS, FLOATERS = 0.08, 0.03
 """Shares of all Gaussians."""
+MIN_THICKNESS = 1e-3
+"""Metres."""
 FIELD_OF_VIEW = 68.0
 """Horizontal, degrees."""
 
@@ -142,8 +144,12 @@ def _surface(
         samples.append(points[others(points) > ON_SURFACE])
     bounds = np.cumsum([len(points) for points in samples])
     counts = np.diff(np.rint(bounds / bounds[-1] * count).astype(int), prepend=0)
-    covers = [cover(shape, points, n, rng) for (*_, shape), points, n in zip(all_parts, samples, counts)]
+    with np.errstate(invalid="ignore"):  # both sides of a thin board in one patch
+        covers = [cover(shape, points, n, rng) for (*_, shape), points, n in zip(all_parts, samples, counts)]
     means, normals, radii, thickness = (np.concatenate(values) for values in zip(*covers))
+    normals[~np.isfinite(normals).all(axis=1)] = (0, 0, 1)
+    thickness = np.nan_to_num(thickness, nan=MIN_THICKNESS).clip(MIN_THICKNESS)
+    radii = np.nan_to_num(radii, nan=MIN_THICKNESS).clip(MIN_THICKNESS)
     return means, normals, np.stack([radii, radii, thickness], axis=1), np.repeat(np.arange(len(all_parts)), counts)
 
 
