@@ -34,7 +34,7 @@ from benchmarks.sites import Place, Settings, Site, possible
 
 CHUNK = 50
 """Cells of one place that a worker takes at a time: whoever takes some first builds the place."""
-QUICK = Settings(voters=150, gaussians=3000, pieces=40)
+QUICK = Settings(voters=80, gaussians=2500, pieces=30, room_views=8, room_width=160)
 QUICK_CELLS = (
     ("masks", "clip", "noise only"), ("masks", "clip", "group"), ("masks", "histogram", "arc"),
     ("superpixels", "histogram", "mild"), ("grid", "clip", "dropped masks"), ("patches", "clip", "noise"),
@@ -146,7 +146,7 @@ def main(arguments: argparse.Namespace) -> None:
     torch.set_grad_enabled(False)
     start = time.time()
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    given = {key: getattr(arguments, key) for key in ("voters", "gaussians", "views", "pieces")}
+    given = {key: getattr(arguments, key) for key in ("voters", "gaussians", "views", "room_views", "pieces")}
     settings = Settings(**(asdict(QUICK) if arguments.quick else given) | {"device": device})
     scenes = ["demo"] if arguments.quick else arguments.scenes
     seeds = SEEDS[:2] if arguments.quick else SEEDS
@@ -177,6 +177,7 @@ if __name__ == "__main__":
     parser.add_argument("--voters", type=int, help="Gaussians of a scene that vote and count; all by default")
     parser.add_argument("--gaussians", type=int, help="of each room; 40,000 by default")
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
+    parser.add_argument("--room-views", type=int, help="training views of each room; 24 and 30 by default")
     parser.add_argument("--pieces", type=int, help="superpixels, cells or patches per image; 256, 256, 1024 by default")
     parser.add_argument("--workers", type=int, default=1, help="processes that run cells")
     parser.add_argument("--minutes", type=float, help="no cell begins later than this")

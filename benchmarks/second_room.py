@@ -178,6 +178,7 @@ def _look(place: tuple[float, float, float], target: tuple[float, float, float],
     return Camera(K, pose.float(), width, height)
 
 
-def second(num_gaussians: int = 40_000, views: int = 30) -> World:
+def second(num_gaussians: int = 40_000, views: int = 30, width: int = 320) -> World:
     """The room as a world: sixteen classes, 30 views, 5 held-out views between them."""
-    return world_of_room("second", second_room(num_gaussians), walk(views), walk(5, phase=0.37))
+    size = width, width * 3 // 4
+    return world_of_room("second", second_room(num_gaussians), walk(views, 0.0, *size), walk(5, 0.37, *size))

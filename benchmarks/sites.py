@@ -39,6 +39,9 @@ class Settings:
     """Of the rooms; None: as many as they have by default."""
     views: int | None = None
     """Of the tabletop; None: all."""
+    room_views: int | None = None
+    room_width: int | None = None
+    """Views of the rooms, and pixels across; None: as many as they have by default."""
     pieces: int | None = None
     """Per image; None: as many as the source makes by default."""
     device: str = "cpu"
@@ -133,8 +136,9 @@ def base_world(scene: str, settings: Settings) -> World:
     """A scene, on the CPU."""
     if scene == "tabletop":
         return tabletop(settings.views)
+    given = {"num_gaussians": settings.gaussians, "views": settings.room_views, "width": settings.room_width}
     room = demo if scene == "demo" else second
-    return room() if settings.gaussians is None else room(settings.gaussians)
+    return room(**{key: value for key, value in given.items() if value is not None})
 
 
 def words_of(scene: str, classes: int) -> dict[str, Words]:

@@ -165,9 +165,10 @@ def tabletop(views: int | None = None) -> World:
     )  # fmt: skip
 
 
-def demo(num_gaussians: int = 40_000) -> World:
+def demo(num_gaussians: int = 40_000, views: int = 24, width: int = 320) -> World:
     """The demo room: thirteen classes, known of every Gaussian but floaters, whether any view sees it or not."""
-    return world_of_room("demo", demo_room(num_gaussians), demo_cameras(), held_out_cameras())
+    size = width, width * 3 // 4
+    return world_of_room("demo", demo_room(num_gaussians), demo_cameras(views, *size), held_out_cameras(4, *size))
 
 
 def world_of_room(name: str, room: DemoRoom, cameras: list[Camera], held_out: list[Camera]) -> World:

@@ -12,12 +12,12 @@ from benchmarks.ballots import _parts, results, voters_of
 from benchmarks.candidates import CANDIDATES, Candidate
 from benchmarks.damage import GROUP, LADDER, STEPS, Damage, observe
 from benchmarks.features import LENGTHS, as_features, mask_features, mixture_features, orthogonal_words, world_looks
-from benchmarks.grid import RowsError, append, chunks, read_rows, run_cells
+from benchmarks.grid import QUICK, RowsError, append, chunks, read_rows, run_cells
 from benchmarks.grid_report import report_of
 from benchmarks.pieces import KINDS, blurred, label_map, observe_pieces, pieces, shares_of
 from benchmarks.rule import Cell, cells_of
 from benchmarks.second_room import parts, second, walk
-from benchmarks.sites import Place, Settings, possible
+from benchmarks.sites import Place, possible
 from benchmarks.variants import lifted_scores, only, refined_scores
 from benchmarks.worlds import World, cell_evidence, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors, refine
@@ -56,7 +56,7 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def room() -> World:
-    return second(4000, views=10)
+    return second(4000, views=10, width=160)
 
 
 @pytest.mark.parametrize("step", LADDER)
@@ -279,16 +279,16 @@ def test_cells_of_one_place_stay_together():
 
 
 def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
-    settings, path = Settings(voters=80, gaussians=3000, pieces=30), tmp_path / "rows.jsonl"
+    path = tmp_path / "rows.jsonl"
     cells = [
         Cell("second", "masks", "clip", "group", "3"), Cell("second", "masks", "clip", "noise only", "all"),
         Cell("second", "superpixels", "histogram", "mild", "3"),
     ]  # fmt: skip
     read_rows(path, {})
-    assert run_cells(cells[:1], settings, (0, 1), path, 0.0) == 0  # past the deadline
+    assert run_cells(cells[:1], QUICK, (0, 1), path, 0.0) == 0  # past the deadline
     assert read_rows(path, {}) == {}
-    assert run_cells(cells[:2], settings, (0, 1), path, float("inf")) == 2
-    assert run_cells(cells[2:], settings, (0, 1), path, float("inf")) == 1
+    assert run_cells(cells[:2], QUICK, (0, 1), path, float("inf")) == 2
+    assert run_cells(cells[2:], QUICK, (0, 1), path, float("inf")) == 1
     rows, names = read_rows(path, {}), [one.name for one in possible(CANDIDATES)]
     assert list(rows) == cells
     for row in rows.values():
