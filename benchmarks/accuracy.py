@@ -43,8 +43,6 @@ from normlift_ns.evaluation.signals import accuracy_bins
 SEEDS = 8
 VARIES = 0.05
 """Accuracy varies over bins of reliability if their means span at least this much."""
-KEYS = {"knn": "plain_knn", "norm": "norm_only", "support": "support_only"}
-"""Names of variants in the results, where they differ."""
 PRESETS = ("preset_half", "preset_every_second_view")
 OTHERS = {"sfs": "A^2 weights", "occam": "centre pixels", "vala": "gated geometric median", "drsplat": "top-k rays"}
 
@@ -113,13 +111,14 @@ class Bench:
         """The full variant by faster lifts, as in `benchmarks.presets`."""
         means = self.world.scene.means
         read = partial(lifted.directions, dtype=torch.float16)
-        source = refine(means, read, lifted.scalars.reliability, self.config, neighbors=self.neighbors).long()
+        given = {"own": lifted.scalars.own_evidence, "neighbors": self.neighbors}
+        source = refine(means, read, lifted.scalars.reliability, self.config, **given).long()
         half = Scores(plain.cosine[source], plain.valid[source])
         views = list(range(0, observed.evidence.num_views, 2))
         columns = observed.evidence.columns_of(views)
         fewer = lift(observed.evidence.select_views(views), observed.features[columns])
         scores = lifted_scores(fewer, self.classes)
-        second = refined_scores("full", means, fewer, scores, self.neighbors, self.config)
+        second = refined_scores("paper", means, fewer, scores, self.neighbors, self.config)
         found = {"half": half, "every_second_view": second}
         return {f"preset_{name}": scores_3d(self.world, scores, self.counted) for name, scores in found.items()}
 
@@ -181,7 +180,7 @@ def summarize(rows: list[dict[str, Any]], report: Report) -> None:
 
         for method in methods:
             group = "ablation" if method in VARIANTS else "preset" if method in PRESETS else "baseline"
-            name = KEYS.get(method, method.removeprefix("preset_"))
+            name = method.removeprefix("preset_")
             for metric in of_scene[0][method]:
                 add(
                     f"{group}.{name}.{metric}",
@@ -189,9 +188,9 @@ def summarize(rows: list[dict[str, Any]], report: Report) -> None:
                 )
             for step in steps if group == "ablation" else ():
                 add(f"ladder.{step}.{name}.miou", [value(method, "miou", s, [step]) for s in seeds])
-        for method in VARIANTS[:-1]:
-            pairs = [value("full", "miou", s, steps) - value(method, "miou", s, steps) for s in seeds]
-            add(f"ablation.full_minus_{KEYS.get(method, method)}.miou", pairs)
+        for method in (variant for variant in VARIANTS if variant != "paper"):
+            pairs = [value("paper", "miou", s, steps) - value(method, "miou", s, steps) for s in seeds]
+            add(f"ablation.paper_minus_{method}.miou", pairs)
         _add_reliability(of_scene, steps, prefix, report)
 
 

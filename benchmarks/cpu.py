@@ -135,7 +135,8 @@ def main(quick: bool, output: Path) -> None:
     with stopwatch() as neighbor_watch:
         neighbors = nearest_neighbors(scene.means, config.k)
     with stopwatch() as refine_watch:
-        source = refine(scene.means, lifted.directions, lifted.scalars.reliability, config, neighbors=neighbors)
+        numbers = {"own": lifted.scalars.own_evidence, "neighbors": neighbors}
+        source = refine(scene.means, lifted.directions, lifted.scalars.reliability, config, **numbers)
 
     pairs = rasterize_evidence(scene, cameras, labels, weight_power=0).rows.weight.double().sum()
     exact_evidence = rasterize_evidence(scene, cameras, labels, dtype=torch.float64)
@@ -147,7 +148,8 @@ def main(quick: bool, output: Path) -> None:
         lifted.scalars.reliability.double() - exact.scalars.reliability
     ).abs().max() / exact.scalars.reliability.max()
     turned = (directions.double() - exact.directions()).norm(dim=1)
-    exact_source = refine(scene.means, exact.directions(), exact.scalars.reliability, config, neighbors=neighbors)
+    numbers = {"own": exact.scalars.own_evidence, "neighbors": neighbors}
+    exact_source = refine(scene.means, exact.directions(), exact.scalars.reliability, config, **numbers)
 
     report.add("fox_evidence_s", watch.seconds, "s", evidence_error)
     report.add("fox_evidence_cpu_s", evidence_cpu, "s of CPU", evidence_error)

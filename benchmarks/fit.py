@@ -35,7 +35,7 @@ from normlift_ns.core.metrics import class_scores, classify, confusion
 
 FIT = ("noise only", "mild", "wrong classes", "split masks", "few views", "shifted masks")
 HELD_OUT = ("noise", "merged masks", "dropped masks", "dominant view", "pose noise", "hard")
-START = RefineConfig(k=36, sigma_d=3.0, tau=0.8, gamma=0.05, delta=0.1)
+START = RefineConfig(vote="paper", k=36, sigma_d=3.0, tau=0.8, gamma=0.05, delta=0.1)
 """A first guess, from an exploration on other data."""
 SEARCH: dict[str, tuple[float, ...]] = {
     "tau": (0.6, 0.7, 0.8, 0.85, 0.9, 0.95),
@@ -83,16 +83,17 @@ class Observation:
 
     def sources(self, config: RefineConfig, reliability: Tensor) -> Tensor:
         """[M] whose direction every voter takes: equations 9 and 10, as `refine` evaluates them."""
-        size = config.k + 1
+        size, numbers = config.k + 1, config.numbers
         group, distance = self.group[:, :size], self.distance[:, :size]
         r = torch.where(group >= 0, reliability[group.clamp(min=0)], 0.0)
-        square = (distance / config.sigma_d) ** 2
+        square = (distance / numbers.sigma_d) ** 2
         nearest = torch.where(r > 0, square, torch.inf).amin(dim=1, keepdim=True)
         weight = r * torch.exp(-0.5 * (square - nearest).nan_to_num(0).clamp(min=0))
-        gate = torch.sigmoid((self.gram[:, :size, :size].float() - config.tau) / config.gamma)
+        gate = torch.sigmoid((self.gram[:, :size, :size].float() - numbers.tau) / numbers.gamma)
         score = r * torch.einsum("mjk,mk->mj", gate, weight)
         best, choice = score[:, 1:].max(dim=1)
-        wins = best > score[:, 0] + config.delta
+        margin = numbers.delta * torch.exp(0.5 * nearest.squeeze(1)) if numbers.delta > 0 else 0.0
+        wins = best > score[:, 0] + margin
         return torch.where(wins, group.gather(1, choice[:, None] + 1).squeeze(1), group[:, 0])
 
     def miou(self, config: RefineConfig, reliability: Tensor | None = None) -> float:

@@ -168,7 +168,14 @@ def measure(report: Report, case: Case) -> None:
         config = RefineConfig()
         neighbors_s, neighbors = timed(lambda: nearest_neighbors(case.scene.means, config.k))
         vote_s, source = timed(
-            lambda: refine(case.scene.means, lifted.directions, lifted.scalars.reliability, config, neighbors=neighbors)
+            lambda: refine(
+                case.scene.means,
+                lifted.directions,
+                lifted.scalars.reliability,
+                config,
+                own=lifted.scalars.own_evidence,
+                neighbors=neighbors,
+            )
         )
         peak_gib = torch.cuda.max_memory_allocated() / 2**30
         field = query_field(lifted, source)

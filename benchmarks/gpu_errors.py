@@ -63,9 +63,9 @@ def vote_errors(case: Case, lifted: Lifted, config: RefineConfig, neighbors: Any
     )
     near.index[local[:, 0]] = local[:, 1:].int()
     near.distance[local[:, 0]] = neighbors.distance[rows].double()
-    found = refine(
-        case.scene.means[used].double(), exact, lifted.scalars.reliability[used].double(), config, neighbors=near
-    )[local[:, 0]]
+    numbers = lifted.scalars.map(lambda values: values[used].double())
+    given = {"own": numbers.own_evidence, "neighbors": near}
+    found = refine(case.scene.means[used].double(), exact, numbers.reliability, config, **given)[local[:, 0]]
     ours = torch.searchsorted(used, source[rows].long())
     return float(((exact[found.long()] - exact[ours]).norm(dim=1) > 1e-3).float().mean())
 

@@ -49,6 +49,8 @@ TUNINGS = (
 )
 BLOCKS = (2**15, 2**16, 2**17, 2**18)
 GAMMAS = (0.1, 0.03, 0.01)
+KINDS = (RefineConfig(vote="paper"), RefineConfig(vote="posterior"))
+MARGINS = (RefineConfig(vote="paper", sigma_d=3.0, delta=0.1), RefineConfig(vote="posterior", delta=0.3))
 SORTED = (0, 512, 4096, 2**30)
 
 
@@ -69,7 +71,7 @@ class Room:
         self.report, self.case, self.means = report, case, case.scene.means
         evidence = case.evidence()
         self.lifted: Lifted = lift(evidence, features(evidence.num_regions))
-        self.reliability = self.lifted.scalars.reliability
+        self.reliability, self.own = self.lifted.scalars.reliability, self.lifted.scalars.own_evidence
         self.neighbors: Neighbors = nearest_neighbors(self.means, RefineConfig().k)
 
     def add(self, key: str, value: float, unit: str, error: float | None = None) -> None:
@@ -77,7 +79,8 @@ class Room:
         print(f"{self.case.name}.{key}: {value:.5g} {unit}", "" if error is None else f"error {error:.3g}", flush=True)
 
     def vote(self, config: RefineConfig | None = None, read: Callable[..., Any] | None = None) -> torch.Tensor:
-        return refine(self.means, read or self.lifted.directions, self.reliability, config, neighbors=self.neighbors)
+        given = {"own": self.own, "neighbors": self.neighbors}
+        return refine(self.means, read or self.lifted.directions, self.reliability, config, **given)
 
     def turned(self, source: torch.Tensor, other: torch.Tensor) -> float:
         """Share of Gaussians to which two votes give different directions."""
@@ -86,14 +89,14 @@ class Room:
         return int(((ours - theirs).norm(dim=1) > 1e-3).sum()) / len(source)
 
 
-def correctness(room: Room, configs: Sequence[RefineConfig] = (RefineConfig(),)) -> None:
+def correctness(room: Room, configs: Sequence[RefineConfig]) -> None:
     """Against float64, against the products in tf32x3, against itself, and with progress told."""
     told: list[int] = []
     again = nearest_neighbors(room.means, RefineConfig().k, progress=lambda done, of: told.append(done))
     same = all(torch.equal(a, b) for a, b in zip(again, room.neighbors))
     room.add("neighbors_with_progress_same_bits", same, f"1: yes, told {len(told)} times")
     for config in configs:
-        name = f"gamma_{config.gamma:g}_delta_{config.delta:g}"
+        name = f"{config.vote}_gamma_{config.numbers.gamma:g}_delta_{config.numbers.delta:g}"
         exact = room.vote(config, lambda rows: room.lifted.directions(rows).double())
         room.add(f"{name}.changed", float((exact != torch.arange(len(exact), device="cuda")).float().mean()), "share")
         found: dict[str, torch.Tensor] = {}
@@ -107,17 +110,17 @@ def correctness(room: Room, configs: Sequence[RefineConfig] = (RefineConfig(),))
             other = room.turned(source, found[PRECISIONS[0]])
             room.add(f"{name}.{precision}.other_direction_than_tf32x3", other, "share")
             room.add(f"{name}.{precision}.other_source_than_float64", (source != exact).float().mean().item(), "share")
-    source = room.vote()
-    error = vote_errors(room.case, room.lifted, RefineConfig(), room.neighbors, source)
-    room.add("vote_error_of_a_sample", error, "share, directions in float64 too")
+        error = vote_errors(room.case, room.lifted, config, room.neighbors, room.vote(config))
+        room.add(f"{name}.vote_error_of_a_sample", error, "share, directions in float64 too")
 
 
 def totals(room: Room) -> None:
     neighbors_s = timed(lambda: nearest_neighbors(room.means, RefineConfig().k))[0]
-    vote_s = timed(room.vote)[0]
     room.add("neighbors_s", neighbors_s, "s")
-    room.add("vote_s", vote_s, "s")
-    room.add("neighbors_vote_s", neighbors_s + vote_s, "s, to be 0.15 at most")
+    for config in KINDS:
+        vote_s = timed(lambda config=config: room.vote(config))[0]
+        room.add(f"{config.vote}.vote_s", vote_s, "s")
+        room.add(f"{config.vote}.neighbors_vote_s", neighbors_s + vote_s, "s, to be 0.15 at most")
 
 
 def stages(room: Room) -> None:
@@ -180,14 +183,15 @@ def variants(room: Room, most: int = 2**17) -> None:
     rows = room.lifted.directions(gaussians)
     row_of = torch.zeros(n, dtype=torch.int32, device=rows.device)
     row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=rows.device)
-    width = float(voting.decay_width(room.neighbors, RefineConfig()))
     halved = kernel.halve(rows)
 
     def cast(config: RefineConfig, precision: Any) -> torch.Tensor:
         source = torch.full((n,), -1, dtype=torch.int32, device=rows.device)
         arrays = (voters, room.neighbors.index, room.neighbors.distance, rows, row_of, room.reliability, source)
-        numbers = {"tau": config.tau, "gamma": config.gamma, "width": width, "delta": config.delta}
-        kernel.vote(*arrays, **numbers, precision=precision)
+        numbers, width = config.numbers, float(voting.decay_width(room.neighbors, config))
+        given = {"tau": numbers.tau, "gamma": numbers.gamma, "width": width, "delta": numbers.delta}
+        own = room.own if config.vote == "posterior" else None
+        kernel.vote(*arrays, **given, own=own, prior=config.prior, precision=precision)
         return source
 
     def spent(config: RefineConfig, precision: Any) -> tuple[float, torch.Tensor]:
@@ -195,9 +199,15 @@ def variants(room: Room, most: int = 2**17) -> None:
         return seconds * n / len(voters), source[voters]
 
     with replaced(kernel, "halve", lambda rows: halved):
+        for config in KINDS:
+            certified_s, certified = spent(config, "certified")
+            other = float((certified != spent(config, "tf32x3")[1]).float().mean())
+            undecided = float((spent(config, "first")[1][certified >= 0] < 0).float().mean())
+            room.add(f"kernel.{config.vote}.certified_s", certified_s, "s, all voters", other)
+            room.add(f"kernel.{config.vote}.undecided", undecided, "share of voters")
         plain_s, plain = spent(RefineConfig(), "tf32x3")
         room.add("kernel.tf32x3_s", plain_s, "s")
-        for gamma in (RefineConfig().gamma, *GAMMAS):
+        for gamma in (RefineConfig().numbers.gamma, *GAMMAS):
             first_s, first = spent(RefineConfig(gamma=gamma), "first")
             full_s, full = spent(RefineConfig(gamma=gamma), "halves")
             share = float((first[full >= 0] < 0).float().mean())
@@ -234,7 +244,7 @@ def main(quick: bool, output: Path) -> None:
         name, n, views = next(room for room in ROOMS if room[1] == 1_930_000)
         room = Room(report, room_case(name, n, views))
         totals(room)
-        correctness(room)
+        correctness(room, (*KINDS, *MARGINS))
         stages(room)
         if not quick:
             variants(room)
@@ -245,7 +255,8 @@ def main(quick: bool, output: Path) -> None:
         if (SHARED / "captures" / "fox").exists():
             fox = Room(report, capture_case("fox"))
             totals(fox)
-            correctness(fox, (RefineConfig(), RefineConfig(gamma=0.03), RefineConfig(gamma=0.4, delta=0.02, tau=0.8)))
+            others = (RefineConfig(gamma=0.03), RefineConfig(gamma=0.4, delta=0.02, tau=0.8))
+            correctness(fox, (*KINDS, *MARGINS, *others))
             stages(fox)
     report.write(output)
 

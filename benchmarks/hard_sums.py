@@ -205,7 +205,7 @@ def rank_one(setting: Setting) -> dict[str, float]:
 def _sources(setting: Setting, means: Tensor, directions: Tensor, reliability: Sequence[float], k: int) -> list[int]:
     there = (x.to(setting.device) for x in (means.float(), directions.float(), torch.tensor(reliability)))
     points, u, r = there
-    return refine(points, u, r, RefineConfig(k=k)).cpu().tolist()
+    return refine(points, u, r, RefineConfig(vote="paper", k=k)).cpu().tolist()
 
 
 def _wrong(found: Sequence[int], expected: Sequence[int]) -> int:

@@ -60,7 +60,8 @@ def miou(world: World, words: Words, observed: Observed, *, low_rank: bool = Fal
     """Of the whole method, in points; stored in a basis and read again if that is asked."""
     lifted, config = lift(observed.evidence, observed.features), RefineConfig()
     near = nearest_neighbors(world.scene.means, config.k)
-    source = refine(world.scene.means, lifted.directions, lifted.scalars.reliability, config, neighbors=near).long()
+    own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
+    source = refine(world.scene.means, lifted.directions, reliability, config, own=own, neighbors=near).long()
     if not low_rank:
         plain = lifted_scores(lifted, words.classes)
         scores = Scores(plain.cosine[source], plain.valid[source])

@@ -38,7 +38,7 @@ def main() -> None:
     axes[0].set_title("truth")
     for one, title, scores in (
         (axes[1], "lifted", plain),
-        (axes[2], "lifted and refined", refined_scores("full", world.scene.means, lifted, plain, near)),
+        (axes[2], "lifted and refined", refined_scores("paper", world.scene.means, lifted, plain, near)),
     ):
         values, alpha = render(world.scene, world.held_out[VIEW], scores.cosine)
         found = classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)

@@ -61,6 +61,7 @@ def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
     evidence = case.evidence(dtype=dtype)
     lifted = lift(evidence, table.to(dtype))
     config, means = RefineConfig(), case.scene.means
+    numbers, own = config.numbers, lifted.scalars.own_evidence
     neighbors = nearest_neighbors(means, config.k)
     if precision == "tf32":
         directions = lifted.directions()
@@ -68,12 +69,13 @@ def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
         vote(
             *(spatial_order(means), neighbors.index, neighbors.distance, directions, row_of),
             *(lifted.scalars.reliability, source),
-            tau=config.tau, gamma=config.gamma, width=float(decay_width(neighbors, config)), delta=config.delta,
+            tau=numbers.tau, gamma=numbers.gamma, width=float(decay_width(neighbors, config)), delta=numbers.delta,
+            own=own if config.vote == "posterior" else None, prior=config.prior,
             precision="tf32",
         )  # fmt: skip
     else:
         read = partial(lifted.directions, dtype=torch.float16) if precision == "half" else lifted.directions
-        source = refine(means, read, lifted.scalars.reliability, config, neighbors=neighbors)
+        source = refine(means, read, lifted.scalars.reliability, config, own=own, neighbors=neighbors)
     return Outcome(lifted.directions(source.long()), lifted.scalars.norm[source.long()] > 0), (lifted, source)
 
 

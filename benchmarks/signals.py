@@ -72,7 +72,7 @@ def views_curve(world: World, words: Words, report: Report) -> None:
     known = (world.truth >= 0).nonzero().squeeze(1)
     neighbors = nearest_neighbors(world.scene.means, RefineConfig().k)
     for count in [v for v in VIEWS if v < len(world.cameras)]:
-        found: dict[Variant, list[float]] = {"none": [], "full": []}
+        found: dict[Variant, list[float]] = {"none": [], "paper": []}
         for seed in range(SEEDS):
             observed = observe(world, words, replace(LADDER["mild"], views=count), seed)
             lifted = lift(observed.evidence, observed.features)

@@ -16,8 +16,8 @@ from torch.nn.functional import normalize
 
 from benchmarks.damage import Observed
 from benchmarks.worlds import World
-from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, rasterize_evidence, refine
-from normlift_ns.core.ablations import Variant, variant_reliability
+from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, rasterize_evidence
+from normlift_ns.core.ablations import Variant, variant_config, variant_reliability, variant_source
 from normlift_ns.core.refine import decay_width, voting_weights
 from normlift_ns.core.sparse import SparseRows, row_offsets
 
@@ -63,10 +63,10 @@ def refined_scores(
     config = config or RefineConfig()
     if variant == "none":
         return scores
-    reliability = variant_reliability(variant, lifted.scalars)
     if variant == "linear":
-        return _average(reliability, scores, neighbors, config)
-    source = refine(means, lifted.directions, reliability, config, neighbors=neighbors).long()
+        reliability = variant_reliability(variant, lifted.scalars)
+        return _average(reliability, scores, neighbors, variant_config(variant, config))
+    source = variant_source(variant, means, lifted.directions, lifted.scalars, config, neighbors=neighbors).long()
     return Scores(scores.cosine[source], scores.valid[source])
 
 

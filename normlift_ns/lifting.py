@@ -245,7 +245,8 @@ def _vote(
         neighbors = nearest_neighbors(means, config.k, progress=partial(stages.tell, "neighbors"))
     with stages("vote", n):
         told = partial(stages.tell, "vote")
-        copied = refine(means, lifted.directions, reliability, config, neighbors=neighbors, progress=told)
+        own = lifted.scalars.own_evidence
+        copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=told)
     changed = copied != torch.arange(len(copied), device=copied.device)
     lost = unsupported(neighbors, reliability)
     return copied, {"refined_share": float(changed.float().mean()), "unsupported_share": float(lost.float().mean())}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from normlift_ns.ranges import check_options, check_texts
 
@@ -44,6 +44,8 @@ BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things"
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 THRESHOLDS: dict[Rule, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
 """Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
+VoteKind = Literal["paper", "posterior"]
+"""How a vote weighs what a Gaussian has seen itself against its neighbours; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class of a Gaussian without a direction, where one is scored: none, or the first."""
 REACH, MIN_SIZE = 4.0, 20
@@ -159,35 +161,66 @@ class SplatOptions:
         check_options(self)
 
 
+class VoteNumbers(NamedTuple):
+    """The parameters whose defaults depend on the kind of vote."""
+
+    sigma_d: float
+    tau: float
+    gamma: float
+    delta: float
+
+
+VOTES: dict[VoteKind, VoteNumbers] = {
+    "paper": VoteNumbers(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
+    "posterior": VoteNumbers(sigma_d=2.0, tau=0.95, gamma=0.4, delta=0.0),
+}
+"""The defaults of each kind of vote; the help of the fields of `RefineConfig` repeats them."""
+
+
 @dataclass(frozen=True)
 class RefineConfig:
     """Parameters of the vote among neighbours.
 
-    The paper publishes no values. The defaults were fitted where the truth is known, and were checked on damage that
-    the fit had not seen: see docs/accuracy.md.
+    The paper publishes no values. The defaults were fitted where the truth is known: see docs/accuracy.md. What suits
+    one kind of vote does not suit the other, so that a parameter that is None takes the default of its kind.
 
     Raises:
         ValueError: a value outside its range.
 
     >>> from normlift_ns import RefineConfig
-    >>> RefineConfig(k=12).sigma_d
-    1.0
+    >>> RefineConfig(vote="paper", k=12).numbers.sigma_d, RefineConfig(vote="posterior").numbers.sigma_d
+    (1.0, 2.0)
     """
 
+    vote: VoteKind = "paper"
+    """How the vote weighs what a Gaussian has seen itself. paper: as one voter among its neighbours (equations 9 and 10
+    of the paper). posterior: by the views that saw it, against --prior views of the neighbourhood."""
     k: int = 36
     """Number of neighbours K in the vote, at least 1."""
-    sigma_d: float = 1.0
+    sigma_d: float | None = None
     """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest
-    one at another place, because scenes are rescaled."""
-    tau: float = 0.95
-    """Cosine at which two directions half agree in the vote, in -1..1."""
-    gamma: float = 0.4
-    """Softness of that agreement, > 0."""
-    delta: float = 0.0
-    """Margin Delta by which the best neighbour must win the vote, >= 0."""
+    one at another place, because scenes are rescaled. By default 1 for paper, 2 for posterior."""
+    tau: float | None = None
+    """Cosine at which two directions half agree in the vote, in -1..1. By default 0.95."""
+    gamma: float | None = None
+    """Softness of that agreement, > 0. By default 0.4."""
+    delta: float | None = None
+    """Margin Delta by which the best neighbour must win the vote, >= 0. By default 0."""
+    prior: float = 4.0
+    """What all neighbours together count in a posterior vote, in views, >= 0."""
 
     def __post_init__(self) -> None:
         check_options(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Configs of version 0.1 know one kind of vote."""
+        vars(self).update({"vote": "paper", **state})
+
+    @property
+    def numbers(self) -> VoteNumbers:
+        """The parameters, with the defaults of this kind of vote where none are given."""
+        given = {name: getattr(self, name) for name in VoteNumbers._fields}
+        return VOTES[self.vote]._replace(**{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True)

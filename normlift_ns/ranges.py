@@ -55,6 +55,7 @@ RANGES: dict[str, Range] = {
     "tau": Range(-1.0, 1.0, "in -1..1"),
     "gamma": _POSITIVE,
     "delta": _NOT_NEGATIVE,
+    "prior": _NOT_NEGATIVE,
     # the lift
     "max_views": _at_least(1),
     "lift_downscale": _at_least(1),

@@ -45,7 +45,8 @@ def rehearse(
             lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
             if options.refine and len(some) > options.vote.k:
                 neighbors = nearest_neighbors(some.means, options.vote.k)
-                refine(some.means, lifted.directions, lifted.scalars.reliability, options.vote, neighbors=neighbors)
+                own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
+                refine(some.means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors)
 
     thread = Thread(target=work, name="rehearsal", daemon=True)
     thread.start()

@@ -1,20 +1,21 @@
-"""The paper's ablation of the refinement (its table 2), behind one switch."""
+"""The paper's ablation of the refinement (its table 2) and what goes beyond it, behind one switch."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import decay_width, refine, voting_weights
 from normlift_ns.errors import InputError
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import RefineConfig, VoteKind
 
-Variant = Literal["none", "knn", "linear", "norm", "support", "full"]
+Variant = Literal["none", "plain_knn", "linear", "norm_only", "support_only", "paper", "posterior"]
 
 
 def refine_variant(
@@ -30,7 +31,7 @@ def refine_variant(
 
     Args:
         variant: "none": the lift as it is. "linear": distance-weighted linear averaging of the directions of N+,
-            weighted by R d_ik and normalised. The others vote with the R of `variant_reliability`.
+            weighted by R d_ik and normalised. The others vote, by `variant_config` and with `variant_reliability`.
         beta: as in `lift`.
     Raises:
         ValueError: an unknown variant.
@@ -41,23 +42,55 @@ def refine_variant(
     >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 2, 1]), torch.ones(3), (2,))
     >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    >>> [refine_variant(name, means, lifted, RefineConfig(k=2))[1] for name in ("none", "linear", "full")]
+    >>> [refine_variant(name, means, lifted, RefineConfig(k=2))[1] for name in ("none", "linear", "paper")]
     [tensor([0., 1.]), tensor([0.7716, 0.6361]), tensor([1., 0.])]
     """
-    config = config or RefineConfig()
     reliability, directions = variant_reliability(variant, lifted.scalars, beta), lifted.directions()
+    config = variant_config(variant, config or RefineConfig())
     if variant == "none":
         return directions
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if variant == "linear":
         return linear_average(directions, reliability, neighbors, config)
-    return directions[refine(means, directions, reliability, config, neighbors=neighbors).long()]
+    source = variant_source(variant, means, directions, lifted.scalars, config, beta=beta, neighbors=neighbors)
+    return directions[source.long()]
+
+
+def variant_source(
+    variant: Variant,
+    means: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
+    scalars: Scalars,
+    config: RefineConfig,
+    *,
+    beta: float = 1.0,
+    neighbors: Neighbors | None = None,
+) -> Int32[Tensor, " n"]:
+    """`refine` as a variant that votes.
+
+    Raises:
+        ValueError: as `refine`; an unknown variant.
+    """
+    reliability, config = variant_reliability(variant, scalars, beta), variant_config(variant, config)
+    return refine(means, directions, reliability, config, own=scalars.own_evidence, neighbors=neighbors)
+
+
+def variant_config(variant: Variant, config: RefineConfig) -> RefineConfig:
+    """The parameters of a variant: those given where they are for its kind of vote, else the defaults of its kind.
+
+    All but "posterior" are variants of the paper's vote.
+
+    >>> variant_config("posterior", RefineConfig(vote="paper", k=12, sigma_d=3.0)).numbers.sigma_d
+    2.0
+    """
+    kind: VoteKind = "posterior" if variant == "posterior" else "paper"
+    return config if config.vote == kind else RefineConfig(vote=kind, k=config.k, prior=config.prior)
 
 
 def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
     """R that a variant votes with.
 
-    "knn": plain voting, 1 for every Gaussian with a direction. "norm": ||f||. "support": N_eff / (N_eff + beta). Any
+    "plain_knn": 1 for every Gaussian with a direction. "norm_only": ||f||. "support_only": N_eff / (N_eff + beta). Any
     other: their product, NormLift's R.
 
     Raises:
@@ -65,12 +98,12 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
     """
     if variant not in get_args(Variant):
         raise InputError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
-    if variant == "knn":
+    if variant == "plain_knn":
         return (scalars.norm > 0).to(scalars.norm.dtype)
-    if variant == "norm":
+    if variant == "norm_only":
         return scalars.norm
     support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + beta), 0.0)
-    return support if variant == "support" else scalars.norm * support
+    return support if variant == "support_only" else scalars.norm * support
 
 
 def linear_average(

@@ -62,6 +62,11 @@ class Scalars:
     view_count: Int32[Tensor, " n"]
     """Number of views in which the Gaussian has weight."""
 
+    @property
+    def own_evidence(self) -> Float[Tensor, " n"]:
+        """||f_j|| N_eff: how many views agree on the direction of a Gaussian, for `refine`."""
+        return self.norm * self.n_eff
+
     def map(self, change: Callable[[Tensor], Tensor]) -> Scalars:
         """The same numbers, each array changed."""
         return Scalars(**{f.name: change(getattr(self, f.name)) for f in fields(Scalars)})

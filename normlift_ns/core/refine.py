@@ -1,4 +1,4 @@
-"""Reliability-guided mode voting: an unreliable Gaussian copies the direction that its reliable neighbours agree on."""
+"""Reliability-guided mode voting: a Gaussian copies the direction that reliable Gaussians near it agree on."""
 
 from __future__ import annotations
 
@@ -30,30 +30,37 @@ def refine(
     reliability: Float[Tensor, " n"],
     config: RefineConfig | None = None,
     *,
+    own: Float[Tensor, " n"] | None = None,
     neighbors: Neighbors | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Mode voting among neighbours (eq. 9 and 10 of the paper): the refined direction of i is directions[source[i]].
+    """Mode voting among neighbours: the refined direction of i is directions[source[i]].
 
-    With N+ the K nearest neighbours of i and i itself::
+    With N the K nearest neighbours of i, and N+ these and i itself::
 
-        S_ij = R_j sum_{k in N+} R_k d_ik g_jk
         d_ik = exp(-|mu_i - mu_k|^2 / (2 sigma_d^2)),   g_jk = sigmoid((<u_k, u_j> - tau) / gamma)
-        source_i = argmax_{j in N+, j != i} S_ij   if that S_ij > S_ii + Delta,   else i
+        paper:      S_ij = R_j sum_{k in N+} R_k d_ik g_jk                                    (equation 9)
+        posterior:  S_ij = R_j (own_i g_ij + P sum_{k in N} R_k d_ik g_jk / sum_{k in N} R_k d_ik)
+        source_i = argmax_{j in N} S_ij   if that S_ij > S_ii + Delta,   else i               (equation 10)
 
-    Where R_i = 0, S_ii = 0, and d_ik counts from the nearest reliable neighbour: see `voting_weights`.
-    All votes read the unrefined directions. Ties go to the nearer neighbour. Where nobody in N+ is reliable nothing
-    changes; see `unsupported`.
+    In the paper's vote i is one voter among up to K + 1, of weight R_i <= 1 however many views saw it. The posterior
+    vote counts views instead. With own_i = ||f_i|| N_eff_i, the number of views that agree on u_i, the first term is
+    what i has seen of a direction u_j. The second is what its neighbourhood says of it, a mean in 0..1, worth as much
+    as a prior of P views. The more views saw i, the less do its neighbours count.
+
+    All votes read the unrefined directions. Ties go to the nearer neighbour. Where no neighbour is reliable nothing
+    changes; see `unsupported`. Where R_i = 0, S_ii = 0: whoever clears Delta wins.
 
     Args:
         directions: u, unit rows or 0, of any floating-point type, read in float32 (float64 if given); or a function
             that gives those of some Gaussians, `Lifted.directions`: then only a block of them is held at a time.
         reliability: R in 0..1.
+        own: `Lifted.scalars.own_evidence`, which the posterior vote needs and the paper's does not read.
         neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes; by default those of
             `possible(config, n)`.
         progress: called after every block of Gaussians with (Gaussians done, Gaussians).
     Raises:
-        ValueError: shapes that disagree, neighbours of another K.
+        ValueError: shapes that disagree, neighbours of another K, a posterior vote without `own`.
 
     >>> import torch
     >>> from normlift_ns import RefineConfig, refine
@@ -62,6 +69,9 @@ def refine(
     >>> source = refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2))
     >>> source.tolist(), directions[source.long()].tolist()
     ([0, 0, 2], [[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
+    >>> vote, seen = RefineConfig(vote="posterior", k=2), torch.tensor([9.0, 1.0, 9.0])
+    >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), vote, own=seen).tolist()
+    [0, 0, 2]
     """
     n, config = means.shape[0], config or RefineConfig()
     config = config if neighbors is not None else possible(config, n)
@@ -71,6 +81,11 @@ def refine(
         raise InputError(
             f"means, directions and reliability must have the same rows, got {n}, {shape}, {tuple(reliability.shape)}"
         )
+    if config.vote == "paper":
+        own = None
+    elif own is None or tuple(own.shape) != (n,):
+        got = "none" if own is None else f"shape {tuple(own.shape)}"
+        raise InputError(f"a posterior vote needs own, the scalars.own_evidence of a lift, of shape {(n,)}; got {got}")
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
@@ -93,9 +108,9 @@ def refine(
             rows = directions(gaussians)
             row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=means.device)
         if on_gpu and rows.dtype != torch.float64 and config.k <= _MOST_IN_KERNEL:
-            _vote_on_gpu(voters, neighbors, rows, row_of, reliability, source, config, decay)
+            _vote_on_gpu(voters, neighbors, rows, row_of, reliability, own, source, config, decay)
         else:
-            _vote(voters, neighbors, rows, row_of, reliability, source, config, width)
+            _vote(voters, neighbors, rows, row_of, reliability, own, source, config, width)
 
     done = n - len(order)
     for voters in order.split(_BLOCK[on_gpu] if given is None else max(1, n)):
@@ -107,13 +122,14 @@ def refine(
 
 
 def possible(config: RefineConfig, n: int) -> RefineConfig:
-    """The same vote with no more neighbours than there are, and than `MOST_VOTERS`; a warning says what changed.
+    """The vote in numbers, with no more neighbours than there are, and than `MOST_VOTERS`; a warning says what changed.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as told:
     ...     possible(RefineConfig(k=100), 5).k, str(told[0].message)
     (4, 'k is 100, but a Gaussian has only 4 others; the vote is among 4 neighbours')
     """
+    config = replace(config, **config.numbers._asdict())
     k = min(config.k, max(1, n - 1), MOST_VOTERS)
     if k == config.k:
         return config
@@ -132,23 +148,29 @@ def _vote(
     directions: Tensor,
     row_of: Tensor,
     reliability: Tensor,
+    own: Tensor | None,
     source: Tensor,
     config: RefineConfig,
     width: Tensor,
 ) -> None:
     """Writes source[voters]; row_of[j] is the row of u_j."""
-    dtype = torch.promote_types(directions.dtype, torch.float32)
+    dtype, numbers = torch.promote_types(directions.dtype, torch.float32), config.numbers
     reliability = reliability.to(dtype)
     step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
     for i in voters.split(step):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
         r = _gather(reliability, group)
-        weight = voting_weights(neighbors, width, i, reliability).to(dtype)
+        if own is None:
+            weight = voting_weights(neighbors, width, i, reliability)
+            margin = _margin(neighbors, width, i, reliability, numbers.delta)
+        else:
+            weight = posterior_weights(neighbors, width, i, reliability, own, config.prior)
+            margin = numbers.delta
         u = directions[row_of[group.clamp(min=0)]].to(dtype)
-        g = torch.sigmoid((u @ u.transpose(1, 2) - config.tau) / config.gamma)
-        score = r * (g @ weight[:, :, None]).squeeze(2)
+        g = torch.sigmoid((u @ u.transpose(1, 2) - numbers.tau) / numbers.gamma)
+        score = r * (g @ weight.to(dtype)[:, :, None]).squeeze(2)
         best, choice = score[:, 1:].max(dim=1)
-        wins = best > score[:, 0] + config.delta
+        wins = best > score[:, 0] + margin
         source[i[wins]] = group[wins].gather(1, choice[wins, None] + 1).squeeze(1).int()
 
 
@@ -158,6 +180,7 @@ def _vote_on_gpu(
     directions: Tensor,
     row_of: Tensor,
     reliability: Tensor,
+    own: Tensor | None,
     source: Tensor,
     config: RefineConfig,
     width: float,
@@ -170,12 +193,14 @@ def _vote_on_gpu(
         neighbors.distance,
         directions.contiguous(),
         row_of,
-        reliability.float(),
+        reliability.float().contiguous(),
         source,
-        tau=config.tau,
-        gamma=config.gamma,
+        own=None if own is None else own.float().contiguous(),
+        prior=config.prior,
+        tau=config.numbers.tau,
+        gamma=config.numbers.gamma,
         width=width,
-        delta=config.delta,
+        delta=config.numbers.delta,
     )
 
 
@@ -198,11 +223,12 @@ def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
 def decay_width(neighbors: Neighbors, config: RefineConfig) -> Float64[Tensor, ""]:
     """sigma_d in the units of the means: times the median spacing (1 where all Gaussians are at one place)."""
     finite = neighbors.spacing[neighbors.spacing.isfinite()]
+    sigma = config.numbers.sigma_d
     if finite.numel() == 0:
-        return config.sigma_d * neighbors.spacing.new_ones(())
+        return sigma * neighbors.spacing.new_ones(())
     # torch looks for a median with one block of a GPU
     median = finite.sort().values[(finite.numel() - 1) // 2] if finite.is_cuda else finite.median()
-    return config.sigma_d * median
+    return sigma * median
 
 
 def voting_weights(
@@ -211,12 +237,57 @@ def voting_weights(
     """R_k d_ik of the given Gaussians, self first; 0 where a neighbour is missing.
 
     Distances are counted from the nearest reliable member of N+, i itself unless R_i = 0. Such a factor per Gaussian
-    picks the same winner, and the weights of one far from everything do not underflow.
+    picks the same winner, and the weights of one far from everything do not underflow. A margin takes the same factor:
+    see `_margin`.
     """
+    r, square = _within(neighbors, width, rows, reliability)
+    return r * _decay(r, square)
+
+
+def posterior_weights(
+    neighbors: Neighbors,
+    width: Float64[Tensor, ""],
+    rows: Int[Tensor, " m"],
+    reliability: Float[Tensor, " n"],
+    own: Float[Tensor, " n"],
+    prior: float,
+) -> Float64[Tensor, "m k_plus_1"]:
+    """own_i, then P R_k d_ik / sum_k R_k d_ik of the neighbours; 0 where one is missing, or none is reliable.
+
+    Distances are counted from the nearest reliable neighbour: the factor cancels in the ratio, and nothing underflows.
+    """
+    r, square = _within(neighbors, width, rows, reliability)
+    near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])
+    total = near.sum(dim=1, keepdim=True)
+    near = torch.where(total > 0, prior * near / total, 0.0)
+    return torch.cat([own[rows, None].to(near), near], dim=1)
+
+
+def _within(
+    neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor
+) -> tuple[Float[Tensor, "m k_plus_1"], Float64[Tensor, "m k_plus_1"]]:
+    """R and squared distances in units of sigma_d in N+, self first."""
     r = _gather(reliability, torch.cat([rows[:, None], neighbors.index[rows]], dim=1))
-    square = torch.nn.functional.pad(neighbors.distance[rows] / width, (1, 0)) ** 2
-    nearest = torch.where(r > 0, square, torch.inf).amin(dim=1, keepdim=True)
-    return r * torch.exp(-0.5 * (square - nearest).nan_to_num(0).clamp(min=0))
+    return r, torch.nn.functional.pad(neighbors.distance[rows] / width, (1, 0)) ** 2
+
+
+def _nearest(r: Tensor, square: Tensor) -> Tensor:
+    """[M, 1] squared distance of the nearest reliable one, infinite where there is none."""
+    return torch.where(r > 0, square, torch.inf).amin(dim=1, keepdim=True)
+
+
+def _decay(r: Tensor, square: Tensor) -> Tensor:
+    """d, as if the nearest reliable one were at distance 0."""
+    return torch.exp(-0.5 * (square - _nearest(r, square)).nan_to_num(0).clamp(min=0))
+
+
+def _margin(
+    neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor, delta: float
+) -> Float64[Tensor, " m"] | float:
+    """Delta in the units of `voting_weights`: larger by what these leave out; infinite where no support clears it."""
+    if delta == 0:
+        return 0.0
+    return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))
 
 
 def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:

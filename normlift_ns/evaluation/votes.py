@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.core.ablations import Variant, linear_average, variant_reliability
+from normlift_ns.core.ablations import Variant, linear_average, variant_config, variant_reliability, variant_source
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
-from normlift_ns.core.refine import refine
 from normlift_ns.core.storage import StoredDirections
 from normlift_ns.options import RefineConfig
 
@@ -43,11 +42,13 @@ class Vote:
 def own_vote(manifest: Mapping[str, Any]) -> Vote:
     """The vote that a run was lifted with; the defaults where its manifest does not say."""
     options = manifest.get("options", {})
-    return Vote("full", RefineConfig(**options.get("vote", {})), options.get("beta", 1.0), {})
+    kind = {"vote": "paper"} if "vote" in options else {}  # version 0.1 knew no other
+    config = RefineConfig(**{**kind, **options.get("vote", {})})
+    return Vote(config.vote, config, options.get("beta", 1.0), {})
 
 
 def ablation(own: Vote) -> Iterator[Vote]:
-    """The variants of the paper's table 2."""
+    """The variants of the paper's table 2, and the posterior vote."""
     for variant in get_args(Variant):
         yield replace(own, variant=variant, label={"variant": variant})
 
@@ -76,16 +77,19 @@ def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Cal
         return there.directions(gaussians, refined=False)
 
     def voted(vote: Vote) -> SemanticField:
-        near, r = neighbors(vote.config.k), variant_reliability(vote.variant, there.scalars, vote.beta)
+        near = neighbors(vote.config.k)
         own = torch.arange(len(field), dtype=torch.int32)
         if vote.variant == "none":
             return replace(field, source=own)
         if vote.variant == "linear":
-            found = linear_average(unrefined(own.long().to(device)), r, near, vote.config)
+            r = variant_reliability(vote.variant, there.scalars, vote.beta)
+            config = variant_config(vote.variant, vote.config)
+            found = linear_average(unrefined(own.long().to(device)), r, near, config)
             has = (found != 0).any(dim=1)
             norm = torch.where(has & (there.scalars.norm <= 0), 1.0, there.scalars.norm)
             scalars = replace(field.scalars, norm=norm.to(field.scalars.norm))
             return replace(field, scalars=scalars, source=own, store=StoredDirections(found[has].half().cpu(), None))
-        return replace(field, source=refine(places, unrefined, r, vote.config, neighbors=near).cpu())
+        scalars, how = there.scalars, {"beta": vote.beta, "neighbors": near}
+        return replace(field, source=variant_source(vote.variant, places, unrefined, scalars, vote.config, **how).cpu())
 
     return voted

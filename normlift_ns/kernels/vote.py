@@ -71,9 +71,10 @@ def _certain(agreed, r, weight, slot, there, spread, delta):
 
 @triton.jit
 def _vote(
-    voters, neighbors, distance, high, low, rough, row_of, reliability, source, dimension, k, tau, gamma, width, delta,
-    GROUP: tl.constexpr, COLUMNS: tl.constexpr, COLUMNS_LATER: tl.constexpr, STAGES: tl.constexpr,
+    voters, neighbors, distance, high, low, rough, row_of, reliability, own, source, dimension, k, tau, gamma, width,
+    delta, prior, GROUP: tl.constexpr, COLUMNS: tl.constexpr, COLUMNS_LATER: tl.constexpr, STAGES: tl.constexpr,
     PRECISION: tl.constexpr, CERTIFY: tl.constexpr, FINISH: tl.constexpr, HALVES: tl.constexpr,
+    POSTERIOR: tl.constexpr,
 ):  # fmt: skip
     i = tl.load(voters + tl.program_id(0)).to(tl.int64)
     slot = tl.arange(0, GROUP)  # 0: i itself
@@ -84,6 +85,8 @@ def _vote(
     r = tl.load(reliability + member, mask=there, other=0.0)
     d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
     place = tl.load(row_of + member, mask=there, other=0).to(tl.int64)
+    if POSTERIOR:
+        seen = tl.load(own + i)
     if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else nobody can win
         if CERTIFY:
             lacks = tl.load(rough + place, mask=there & (r > 0), other=0.0)
@@ -94,9 +97,15 @@ def _vote(
             inside = there[:, None] & (column < dimension)[None, :]
             part = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
             cosine = tl.dot(part, tl.trans(part), cosine, input_precision=PRECISION)
-        nearest = tl.min(tl.where(r > 0, d, float("inf")), axis=0)
+        votes = (r > 0) & (slot > 0) if POSTERIOR else r > 0
+        nearest = tl.min(tl.where(votes, d, float("inf")), axis=0)
         beyond = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product rounds
         weight = r * tl.exp(-0.5 * beyond)
+        if POSTERIOR:
+            near = tl.where(slot > 0, weight, 0.0)
+            weight = tl.where(slot > 0, near / tl.sum(near, axis=0) * prior, seen)
+        else:  # in the units of these weights, which leave out how far the nearest one is
+            delta = tl.where(delta > 0, delta * tl.exp(0.5 * nearest * nearest), 0.0)
         undecided = True
         if CERTIFY:
             agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
@@ -160,6 +169,8 @@ def vote(
     gamma: float,
     width: float,
     delta: float,
+    own: Float32[Tensor, " n"] | None = None,
+    prior: float = 0.0,
     precision: Precision = "certified",
 ) -> None:
     """Writes to `source` whose direction each of the voters takes; formulas in `core.refine`.
@@ -170,6 +181,7 @@ def vote(
         directions: unit rows or 0, multiplied on tensor cores and added in float32.
         row_of: the row of a Gaussian's direction; those of voters and their neighbours are read.
         width: sigma_d, in the units of `distance`.
+        own: evidence of a posterior vote against `prior` views; without it the vote is the paper's.
         precision: of products of float32 directions. "halves": of two halves of 11 bits each. "certified": the same
             winners, by the first halves alone where these decide. "first": writes only the latter. "tf32", "tf32x3",
             "ieee": rounded to 11 bits, in three such parts, or unrounded. Half-precision directions are not rounded.
@@ -180,13 +192,13 @@ def vote(
     high, low, rough = halve(directions) if halves else (directions, directions, reliability)
     tuning = _HALVES if halves else _WHOLE
     _vote[(len(voters),)](
-        voters, neighbors, distance, high, low, rough, row_of, reliability, source,
-        directions.shape[1], neighbors.shape[1], tau, gamma, width, delta,
+        voters, neighbors, distance, high, low, rough, row_of, reliability, reliability if own is None else own,
+        source, directions.shape[1], neighbors.shape[1], tau, gamma, width, delta, prior,
         GROUP=max(16, triton.next_power_of_2(neighbors.shape[1] + 1)), COLUMNS=tuning.columns,
         COLUMNS_LATER=tuning.columns_later, STAGES=tuning.stages, CERTIFY=halves and precision != "halves",
         FINISH=precision != "first" or not halves, HALVES=halves,
-        PRECISION=precision if precision in ("tf32", "ieee") else "tf32x3", num_warps=tuning.warps,
-        maxnreg=tuning.registers,
+        PRECISION=precision if precision in ("tf32", "ieee") else "tf32x3", POSTERIOR=own is not None,
+        num_warps=tuning.warps, maxnreg=tuning.registers,
     )  # fmt: skip
 
 

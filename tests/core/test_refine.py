@@ -1,14 +1,36 @@
-"""Mode voting against a Python loop, its invariances, and the ablation variants."""
+"""Both votes against Python loops, their invariances and limits, and the ablation variants."""
 
+import copy
+import inspect
 import math
+import pickle
+import re
+from dataclasses import asdict, replace
 from decimal import Decimal, localcontext
+from itertools import pairwise
+from typing import get_args
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from normlift_ns import RefineConfig, lift, nearest_neighbors, refine, refine_variant, unsupported
+from benchmarks.captures import trained_scene
+from normlift_ns import (
+    InputError,
+    Neighbors,
+    RefineConfig,
+    lift,
+    nearest_neighbors,
+    refine,
+    refine_variant,
+    unsupported,
+)
+from normlift_ns.core.ablations import Variant
+from normlift_ns.core.refine import possible
+from normlift_ns.evaluation.votes import own_vote
+from normlift_ns.options import VOTES, VoteNumbers
+from tests.captures import needs_shared
 from tests.scenes import generator, random_evidence, unit_rows
 
 SEEDS = st.integers(0, 2**31)
@@ -26,38 +48,65 @@ def scene(seed: int, n: int = 60, classes: int = 3) -> tuple[torch.Tensor, torch
     return means, torch.where(zero[:, None], 0.0, u), torch.where(zero, 0.0, reliability)
 
 
-def vote(means, u, r, config) -> list[int]:
-    """Equations 9 and 10, one term at a time; distances from the nearest reliable member."""
-    n = len(means)
+def group_and_terms(means, u, config):
+    """K nearest neighbours of every Gaussian, nearest first, d_ik and g_jk; one term at a time."""
+    n, numbers = len(means), config.numbers
     distance = (means[:, None] - means[None]).norm(dim=-1)
     nearest = torch.where(distance > 0, distance, math.inf).min(1).values
     unit = sorted(nearest.tolist())[(n - 1) // 2]  # torch's median
-    source = []
-    for i in range(n):
-        near = sorted((distance[i, j].item(), j) for j in range(n) if j != i)[: config.k]
-        group = [i] + [j for _, j in near]
-        start = min((distance[i, j].item() for j in group if r[j] > 0), default=0.0)
+    near = [
+        [j for _, j in sorted((distance[i, j].item(), j) for j in range(n) if j != i)[: config.k]] for i in range(n)
+    ]
 
-        def score(j: int, i=i, group=group, start=start) -> float:
-            total = 0.0
-            for k in group:
-                d = math.exp(-0.5 * (distance[i, k].item() ** 2 - start**2) / (config.sigma_d * unit) ** 2)
-                g = 1 / (1 + math.exp(-((u[k] @ u[j]).item() - config.tau) / config.gamma))
-                total += r[k].item() * d * g
-            return r[j].item() * total
+    def d(i: int, k: int) -> Decimal:
+        return (-((Decimal(distance[i, k].item()) / Decimal(numbers.sigma_d * unit)) ** 2) / 2).exp()
 
-        scores = [score(j) for j in group]
-        best = max(range(1, len(group)), key=lambda place: (scores[place], -place))
-        source.append(group[best] if scores[best] > scores[0] + config.delta else i)
+    def g(j: int, k: int) -> Decimal:
+        return Decimal(1 / (1 + math.exp(-((u[k] @ u[j]).item() - numbers.tau) / numbers.gamma)))
+
+    return near, d, g
+
+
+def vote(means, u, r, config, own=None) -> list[int]:
+    """Both votes as `refine` defines them, nothing shifted, in decimal numbers that do not underflow."""
+    with localcontext() as context:
+        context.Emin = -(10**9)
+        near, d, g = group_and_terms(means, u, config)
+        rely, source = [Decimal(x) for x in r.tolist()], []
+        for i, neighbors in enumerate(near):
+            decay = {k: d(i, k) for k in (i, *neighbors)}
+
+            def score(j: int, i=i, neighbors=neighbors, decay=decay) -> Decimal:
+                if config.vote == "paper":
+                    return rely[j] * sum(rely[k] * decay[k] * g(j, k) for k in (i, *neighbors))
+                total = sum(rely[k] * decay[k] for k in neighbors)
+                mean = sum(rely[k] * decay[k] * g(j, k) for k in neighbors) / total if total > 0 else Decimal(0)
+                return rely[j] * (Decimal(own[i].item()) * g(i, j) + Decimal(config.prior) * mean)
+
+            best = max(neighbors, key=lambda j: (score(j), -neighbors.index(j)))
+            source.append(best if score(best) > score(i) + Decimal(config.numbers.delta) else i)
     return source
 
 
 @settings(deadline=None, max_examples=20)
-@given(seed=SEEDS, k=st.integers(1, 70), sigma_d=st.floats(0.3, 5), tau=st.floats(0.2, 0.95), delta=st.floats(0, 0.5))
-def test_equals_the_loop(seed, k, sigma_d, tau, delta):
-    means, u, r = scene(seed, n=40)
-    config = RefineConfig(k=k, sigma_d=sigma_d, tau=tau, gamma=0.05, delta=delta)
-    assert refine(means, u, r, config).tolist() == vote(means, u, r, config)
+@given(
+    seed=SEEDS,
+    k=st.integers(1, 50),
+    sigma_d=st.floats(0.3, 5),
+    tau=st.floats(0.2, 0.95),
+    delta=st.floats(0, 0.5),
+    prior=st.sampled_from([0.0, 0.5, 4.0, 30.0]),
+    kind=st.sampled_from(["paper", "posterior"]),
+    far=st.booleans(),
+)
+def test_equals_the_loop(seed, k, sigma_d, tau, delta, prior, kind, far):
+    means, u, r = scene(seed, n=25)
+    if far:  # of all weights of some Gaussians nothing is left in the numbers of the machine
+        means[:3] *= 300
+        means[20:] += 40
+    own = torch.where(r > 0, 8 * torch.rand(25, generator=generator(seed), dtype=torch.float64), 0.0)
+    config = RefineConfig(vote=kind, k=k, sigma_d=sigma_d, tau=tau, gamma=0.05, delta=delta, prior=prior)
+    assert refine(means, u, r, config, own=own).tolist() == vote(means, u, r, config, own)
 
 
 def test_the_loop_test_changes_something():
@@ -65,25 +114,133 @@ def test_the_loop_test_changes_something():
     changed = refine(means, u, r, RefineConfig(k=12)) != torch.arange(60)
     assert 10 < int(changed.sum()) < 60
     assert changed[r == 0].float().mean() > 0.8
+    # what many views saw alike stays, what few saw is repaired, and neighbours decide where nothing was seen
+    own = torch.where(r > 0, torch.where(torch.arange(60) < 30, 30.0, 0.1), 0.0)
+    kept = refine(means, u, r, RefineConfig(vote="posterior", k=12), own=own) == torch.arange(60)
+    assert kept[(own == 30)].float().mean() > kept[own == 0.1].float().mean() + 0.3
+    assert not kept[own == 0].any()
 
 
 @settings(deadline=None, max_examples=20)
-@given(seed=SEEDS)
-def test_invariances(seed):
+@given(seed=SEEDS, kind=st.sampled_from(["paper", "posterior"]))
+def test_invariances(seed, kind):
     """Rigid motion, scale of the scene, order of Gaussians, rotation of feature space."""
     means, u, r = scene(seed)
-    config = RefineConfig(k=12)
-    source = refine(means, u, r, config)
+    config, own = RefineConfig(vote=kind, k=12), 5 * r
+    source = refine(means, u, r, config, own=own)
     g = generator(seed)
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64)).Q
-    assert torch.equal(refine(means @ rotation + 7, u, r, config), source)
-    assert torch.equal(refine(means * 1e-3, u, r, config), source)
+    assert torch.equal(refine(means @ rotation + 7, u, r, config, own=own), source)
+    assert torch.equal(refine(means * 1e-3, u, r, config, own=own), source)
     turn = torch.linalg.qr(torch.randn(8, 8, generator=g, dtype=torch.float64)).Q
-    assert torch.equal(refine(means, u @ turn, r, config), source)
+    assert torch.equal(refine(means, u @ turn, r, config, own=own), source)
     order = torch.randperm(60, generator=g)
     position = torch.empty_like(order)
     position[order] = torch.arange(60)
-    assert torch.equal(refine(means[order], u[order], r[order], config), position[source[order].long()].int())
+    moved = refine(means[order], u[order], r[order], config, own=own[order])
+    assert torch.equal(moved, position[source[order].long()].int())
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=SEEDS, factor=st.sampled_from([2.0**-40, 0.5, 4.0]))
+def test_the_unit_of_reliability_cancels_in_a_posterior_vote(seed, factor):
+    means, u, r = scene(seed)
+    config, own = RefineConfig(vote="posterior", k=12), 5 * r
+    found = refine(means, u, r, config, own=own)
+    assert torch.equal(refine(means, u, factor * r, config, own=own), found)
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=SEEDS)
+def test_own_evidence_and_the_prior_pull_against_each_other(seed):
+    means, u, r = scene(seed)
+    config, itself, own = RefineConfig(vote="posterior", k=12), torch.arange(60).int(), 5 * r
+    alike = torch.where(r > 0, 0.5, 0.0).double()
+    # nobody is more reliable, and nobody agrees better with what was seen than that itself
+    for kept in (
+        refine(means, u, alike, config, own=1e9 * (r > 0)) == itself,
+        refine(means, u, alike, replace(config, prior=0.0), own=own) == itself,
+    ):
+        assert kept[r > 0].all()
+    assert torch.equal(refine(means, u, r, replace(config, prior=0.0), own=0 * own), itself)  # nothing to go by
+    # a prior of P views against own evidence is a prior of 1 against a P-th of it
+    assert torch.equal(
+        refine(means, u, r, replace(config, prior=4.0), own=own),
+        refine(means, u, r, replace(config, prior=1.0), own=own / 4),
+    )
+    # without own evidence and R: the neighbourhood's mode, whatever the prior
+    nothing = r == 0
+    modes = [refine(means, u, r, replace(config, prior=p), own=own)[nothing] for p in (0.25, 4.0, 1e6)]
+    assert all(torch.equal(mode, modes[0]) for mode in modes)
+    assert not (modes[0] == itself[nothing]).any()
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=SEEDS, kind=st.sampled_from(["paper", "posterior"]))
+def test_a_larger_margin_repairs_fewer(seed, kind):
+    means, u, r = scene(seed)
+    changed = []
+    for delta in (0.0, 1e-12, 0.01, 0.1, 0.3, 1.0, 3.0):
+        config = RefineConfig(vote=kind, k=12, delta=delta)
+        changed.append(refine(means, u, r, config, own=5 * r) != torch.arange(60))
+    assert all(bool((few <= many).all()) for many, few in pairwise(changed))
+    assert int(changed[0].sum()) > int(changed[-2].sum())
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=SEEDS, dtype=st.sampled_from([torch.float32, torch.float64]), kind=st.sampled_from(["paper", "posterior"]))
+def test_margins_are_compared_with_supports_in_their_own_units(seed, dtype, kind):
+    """Delta a little below and above what the best of each neighbourhood is ahead: it wins, and it does not."""
+    means, u, r = scene(seed, n=30)
+    means[::3] *= 4  # some far from everybody
+    own, config = 5 * r, RefineConfig(vote=kind, k=9, sigma_d=2.0)
+    arrays = [x.to(dtype) for x in (means, u, r)]
+    near, d, g = group_and_terms(means, u, config)
+    for i in torch.where(r == 0)[0].tolist()[:4] + torch.where(r > 0)[0].tolist()[:2]:
+        share = {k: float(d(i, k)) * r[k].item() for k in (i, *near[i])}
+        total = sum(share[k] for k in near[i])
+        score = {}
+        for j in (i, *near[i]):
+            agree = {k: float(g(j, k)) for k in (i, *near[i])}
+            if kind == "paper":
+                score[j] = r[j].item() * sum(share[k] * agree[k] for k in (i, *near[i]))
+            elif total > 0:
+                mean = sum(share[k] * agree[k] for k in near[i]) / total
+                score[j] = r[j].item() * (own[i].item() * agree[i] + config.prior * mean)
+        if len(score) == 0:
+            continue
+        ahead = max(score[j] for j in near[i]) - score[i]
+        slack = 1e-12 if dtype == torch.float64 else 1e-5 * max(score.values())
+        if ahead < 3 * slack or ahead == 0:
+            continue
+        won = [
+            int(refine(*arrays, replace(config, delta=max(0.0, delta)), own=own)[i]) != i
+            for delta in (ahead - slack, ahead + slack)
+        ]
+        assert won == [True, False]
+
+
+def test_a_margin_counts_where_a_support_without_shift_is_nothing():
+    """A Gaussian 1,000 spacings away takes the mode at Delta = 0, and clears no margin in the paper's vote."""
+    means, u, r = scene(3)
+    means[0] = torch.tensor([1000.0, 0, 0])
+    u[0], r[0] = 0, 0
+    own = 5 * r
+    for dtype in (torch.float32, torch.float64):
+        arrays = [x.to(dtype) for x in (means, u, r)]
+        won = {
+            (kind, delta): int(refine(*arrays, RefineConfig(vote=kind, k=12, delta=delta), own=own)[0]) != 0
+            for kind in ("paper", "posterior")
+            for delta in (0.0, 1e-30, 0.1)
+        }
+        assert won == {
+            ("paper", 0.0): True,
+            ("paper", 1e-30): False,
+            ("paper", 0.1): False,
+            ("posterior", 0.0): True,
+            ("posterior", 1e-30): True,
+            ("posterior", 0.1): True,
+        }
 
 
 def test_chunks_do_not_change_the_vote(monkeypatch):
@@ -93,10 +250,17 @@ def test_chunks_do_not_change_the_vote(monkeypatch):
     assert torch.equal(refine(means, u, r, RefineConfig(k=12)), whole)
 
 
-@pytest.mark.parametrize("config", [RefineConfig(k=12, delta=1e30), RefineConfig(k=1, delta=5.0)])
+@pytest.mark.parametrize(
+    "config",
+    [
+        RefineConfig(k=12, delta=1e30),
+        RefineConfig(k=1, delta=5.0),
+        RefineConfig(vote="posterior", k=12, delta=12.0),
+    ],
+)
 def test_a_margin_that_nobody_clears_is_the_identity(config):
     means, u, r = scene(2)
-    assert torch.equal(refine(means, u, r, config), torch.arange(60, dtype=torch.int32))
+    assert torch.equal(refine(means, u, r, config, own=5 * r), torch.arange(60, dtype=torch.int32))
 
 
 def test_unreliable_neighbourhoods_stay_untouched_and_are_counted():
@@ -107,8 +271,9 @@ def test_unreliable_neighbourhoods_stay_untouched_and_are_counted():
     means[30:] += 1000
     r[30:] = 0
     config = RefineConfig(k=12)
-    source = refine(means, u, r, config)
-    assert torch.equal(source[30:], torch.arange(30, 60, dtype=torch.int32))
+    for kind in ("paper", "posterior"):
+        source = refine(means, u, r, replace(config, vote=kind), own=1 + r)
+        assert torch.equal(source[30:], torch.arange(30, 60, dtype=torch.int32))
     lost = unsupported(nearest_neighbors(means, config.k), r)
     assert int(lost.sum()) == 30
     assert lost[30:].all()
@@ -121,19 +286,16 @@ def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
     means[0] = torch.tensor([1000.0, 0, 0])
     u[0], r[0] = 0, 0
     config = RefineConfig(k=12)
-    near = nearest_neighbors(means, config.k)
-    scores = {}
-    with localcontext() as context:
-        context.Emin = -(10**9)
-        for j in near.index[0].tolist():
-            total = Decimal(0)
-            for k, distance in zip(near.index[0].tolist(), near.distance[0].tolist()):
-                decay = (-((Decimal(distance) / Decimal(float(near.spacing.median()))) ** 2) / 2).exp()
-                agree = torch.sigmoid((u[j] @ u[k] - config.tau) / config.gamma)
-                total += Decimal(float(r[k] * agree)) * decay
-            scores[j] = Decimal(float(r[j])) * total
-    assert 0 < max(scores.values()) < Decimal(10) ** -100_000
-    assert int(refine(means.to(dtype), u.to(dtype), r.to(dtype), config)[0]) == max(scores, key=scores.__getitem__)
+    own = torch.zeros(60, dtype=torch.float64)
+    for kind in ("paper", "posterior"):
+        chosen = replace(config, vote=kind)
+        near, d, _ = group_and_terms(means, u, chosen)
+        with localcontext() as context:
+            context.Emin = -(10**9)
+            assert 0 < max(d(0, k) for k in near[0] if r[k] > 0) < Decimal(10) ** -50_000
+        expected = vote(means, u, r, chosen, own)[0]
+        assert expected != 0
+        assert int(refine(means.to(dtype), u.to(dtype), r.to(dtype), chosen, own=own)[0]) == expected
 
 
 def test_a_reliable_cluster_far_away_never_changes():
@@ -171,6 +333,8 @@ def test_half_precision_directions_vote_like_float32():
         ({"tau": 1.5}, "tau must be in -1..1"),
         ({"gamma": -1.0}, "gamma must be positive"),
         ({"delta": -0.1}, "delta must be not negative"),
+        ({"prior": -1.0}, "prior must be not negative"),
+        ({"vote": "mean"}, "vote must be one of paper, posterior"),
     ],
 )
 def test_parameters_have_ranges(kwargs, message):
@@ -187,40 +351,122 @@ def test_disagreeing_shapes_are_named():
         refine(means, u, r, neighbors=nearest_neighbors(means, 5))
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_a_posterior_vote_needs_own_evidence():
+    means, u, r = scene(7)
+    config = RefineConfig(vote="posterior", k=5)
+    with pytest.raises(InputError, match=r"a posterior vote needs own, .* of shape \(60,\); got none"):
+        refine(means, u, r, config)
+    with pytest.raises(InputError, match=r"of shape \(60,\); got shape \(59,\)"):
+        refine(means, u, r, config, own=r[1:])
+
+
+def test_defaults_are_those_of_the_kind_of_vote_and_stand_in_the_help():
+    """A number given counts for either kind; the help repeats the table."""
+    assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTES["posterior"]._replace(tau=0.5)
+    assert RefineConfig(vote="paper") == replace(RefineConfig(vote="posterior"), vote="paper")
+    text = " ".join(inspect.getsource(RefineConfig).split())
+    for name in VoteNumbers._fields:
+        values = {kind: getattr(numbers, name) for kind, numbers in VOTES.items()}
+        each = [f"{value:g} for {kind}" for kind, value in values.items()]
+        told = (
+            f"By default {values['paper']:g}." if len(set(values.values())) == 1 else f"By default {', '.join(each)}."
+        )
+        assert re.search(rf"{name}: float \| None = None .{{1,250}}{re.escape(told)}", text), name
+
+
+def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
+    old = RefineConfig.__new__(RefineConfig)
+    old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
+    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteNumbers(1.0, 0.95, 0.4, 0.0))
+    manifest = {"options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "beta": 2.0}}
+    own = own_vote(manifest)
+    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteNumbers(2.5, 0.9, 0.4, 0.1))
+    assert own_vote({}).config == RefineConfig()
+    told = asdict(possible(RefineConfig(vote="posterior", tau=0.5), 1000))  # what a manifest of today holds
+    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": 0.4, "sigma_d": 2.0, "tau": 0.5}
+    assert own_vote({"options": {"vote": told}}).variant == "posterior"
+    new = RefineConfig(vote="posterior", sigma_d=3.0)
+    assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new
+
+
+@needs_shared
+def test_a_margin_on_a_capture_clears_what_it_clears_in_the_paper():
+    """Gaussians of the fox with a wide decay: no direction is copied by a support that Delta exceeds.
+
+    Supports counted from the nearest reliable neighbour would clear it for hundreds of Gaussians more.
+    """
+    means, g = trained_scene("fox").means.double(), generator(0)
+    near = nearest_neighbors(means, 36)
+    voters = torch.randperm(len(means), generator=g)[:4000]
+    index = torch.full_like(near.index, -1)
+    index[voters] = near.index[voters]
+    some = Neighbors(index, near.distance, near.spacing)
+    # one of ten classes in every cell of the scene; nothing is known of a third, and of whole cells
+    cell = (means / (20 * near.spacing.median())).floor().long() @ torch.tensor([73, 19, 31])
+    u = torch.nn.functional.normalize(
+        unit_rows(10, 16, 0)[cell % 10] + 0.1 * torch.randn(len(means), 16, generator=g), dim=1
+    )
+    empty = (torch.rand(len(means), generator=g) < 0.33) | (cell % 7 == 0)
+    r = torch.where(empty, 0.0, torch.rand(len(means), generator=g).double())
+    u = torch.where(empty[:, None], 0.0, u)
+    config = RefineConfig(vote="paper", sigma_d=3.0, delta=0.1)
+    numbers = config.numbers
+    group = torch.cat([voters[:, None], near.index[voters].long()], dim=1)
+    square = torch.nn.functional.pad(near.distance[voters] / (3.0 * near.spacing.median()), (1, 0)) ** 2
+    agree = torch.sigmoid((u[group] @ u[group].transpose(1, 2) - numbers.tau) / numbers.gamma)
+    support = r[group] * torch.einsum("ijk,ik->ij", agree, r[group] * torch.exp(-0.5 * square))  # equation 9
+    best = support[:, 1:].max(dim=1)
+    clears = best.values > support[:, 0] + 0.1  # equation 10
+    expected = torch.where(clears, group.gather(1, best.indices[:, None] + 1).squeeze(1), voters)
+    assert torch.equal(refine(means, u, r, config, neighbors=some)[voters].long(), expected)
+    nearest = torch.where(r[group] > 0, square, torch.inf).amin(dim=1)
+    shifted = (best.values * torch.exp(0.5 * nearest) > support[:, 0] + 0.1) & (best.values > 0)
+    assert int(shifted.sum()) > int(clears.sum()) + 100
+
+
 def test_ablation_variants_are_what_their_names_say():
     evidence, features = random_evidence(50, [3, 2, 4], 0), unit_rows(9, 8, 0)
     means = torch.rand(50, 3, generator=generator(0), dtype=torch.float64)
     lifted = lift(evidence, features)
     config = RefineConfig(k=8, tau=0.5)
     u = lifted.directions()
-    got = {
-        name: refine_variant(name, means, lifted, config)
-        for name in ("none", "knn", "linear", "norm", "support", "full")
-    }
-    ones = (lifted.scalars.norm > 0).double()
-    support = torch.where(lifted.scalars.n_eff > 0, lifted.scalars.n_eff / (lifted.scalars.n_eff + 1), 0.0)
+    got = {name: refine_variant(name, means, lifted, config) for name in get_args(Variant)}
+    scalars = lifted.scalars
+    ones = (scalars.norm > 0).double()
+    support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + 1), 0.0)
     assert torch.equal(got["none"], u)
     for name, r in (
-        ("knn", ones),
-        ("norm", lifted.scalars.norm),
-        ("support", support),
-        ("full", lifted.scalars.reliability),
+        ("plain_knn", ones),
+        ("norm_only", scalars.norm),
+        ("support_only", support),
+        ("paper", scalars.reliability),
     ):
         assert torch.equal(got[name], u[refine(means, u, r, config).long()]), name
+    own = scalars.norm * scalars.n_eff
+    assert torch.equal(scalars.own_evidence, own)
+    posterior = refine(means, u, scalars.reliability, RefineConfig(vote="posterior", k=8), own=own)
+    assert torch.equal(got["posterior"], u[posterior.long()])
+    # parameters are those of a kind of vote
+    ours = RefineConfig(vote="posterior", k=8, tau=0.5)
+    given = u[refine(means, u, scalars.reliability, ours, own=own).long()]
+    assert torch.equal(refine_variant("posterior", means, lifted, ours), given)
+    plain = u[refine(means, u, scalars.reliability, RefineConfig(vote="paper", k=8)).long()]
+    assert torch.equal(refine_variant("paper", means, lifted, ours), plain)
     near = nearest_neighbors(means, 8)
     group = [7, *near.index[7].tolist()]
     distance = torch.cat([torch.zeros(1).double(), near.distance[7]])
-    weight = (
-        torch.exp(-0.5 * (distance / (config.sigma_d * near.spacing.median())) ** 2) * lifted.scalars.reliability[group]
-    )
+    width = config.numbers.sigma_d * near.spacing.median()
+    weight = torch.exp(-0.5 * (distance / width) ** 2) * lifted.scalars.reliability[group]
     assert torch.allclose(got["linear"][7], torch.nn.functional.normalize(weight @ u[group], dim=0))
-    assert len({value.sum().item() for value in got.values()}) == 6
+    assert len({value.sum().item() for value in got.values()}) == 7
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_variant():
     lifted = lift(random_evidence(5, [2], 0), unit_rows(2, 8, 0))
-    with pytest.raises(ValueError, match="variant must be one of none, knn, linear, norm, support, full"):
+    known = "none, plain_knn, linear, norm_only, support_only, paper, posterior"
+    with pytest.raises(ValueError, match=f"variant must be one of {known}; got 'mean'"):
         refine_variant("mean", torch.rand(5, 3), lifted)
 
 

@@ -96,7 +96,8 @@ def test_lift_finds_the_classes_and_refinement_repairs(room: DemoRoom):
     lifted = lift(evidence, features)
     directions = lifted.directions()
     neighbors = nearest_neighbors(room.scene.means, 36)
-    source = refine(room.scene.means, directions, lifted.scalars.reliability, neighbors=neighbors).long()
+    own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
+    source = refine(room.scene.means, directions, reliability, own=own, neighbors=neighbors).long()
     before, after = mean_iou(room, directions @ classes.T), mean_iou(room, directions[source] @ classes.T)
     assert 0.88 < before < 0.94
     assert after > before + 0.005

@@ -30,14 +30,18 @@ from safetensors.numpy import load_file
 
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
+VOTE = ("--vote", "paper", "--k", 36, "--sigma-d", 1, "--tau", 0.95, "--gamma", 0.4, "--delta", 0)
+"""Of version 0.1."""
 SAMPLES = 64
 SAME_SOURCES, LOOSE, FEW = 0.9, 0.01, 5
 """On another machine: the share of equal sources, how far floats may be apart, and whole numbers at least."""
 
 
 def run_commands(scene: str, config: Path, folder: Path) -> None:
-    """Lifts a run (8 views, half resolution, colour encoder), asks it and exports what is found."""
-    lift = ("--encoder", "colour", "--max-views", 8, "--lift-downscale", 2, "--queries", *TEXTS[scene])
+    """Lifts a run (8 views, half resolution, colour encoder, the vote of version 0.1), asks it and exports what is
+    found.
+    """
+    lift = ("--encoder", "colour", "--max-views", 8, "--lift-downscale", 2, *VOTE, "--queries", *TEXTS[scene])
     _command("ns-normlift", "--load-config", config, *lift, "--timestamp", "golden", "--output-dir", folder)
     (lifted,) = folder.glob("*/normlift/golden/config.yml")
     files = ("--json", folder / "answers.json", "--output-path", folder / "answers.npz")

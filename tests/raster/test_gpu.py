@@ -313,7 +313,8 @@ def test_the_whole_lift_equals_that_of_the_cpu():
         there = scene.to(device)
         lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(device))
         neighbors = nearest_neighbors(there.means, 36)
-        source = refine(there.means, lifted.directions, lifted.scalars.reliability, neighbors=neighbors)
+        given = {"own": lifted.scalars.own_evidence, "neighbors": neighbors}
+        source = refine(there.means, lifted.directions, lifted.scalars.reliability, **given)
         results.append(
             [x.cpu() for x in (lifted.scalars.reliability, neighbors.index, lifted.directions(source.long()))]
         )

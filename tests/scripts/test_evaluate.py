@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+from normlift_ns.core.ablations import Variant
 from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.evaluation import votes
@@ -100,15 +102,15 @@ def test_studies_of_masks(workspace, monkeypatch, capsys):
     studies = document["studies"]
     assert list(studies) == ["ablation", "sweeps", "signals", "timing"]
     by_variant = {row["variant"]: row for row in studies["ablation"]}
-    assert list(by_variant) == ["none", "knn", "linear", "norm", "support", "full"]
-    assert by_variant["full"]["miou_3d"] == pytest.approx(document["results"]["miou_3d"], abs=5e-3)  # from stored u
+    assert list(by_variant) == list(get_args(Variant))
+    assert by_variant["paper"]["miou_3d"] == pytest.approx(document["results"]["miou_3d"], abs=5e-3)  # from stored u
     plain = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", "--refined", False)
     assert by_variant["none"]["miou_3d"] == plain["results"]["miou_3d"]
     assert len({row["miou_3d"] for row in by_variant.values()}) > 3
     assert [(row["parameter"], row["value"]) for row in studies["sweeps"]][2] == ("k", 12)
     assert len(studies["sweeps"]) == 5
     own = [r["miou_3d"] for r in studies["sweeps"] if (r["parameter"], r["value"]) in (("k", 12), ("delta", 0.0))]
-    assert own == [by_variant["full"]["miou_3d"]] * 2
+    assert own == [by_variant["paper"]["miou_3d"]] * 2
     (signals,) = studies["signals"]
     assert signals["zero.share"] == pytest.approx(document["results"]["zero_evidence_share"])
     assert signals["zero.accuracy"] is None  # no mask tells the class of what nobody sees
@@ -139,7 +141,7 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     studies = evaluated(monkeypatch, workspace, "scannet", path, *flags)["studies"]
     assert studies["signals"][0]["scene"] == "scene0000_00"
     assert 0.5 < studies["signals"][0]["seen.accuracy"] < 1
-    assert [row["variant"] for row in studies["ablation"]][-1] == "full"
+    assert [row["variant"] for row in studies["ablation"]][-1] == "posterior"
     assert studies["ablation"][-1]["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
 
 
