@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.consensus import SEED, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
@@ -24,7 +25,7 @@ from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.langsplat.source import refuse_equal_stems, write_langsplat
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
-from normlift_ns.observing import BLOCK, block_evidence, observe_views, spread
+from normlift_ns.observing import BLOCK, block_evidence, observe_views, region_levels, spread
 from normlift_ns.options import BackendName, LiftOptions, RefineConfig
 from normlift_ns.raster.gsplat import rules_named
 from normlift_ns.raster.rasterize import backend_of
@@ -64,7 +65,7 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Of each stage, in their order: features, evidence, lift, neighbors, vote, store."""
+    """Of each stage, in their order: features, evidence, consensus (if asked for), lift, neighbors, vote, store."""
 
 
 def lift_scene(
@@ -101,7 +102,8 @@ def lift_scene(
     if export is not None:
         refuse_equal_stems([views.names[index] for index in used])
     ready = _get_ready(scene, gaussians, options, drawing)
-    evidence, features = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages, ready)
+    evidence, features, level = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages, ready)
+    features, agreed = _agree(evidence, features, level, options, stages) if options.consensus else (features, {})
     with stages("lift") as step:
         lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
         _check_seen(evidence, lifted.scalars, source)
@@ -118,7 +120,7 @@ def lift_scene(
             "options": asdict(options),
             "gsplat_rules": drawing.rules,
             "backend": drawing.backend,
-            "statistics": {**counts, **_statistics(lifted.scalars), **shares},
+            "statistics": {**counts, **agreed, **_statistics(lifted.scalars), **shares},
             "cost": cost(stages.seconds, device),
         }
         rule = {"tolerance": options.tolerance, "storage": options.storage}
@@ -202,10 +204,12 @@ def _observe(
     export: Export | None,
     stages: Stages,
     ready: Callable[[], None],
-) -> tuple[Evidence, Float[Tensor, "s d"]]:
-    """Evidence and feature table of some training views, block by block, so that an interrupted lift can resume."""
+) -> tuple[Evidence, Float[Tensor, "s d"], Int64[Tensor, " s"]]:
+    """Evidence, feature table and levels of the regions of some training views, block by block, so that an interrupted
+    lift can resume.
+    """
     seen = cached(source, cache) if options.reuse_evidence else source
-    parts, tables = [], []
+    parts, tables, levels = [], [], []
     for start in range(0, len(used), BLOCK):
         with stages("features", len(used)) as step:
 
@@ -218,6 +222,7 @@ def _observe(
             chosen = used[start : start + BLOCK]
             block = observe_views(scene, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
             tables.extend(block.features)
+            levels.extend(region_levels(*x) for x in zip(block.regions, map(len, block.features)))
         with stages("evidence", len(used)) as step:
             ready()
             evidence = block_evidence(
@@ -233,7 +238,19 @@ def _observe(
                 done=step,
             )
             parts.append(evidence)
-    return Evidence.merge(*parts), torch.cat(tables).to(gaussians.means.device, drawing.dtype)
+    return Evidence.merge(*parts), torch.cat(tables).to(gaussians.means.device, drawing.dtype), torch.cat(levels)
+
+
+def _agree(
+    evidence: Evidence, features: Float[Tensor, "s d"], level: Int64[Tensor, " s"], options: LiftOptions, stages: Stages
+) -> tuple[Float[Tensor, "s d"], dict[str, Any]]:
+    """The feature table on which the views agree, and what the manifest says of it."""
+    with stages("consensus") as step:
+        power, sample = options.consensus_power, options.consensus_sample
+        found = consensus(evidence, features, level=level, power=power, sample=sample)
+        step()
+    facts = {"power": power, "sample": sample, "seed": SEED, "gaussians": found.gaussians, "agreement": found.agreement}
+    return found.features, {"consensus": facts}
 
 
 def _vote(

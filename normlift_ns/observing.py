@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 from xxhash import xxh3_128
 
@@ -33,6 +33,18 @@ _SMALLEST = 8
 """Pixels along a side of an image made smaller; fewer show nothing."""
 _KEY = "normlift_ns.block/5"
 """Part of every key: to be raised when evidence changes for the same input."""
+
+
+def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
+    """The level of each of `count` regions: the first that it occurs in, 0 for one without cells.
+
+    >>> region_levels(torch.tensor([[0, 0, -1], [1, 2, 2]], dtype=torch.int32), 3).tolist()
+    [0, 1, 1]
+    """
+    level = torch.zeros(count, dtype=torch.int64)
+    for number, of_cell in reversed(list(enumerate(regions))):
+        level[of_cell[of_cell >= 0].long()] = number
+    return level
 
 
 class Block(NamedTuple):

@@ -247,6 +247,14 @@ class LiftOptions:
     """Pixels without a region: ignore them, or let them dilute as observations of nothing."""
     weight_power: Literal[1, 2] = 1
     """1: weights A_ij as in the paper. 2: their squares."""
+    consensus: bool = False
+    """Before the lift, give every region the feature that the regions of other views agree on which hold the same
+    Gaussians."""
+    consensus_power: float = 1.0
+    """How little a region counts for another one of which it shows more: the power of the share of it that lies there,
+    >= 0. For --consensus True."""
+    consensus_sample: int = 50
+    """Gaussians that the consensus looks at in every region, or all that it has. For --consensus True."""
     refine: bool = True
     """Repair unreliable Gaussians by a vote among neighbours."""
     vote: RefineConfig = field(default_factory=RefineConfig)

@@ -60,6 +60,8 @@ RANGES: dict[str, Range] = {
     "max_views": _at_least(1),
     "lift_downscale": _at_least(1),
     "beta": _NOT_NEGATIVE,
+    "consensus_power": _NOT_NEGATIVE,
+    "consensus_sample": _at_least(1),
     "tolerance": Range(1e-9, _LARGEST, "positive, at least 1e-09"),
     "load_step": _at_least(0),
     # 2D features

@@ -65,7 +65,7 @@ FOREIGN = {
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/run.py")
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
-MOST_MODULES = 18
+MOST_MODULES = 19
 
 
 def layer(path: Path) -> str:

@@ -11,18 +11,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RasterSettings, RefineConfig, View
+from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RasterSettings, RefineConfig, View, observing
+from normlift_ns.core.consensus import consensus
 from normlift_ns.encoders import LangSplat, RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import LabelFiles
-from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.encoders.source import FeatureSource, ViewFeatures
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
 from normlift_ns.lifting import Export, lift_scene
@@ -309,3 +310,67 @@ def test_the_manifest_says_what_rasterized_and_by_which_rules(asked, recorded, r
     assert found.field.manifest["gsplat_rules"] == rules
     assert found.field.manifest["backend"] == "numba"
     assert RasterSettings.recorded(found.field.manifest) == RasterSettings.of_gsplat(rules)
+
+
+def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The three views have two masks each, of noise of their own; switching it on rasterizes nothing again, and the
+    stored features are those that the formula gives."""
+    halves = np.ones((HEIGHT, WIDTH), int)
+    halves[:, WIDTH // 2 :] = 2
+    names = ("a.png", "b.png", "c.png")
+    source = files(tmp_path / "maps", halves, "a", "b", "c")
+    rasterized: list[int] = []
+    original = observing.rasterize_evidence
+
+    def rasterize(*arguments: Any, **options: Any) -> Any:
+        rasterized.append(1)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(observing, "rasterize_evidence", rasterize)
+    told: list[str] = []
+    results = {}
+    for on in (False, True, False):
+        given = LiftOptions(refine=False, consensus=on, consensus_sample=7, storage="evidence")
+        results[on] = lift_scene(
+            scene(*names), source, given, tmp_path / "cache", encoder={}, report=lambda stage, *_: told.append(stage)
+        )
+    assert len(rasterized) == 1
+    assert "consensus" in told
+    off, on = results[False], results[True]
+    assert "consensus" not in off.seconds and "consensus" not in off.field.manifest["statistics"]
+    assert list(on.seconds).index("consensus") == list(on.seconds).index("evidence") + 1
+    facts = on.field.manifest["statistics"]["consensus"]
+    assert {name: facts[name] for name in ("power", "sample", "seed")} == {"power": 1.0, "sample": 7, "seed": 0}
+    assert facts["agreement"][0] > 0.5
+    assert on.field.manifest["cost"]["consensus_s"] > 0
+    before, after = (x.field.store for x in (off, on))
+    assert torch.equal(before.evidence.rows.weight, after.evidence.rows.weight)
+    expected = consensus(before.evidence, before.features, sample=7).features
+    assert torch.allclose(after.features, expected, atol=1e-6)
+    assert not torch.allclose(after.features, before.features, atol=1e-3)
+
+
+def test_levels_agree_each_for_itself(tmp_path: Path) -> None:
+    """Two levels at once: wholes and halves of the same pixels are not compared."""
+    rows = torch.nn.functional.normalize(torch.rand(3, 4, generator=generator(1)), dim=1)
+
+    class Both:
+        identity: ClassVar = {"kind": "both"}
+
+        def available(self, names: Sequence[str]) -> list[str]:
+            return list(names)
+
+        def text(self, prompts: Sequence[str]) -> torch.Tensor:
+            return rows[:1].expand(len(prompts), -1)
+
+        def view(self, image: torch.Tensor, name: str) -> ViewFeatures:
+            cells = (torch.arange(WIDTH) >= WIDTH // 2).int().expand(HEIGHT, WIDTH).contiguous()
+            own = rows[[0, 1, 2]] if name == "a.png" else rows[[2, 1, 0]]
+            return ViewFeatures(cells, own, torch.tensor([[0, 0], [1, 2]], dtype=torch.int32))
+
+    given = LiftOptions(refine=False, consensus=True, storage="evidence")
+    found = lift_scene(scene("a.png", "b.png"), Both(), given, tmp_path, encoder={}).field
+    assert len(found.manifest["statistics"]["consensus"]["agreement"]) == 2
+    whole = torch.nn.functional.normalize(rows[0] + rows[2], dim=0)
+    assert torch.allclose(found.store.features[[0, 3]], whole.expand(2, -1), atol=1e-6)
+    assert torch.allclose(found.store.features[[1, 4]], rows[1].expand(2, -1), atol=1e-6)

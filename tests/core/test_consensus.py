@@ -1,0 +1,333 @@
+"""Consensus of regions across views, against loops straight from the formula in float64."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Evidence, lift
+from normlift_ns.core import consensus as module
+from normlift_ns.core.consensus import consensus, region_overlaps, sampled_gaussians
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.errors import InputError
+from tests.scenes import dense, generator, random_evidence, unit_rows
+
+VIEWS = [3, 0, 1, 5, 2, 4]
+SEEDS = st.integers(0, 2**31)
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+
+
+def things(seed: int, gaussians: int = 60, views: int = 5, count: int = 4) -> Evidence:
+    """Every view has a region per thing; a few Gaussians lie between two, and some views miss some."""
+    g = generator(seed)
+    own = torch.randint(0, count, (gaussians,), generator=g)
+    weight = torch.zeros(gaussians, views, count, dtype=torch.float64)
+    seen = torch.rand(gaussians, views, generator=g, dtype=torch.float64) + 0.5
+    weight.scatter_(2, own[:, None, None].expand(-1, views, 1), seen[:, :, None])
+    other = torch.randint(0, count, (gaussians, views, 1), generator=g)
+    weight.scatter_add_(2, other, 0.3 * torch.rand(gaussians, views, 1, generator=g, dtype=torch.float64))
+    weight[torch.rand(gaussians, views, generator=g) < 0.2] = 0
+    return of_dense(weight.flatten(1), [count] * views)
+
+
+def of_dense(weight: torch.Tensor, counts: list[int]) -> Evidence:
+    row, column = weight.nonzero(as_tuple=True)
+    rows = SparseRows.from_coo(row, column.int(), weight[row, column], len(weight))
+    view = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts, dtype=torch.int64)).int()
+    nothing = torch.zeros(0, dtype=torch.int32)
+    blank = SparseRows.from_coo(nothing, nothing, torch.zeros(0, dtype=torch.float64), len(weight))
+    return Evidence(rows, view, blank, len(counts))
+
+
+def oracle(evidence: Evidence, features: torch.Tensor, power: float, level: torch.Tensor) -> torch.Tensor:
+    """The formula, in loops; every view's median weight is taken over all of its Gaussians."""
+    n, size, view = evidence.num_gaussians, evidence.num_regions, evidence.region_view.tolist()
+    weight, out = dense(evidence.rows, size).double(), features.double().clone()
+    for number in level.unique().tolist():
+        mine = [s for s in range(size) if level[s] == number]
+        p, sees = torch.zeros(n, size, dtype=torch.float64), torch.zeros(n, evidence.num_views, dtype=torch.bool)
+        for v in range(evidence.num_views):
+            of_view = [s for s in mine if view[s] == v]
+            total = weight[:, of_view].sum(1)
+            if not bool((total > 0).any()):
+                continue
+            median = total[total > 0].median()
+            for j in range(n):
+                if total[j] > 0 and total[j] >= 0.5 * median:
+                    kept = [s for s in of_view if weight[j, s] >= 0.02 * total[j]]
+                    p[j, kept] = weight[j, kept] / weight[j, kept].sum()
+                    sees[j, v] = True
+        J, c = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, size, dtype=torch.float64)
+        met, area = 0.0, 0.0
+        for s in mine:
+            for t in mine:
+                both = (sees[:, view[s]] & sees[:, view[t]]).double()
+                if view[s] != view[t] and (p[:, s] * p[:, t]).sum() > 0:
+                    inner = (p[:, s] * p[:, t]).sum()
+                    c[s, t] = inner / (p[:, s] * both).sum()
+                    J[s, t] = inner / ((p[:, s] * both).sum() + (p[:, t] * both).sum() - inner)
+        J[J < 0.1] = 0
+        for s in mine:
+            for v in set(range(evidence.num_views)) - {view[s]}:
+                a = (p[:, s] * sees[:, v]).sum()
+                area += float(a)
+                met += float(a) * max([float(J[s, t]) for t in mine if view[t] == v] or [0.0])
+        strength = min(1.0, max(0.0, (met / area - 0.4) / 0.1)) if area > 0 else 0.0
+        for s in mine:
+            total = features[s].double().clone()
+            for t in mine:
+                total += strength * J[s, t] * c[t, s] ** power * features[t]
+            if features[s].abs().sum() > 0 and J[s].sum() > 0 and strength > 0:
+                out[s] = total / total.norm()
+    return out
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=SEEDS, power=st.sampled_from([0.0, 1.0, 2.0]), levels=st.integers(1, 2))
+def test_equals_the_formula(seed, power, levels):
+    evidence = things(seed, gaussians=25)
+    features = unit_rows(evidence.num_regions, 6, seed)
+    level = torch.arange(evidence.num_regions) % levels
+    found = consensus(evidence, features, level=level, power=power).features
+    assert torch.allclose(found, oracle(evidence, features, power, level), rtol=0, atol=1e-12)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=SEEDS)
+def test_random_evidence_equals_the_formula(seed):
+    evidence = random_evidence(20, VIEWS, seed)
+    features = unit_rows(sum(VIEWS), 5, seed)
+    level = torch.zeros(sum(VIEWS), dtype=torch.int64)
+    found = consensus(evidence, features).features
+    assert torch.allclose(found, oracle(evidence, features, 1.0, level), rtol=0, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(seed=SEEDS)
+def test_overlaps_are_symmetric_shares(seed):
+    evidence = things(seed)
+    iou, inside, agreement = region_overlaps(evidence.rows, evidence.region_view)
+    size = evidence.num_regions
+    table = dense(iou, size)
+    assert torch.equal(table, table.T)
+    assert bool(((iou.weight >= 0.1) & (iou.weight <= 1) & (inside >= iou.weight - 1e-12) & (inside <= 1)).all())
+    view = evidence.region_view
+    assert bool((table[view[:, None] == view] == 0).all())
+    assert 0 < agreement <= 1
+
+
+@settings(deadline=None)
+@given(seed=SEEDS)
+def test_rows_are_unit_and_zero_rows_stay(seed):
+    evidence = things(seed)
+    features = unit_rows(evidence.num_regions, 7, seed, torch.float32)
+    features[::4] = 0
+    found = consensus(evidence, features).features
+    assert found.dtype == torch.float32
+    assert torch.equal(found[::4], features[::4])
+    kept = torch.arange(len(found)) % 4 != 0
+    assert torch.allclose(found[kept].norm(dim=1), torch.ones(int(kept.sum())), atol=1e-6)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=SEEDS, views=st.permutations(range(5)))
+def test_order_does_not_matter(seed, views):
+    evidence = things(seed)
+    features = unit_rows(evidence.num_regions, 6, seed)
+    found = consensus(evidence, features).features
+    columns = evidence.columns_of(list(views))
+    turned = consensus(evidence.select_views(list(views)), features[columns]).features
+    assert torch.allclose(turned, found[columns], rtol=0, atol=1e-12)
+    shuffled = evidence.rows.select_rows(torch.randperm(len(evidence.rows), generator=generator(seed)))
+    assert torch.allclose(consensus(replace(evidence, rows=shuffled), features).features, found, rtol=0, atol=1e-12)
+    within = torch.cat([4 * v + torch.randperm(4, generator=generator(seed + v)) for v in range(5)])
+    weight = dense(evidence.rows, 20)[:, within]
+    assert torch.allclose(
+        consensus(of_dense(weight, [4] * 5), features[within]).features, found[within], rtol=0, atol=1e-12
+    )
+
+
+def test_a_region_that_overlaps_nothing_keeps_its_feature():
+    weight = dense(things(0).rows, 20)
+    weight = torch.cat([weight, torch.zeros(len(weight), 2)], 1)
+    weight = torch.cat([weight, torch.zeros(5, 22)])
+    weight[-5:, 20] = 1.0  # seen by one view alone; the last region by none
+    evidence = of_dense(weight, [4, 4, 4, 4, 4, 2])
+    features = unit_rows(22, 9, 1, torch.float32)
+    found = consensus(evidence, features).features
+    assert torch.equal(found[20:], features[20:])
+    assert bool((found[:20] != features[:20]).any(dim=1).all())
+
+
+def test_regions_of_different_levels_are_not_compared():
+    evidence = things(3)
+    features = unit_rows(20, 6, 3)
+    level = torch.arange(20) % 4 // 2
+    found = consensus(evidence, features, level=level)
+    assert len(found.agreement) == 2
+    changed = torch.where((level == 1)[:, None], unit_rows(20, 6, 4), features)
+    assert torch.equal(consensus(evidence, changed, level=level).features[level == 0], found.features[level == 0])
+
+
+def test_a_mask_of_two_things_does_not_speak_for_the_small_one():
+    """Half of the views join a small thing to a large one: its own masks keep their feature, and the joined ones, of
+    which the large thing is most, tell them nothing.
+    """
+    small, large, views = 10, 90, 6
+    weight = torch.zeros(small + large, views, 2, dtype=torch.float64)
+    weight[:small, :3, 0] = 1
+    weight[:small, 3:, 1] = 1
+    weight[small:, :, 1] = 1
+    features = torch.eye(2, dtype=torch.float64).repeat(views, 1)
+    evidence = of_dense(weight.flatten(1), [2] * views)
+    found = consensus(evidence, features).features
+    assert float(found[0, 0]) > 0.999
+    assert float(lift(evidence, found).directions(torch.tensor([0]))[0, 1]) == pytest.approx(0.5**0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("side", [0.2, 0.4])
+def test_cells_of_an_arbitrary_partition_are_left_alone(side):
+    """Squares of every view lie where they lie: what they have in common is chance, whatever the features."""
+    g = generator(1)
+    place = torch.rand(4000, 2, generator=g)
+    count = int(1 / side) + 2
+    weight = torch.zeros(4000, 8, count * count)
+    for view in range(8):
+        cell = ((place + side * torch.rand(2, generator=g)) / side).long()
+        weight[torch.arange(4000), view, cell[:, 0] * count + cell[:, 1]] = 1
+    evidence = of_dense(weight.flatten(1), [count * count] * 8)
+    features = unit_rows(evidence.num_regions, 8, 1)
+    found = consensus(evidence, features)
+    assert found.agreement[0] < 0.45
+    assert (found.features * features).sum(1).mean() > 0.9
+
+
+def large(regions: int, gaussians: int, views: int) -> Evidence:
+    """Every Gaussian in one region of every view, things of neighbouring numbers."""
+    g = generator(0)
+    per_view = regions // views
+    thing = torch.rand(gaussians, generator=g) * per_view
+    blur = 0.2 * torch.randn(gaussians, views, generator=g)
+    local = (thing[:, None] + blur).clamp(0, per_view - 1e-3).long()
+    column = (local + per_view * torch.arange(views)).int()
+    offsets = torch.arange(gaussians + 1) * views
+    empty = SparseRows(torch.zeros(gaussians + 1, dtype=torch.int64), torch.zeros(0, dtype=torch.int32), torch.zeros(0))
+    rows = SparseRows(offsets, column.flatten(), torch.ones(gaussians * views))
+    return Evidence(rows, (torch.arange(per_view * views) // per_view).int(), empty, views)
+
+
+def test_a_sample_tells_what_the_whole_does():
+    evidence = large(600, 60_000, 20)
+    features = unit_rows(600, 32, 0, torch.float32)
+    sampled, whole = (consensus(evidence, features, sample=k) for k in (50, 10**6))
+    assert sampled.gaussians < 6000 and whole.gaussians == 60_000
+    assert (1 - (sampled.features * whole.features).sum(1)).mean() < 0.01
+    assert sampled.agreement[0] == pytest.approx(whole.agreement[0], abs=0.05)
+
+
+@settings(deadline=None)
+@given(seed=SEEDS, least=st.integers(1, 30))
+def test_every_region_has_its_sample(seed, least):
+    evidence = random_evidence(300, VIEWS, seed)
+    chosen, chance = sampled_gaussians(evidence.rows, sum(VIEWS), least)
+    count, got = (torch.bincount(r.column, minlength=15) for r in (evidence.rows, evidence.rows.select_rows(chosen)))
+    assert bool((got >= count.clamp(max=least)).all())
+    assert bool(((chance > 0) & (chance <= 1)).all())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_same_inputs_same_bits(device):
+    evidence = large(600, 20_000, 20).to(device)
+    features = unit_rows(600, 32, 0, torch.float32).to(device)
+    first = consensus(evidence, features)
+    for _ in range(3):
+        again = consensus(evidence, features)
+        assert torch.equal(again.features, first.features)
+        assert again.agreement == first.agreement
+
+
+def test_many_masks_need_no_square_of_them():
+    """24,000 masks, of which a square would take 2.3 GB in float32."""
+    import tracemalloc  # noqa: PLC0415
+
+    evidence = large(24_000, 60_000, 30)
+    features = unit_rows(24_000, 8, 0, torch.float32)
+    peak = 0
+    kept = module._sparse_blocks
+
+    def watched(*arguments):
+        nonlocal peak
+        for block in kept(*arguments):
+            peak = max(peak, *(x.numel() for x in block))
+            yield block
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(module, "_sparse_blocks", watched)
+        tracemalloc.start()  # NumPy's and SciPy's arrays
+        found = consensus(evidence, features)
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert found.agreement[0] > 0.4
+    assert peak < 24_000 * 300
+    assert most < 2**29
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e30])
+def test_scale_of_weights_does_not_matter(scale):
+    evidence = things(5)
+    scaled = replace(evidence, rows=replace(evidence.rows, weight=(evidence.rows.weight * scale).float()))
+    features = unit_rows(20, 6, 5)
+    found = consensus(scaled, features)
+    assert torch.allclose(found.features, consensus(evidence, features).features, atol=1e-6)
+
+
+@pytest.mark.parametrize(("gaussians", "counts"), [(0, []), (0, [2, 1]), (5, []), (5, [0, 0]), (5, [3]), (5, [1, 1])])
+def test_little_evidence(gaussians, counts):
+    size = sum(counts)
+    features = unit_rows(size, 4, 0, torch.float32) if size > 0 else torch.zeros(0, 4)
+    for weight in (torch.zeros(gaussians, size), torch.rand(gaussians, size, generator=generator(0))):
+        found = consensus(of_dense(weight, counts), features)
+        assert bool(found.features.isfinite().all())
+        assert found.features.shape == features.shape
+        if len([c for c in counts if c > 0]) < 2 or gaussians == 0:
+            assert torch.equal(found.features, features)
+
+
+def test_opposite_features_leave_a_row_as_it_is():
+    evidence = of_dense(torch.ones(4, 2, dtype=torch.float64), [1, 1])
+    features = torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
+    assert torch.equal(consensus(evidence, features).features, features)
+
+
+def test_refusals(unchecked):
+    evidence = things(0)
+    features = unit_rows(20, 4, 0)
+    for arguments, message in (
+        ({"features": features[:3]}, "one row per region of the evidence, 20; got 3"),
+        ({"level": torch.zeros(3, dtype=torch.int64)}, "level must have"),
+        ({"power": -1.0}, "power must be"),
+        ({"power": float("nan")}, "power must be"),
+        ({"sample": 0}, "sample >= 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            consensus(evidence, **{"features": features, **arguments})
+
+
+def test_half_precision_stays():
+    evidence = things(2)
+    features = unit_rows(20, 6, 2)
+    found = consensus(evidence, features.half()).features
+    assert found.dtype == torch.float16
+    assert torch.allclose(found.double(), consensus(evidence, features).features, atol=2e-3)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_gpu_equals_cpu():
+    evidence = large(2000, 50_000, 40)
+    features = unit_rows(2000, 64, 0, torch.float32)
+    here, there = consensus(evidence, features), consensus(evidence.to("cuda"), features.cuda())
+    assert here.gaussians == there.gaussians
+    assert there.agreement[0] == pytest.approx(here.agreement[0], abs=1e-5)
+    assert torch.allclose(there.features.cpu(), here.features, atol=1e-4)
