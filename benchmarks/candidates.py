@@ -34,7 +34,8 @@ class Candidate:
         return " ".join([method, *power, *changed])
 
 
-POWER, POWERS = 2.0, (1.0, 2.0, 3.0)
+POWER, POWERS = 1.0, (1.0, 2.0, 3.0)
+"""Of the consensus: the default of `core.consensus`, and all that are tried."""
 FIRST: dict[Vote, Candidate] = {
     "none": Candidate(),
     "linear": Candidate("linear"),

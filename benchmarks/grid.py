@@ -13,7 +13,6 @@ results/grid.json is written when no cell is missing, or with `--report`.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import sys
@@ -29,8 +28,9 @@ import torch
 from benchmarks.candidates import CANDIDATES
 from benchmarks.grid_report import report_of, show
 from benchmarks.report import RESULTS
+from benchmarks.rows import append, read_rows
 from benchmarks.rule import CHOICE, CONFIRMATION, SEEDS, Cell, cells_of
-from benchmarks.sites import Place, Settings, Site, possible
+from benchmarks.sites import Place, Settings, Site
 
 CHUNK = 50
 """Cells of one place that a worker takes at a time: whoever takes some first builds the place."""
@@ -41,50 +41,9 @@ QUICK_CELLS = (
 )  # fmt: skip
 
 
-class RowsError(ValueError):
-    """A file of rows that cannot be gone on with."""
-
-
-def read_rows(path: Path, run: dict[str, Any]) -> dict[Cell, dict[str, Any]]:
-    """The finished cells in a file that is made if there is none; a half-written last line is cut off.
-
-    Args:
-        run: what all rows must have in common, the first line of the file.
-    Raises:
-        RowsError: rows of another run, or a damaged line that is not the last.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = path.read_bytes() if path.exists() else b""
-    whole = content[: content.rfind(b"\n") + 1]
-    if len(whole) < len(content):
-        os.truncate(path, len(whole))
-    lines = whole.decode().splitlines()
-    if len(lines) == 0:
-        append(path, run)
-        return {}
-    found: list[dict[str, Any]] = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError as error:
-            raise RowsError(f"{path}, line {number} is no JSON ({error}); delete the line, or the file") from error
-    if found[0] != json.loads(json.dumps(run)):
-        raise RowsError(
-            f"{path} holds rows of another run, {json.dumps(found[0])[:300]}; expected {json.dumps(run)[:300]}; give "
-            "another file: --rows PATH"
-        )
-    return {Cell(*row["cell"]): row for row in found[1:]}
-
-
-def append(path: Path, row: dict[str, Any]) -> None:
-    """Adds a line in one piece, whoever else writes."""
-    line = (json.dumps(row) + "\n").encode()
-    file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    try:
-        written = os.write(file, line)
-        assert written == len(line), (written, len(line))
-    finally:
-        os.close(file)
+def finished(path: Path, run: dict[str, Any]) -> dict[Cell, dict[str, Any]]:
+    """The rows of the cells that are done; raises as `read_rows`."""
+    return {Cell(*row["cell"]): row for row in read_rows(path, run)}
 
 
 @lru_cache(maxsize=1)
@@ -96,15 +55,14 @@ def site_of(place: Place, settings: Settings) -> Site:
 def run_cells(cells: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, deadline: float) -> int:
     """Runs cells of one place until the deadline (`time.time`), and says how many."""
     torch.set_grad_enabled(False)
-    candidates = possible(CANDIDATES)
     for done, cell in enumerate(cells):
         if time.time() > deadline:
             return done
         site = site_of(Place.of(cell), settings)
         start = time.perf_counter()
-        found = [site.run(cell, seed, candidates) for seed in seeds]
+        found = [site.run(cell, seed, CANDIDATES) for seed in seeds]
         seconds = time.perf_counter() - start
-        values = {key: {one.name: [getattr(x[one.name], key) for x in found] for one in candidates}
+        values = {key: {one.name: [getattr(x[one.name], key) for x in found] for one in CANDIDATES}
                   for key in ("miou", "copied")}  # fmt: skip
         append(path, {"cell": list(cell), "seconds": round(seconds, 3), "voters": len(site.voters.truth), **values})
         print(f"{seconds:6.2f} s  {', '.join(cell)}", flush=True)
@@ -150,15 +108,15 @@ def main(arguments: argparse.Namespace) -> None:
     settings = Settings(**(asdict(QUICK) if arguments.quick else given) | {"device": device})
     scenes = ["demo"] if arguments.quick else arguments.scenes
     seeds = SEEDS[:2] if arguments.quick else SEEDS
-    names = [one.name for one in possible(CANDIDATES)]
+    names = [one.name for one in CANDIDATES]
     sizes = {key: value for key, value in asdict(settings).items() if key != "device"}
     cells = cells_to_run(scenes, arguments.quick)
-    rows = read_rows(arguments.rows, run := {"seeds": list(seeds), "candidates": names, **sizes})
+    rows = finished(arguments.rows, run := {"seeds": list(seeds), "candidates": names, **sizes})
     missing = [cell for cell in cells if cell not in rows]
     print(f"{len(cells)} cells of {len(seeds)} seeds, {len(cells) - len(missing)} of them done before", flush=True)
     deadline = start + 60 * arguments.minutes if arguments.minutes is not None else float("inf")
     run_all(missing, settings, seeds, arguments.rows, arguments.workers, deadline)
-    rows = {cell: row for cell, row in read_rows(arguments.rows, run).items() if cell in set(cells)}
+    rows = {cell: row for cell, row in finished(arguments.rows, run).items() if cell in set(cells)}
     spent = sum(row["seconds"] for row in rows.values())
     print(f"{len(rows)} of {len(cells)} cells done, {spent:.0f} s in cells so far, {time.time() - start:.0f} s now")
     if len(rows) == 0:

@@ -18,11 +18,7 @@ from benchmarks.rule import Cell, damage_of
 from benchmarks.second_room import second
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Evidence, lift, nearest_neighbors
-
-try:
-    from normlift_ns.core.consensus import agreed, region_overlaps, sampled_gaussians
-except ImportError:
-    agreed = region_overlaps = sampled_gaussians = None
+from normlift_ns.core.consensus import agreed, region_overlaps, sampled_gaussians
 
 NEIGHBORS = 36
 SAMPLE = 50
@@ -120,15 +116,9 @@ def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float])
     """F' of every power; the overlaps of regions are computed once."""
     if len(powers) == 0:
         return {}
-    assert sampled_gaussians and region_overlaps and agreed, "no consensus in this version"
     chosen, chance = sampled_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
     overlaps = region_overlaps(evidence.rows.select_rows(chosen), evidence.region_view, chance)
     return {power: agreed(features, overlaps, power) for power in powers}
-
-
-def possible(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Those that this version can run."""
-    return [one for one in candidates if one.consensus is None or agreed is not None]
 
 
 @lru_cache(maxsize=1)

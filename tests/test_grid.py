@@ -12,16 +12,17 @@ from benchmarks.ballots import _parts, results, voters_of
 from benchmarks.candidates import CANDIDATES, Candidate
 from benchmarks.damage import GROUP, LADDER, STEPS, Damage, observe
 from benchmarks.features import LENGTHS, as_features, mask_features, mixture_features, orthogonal_words, world_looks
-from benchmarks.grid import QUICK, RowsError, append, chunks, read_rows, run_cells
+from benchmarks.grid import QUICK, chunks, finished, run_cells
 from benchmarks.grid_report import report_of
 from benchmarks.pieces import KINDS, blurred, label_map, observe_pieces, pieces, shares_of
+from benchmarks.rows import RowsError, append, read_rows
 from benchmarks.rule import Cell, cells_of
 from benchmarks.second_room import parts, second, walk
-from benchmarks.sites import Place, possible
+from benchmarks.sites import Place
 from benchmarks.variants import lifted_scores, only, refined_scores
 from benchmarks.worlds import World, cell_evidence, made_words
-from normlift_ns import RefineConfig, lift, nearest_neighbors, refine
-from normlift_ns.core.ablations import variant_reliability
+from normlift_ns import RefineConfig, lift, nearest_neighbors
+from normlift_ns.core.ablations import variant_source
 from normlift_ns.core.metrics import classify
 from tests.scenes import generator, orbit, random_scene
 from tests.test_accuracy import CLASSES, WORDS, exact_maps
@@ -206,13 +207,15 @@ def test_votes_are_those_of_refine(world):
     lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)
     voters = voters_of(neighbors, world.truth, CLASSES)
     (part,) = _parts(lifted, voters, cosines=True)
-    config = RefineConfig(k=9, sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0)
-    names = {"plain_knn": "knn", "norm_only": "norm", "support_only": "support", "paper": "full"}
-    for name, variant in names.items():
-        reliability = variant_reliability(variant, lifted.scalars)
-        expected = refine(world.scene.means, lifted.directions, reliability, config, neighbors=neighbors)
-        (source,) = part.sources([Candidate(name)], 0.95, 0.4)
-        assert torch.equal(source, expected[voters.group[:, 0]].long()), name
+    for name in ("plain_knn", "norm_only", "support_only", "paper", "posterior"):
+        for delta in (0.0, 0.1):
+            vote = "posterior" if name == "posterior" else "paper"
+            config = RefineConfig(vote=vote, k=9, sigma_d=1.5, tau=0.95, gamma=0.4, delta=delta, prior=3.0)
+            expected = variant_source(
+                name, world.scene.means, lifted.directions, lifted.scalars, config, neighbors=neighbors
+            )
+            (source,) = part.sources([Candidate(name, sigma_d=1.5, delta=delta, prior=3.0)], 0.95, 0.4)
+            assert torch.equal(source, expected[voters.group[:, 0]].long()), (name, delta)
 
 
 def test_a_posterior_vote_is_the_formula(world):
@@ -243,8 +246,8 @@ def test_results_are_those_of_the_variants(world):
     voters = voters_of(neighbors, world.truth, CLASSES)
     found = results([Candidate(), Candidate("linear"), Candidate("paper")], lifted, voters, WORDS.classes)
     plain, counted = lifted_scores(lifted, WORDS.classes), voters.group[:, 0]
-    config = RefineConfig(k=9, sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0)
-    for name, variant in (("none", "none"), ("linear", "linear"), ("paper", "full")):
+    config = RefineConfig(vote="paper", k=9, sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0)
+    for name, variant in (("none", "none"), ("linear", "linear"), ("paper", "paper")):
         scores = refined_scores(variant, world.scene.means, lifted, plain, only(neighbors, counted), config)
         answer = classify(scores.cosine, scores.valid)[counted]
         truth = world.truth[counted]
@@ -257,13 +260,13 @@ def test_results_are_those_of_the_variants(world):
 
 def test_a_file_of_rows_is_gone_on_with(tmp_path):
     path, run = tmp_path / "some" / "rows.jsonl", {"seeds": [1, 2], "voters": None}
-    assert read_rows(path, run) == {}
+    assert finished(path, run) == {}
     cells = cells_of("demo")[:2]
     for cell in cells:
         append(path, {"cell": list(cell), "seconds": 1.0})
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"cell": ["demo", "masks", "cl')
-    assert list(read_rows(path, run)) == cells and path.read_bytes() == whole  # the damaged last line is gone
+    assert list(finished(path, run)) == cells and path.read_bytes() == whole  # the damaged last line is gone
     with pytest.raises(RowsError, match="another run"):
         read_rows(path, run | {"voters": 5})
     path.write_bytes(whole.replace(b'{"cell"', b"{cell", 1))
@@ -286,10 +289,10 @@ def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
     ]  # fmt: skip
     read_rows(path, {})
     assert run_cells(cells[:1], QUICK, (0, 1), path, 0.0) == 0  # past the deadline
-    assert read_rows(path, {}) == {}
+    assert finished(path, {}) == {}
     assert run_cells(cells[:2], QUICK, (0, 1), path, float("inf")) == 2
     assert run_cells(cells[2:], QUICK, (0, 1), path, float("inf")) == 1
-    rows, names = read_rows(path, {}), [one.name for one in possible(CANDIDATES)]
+    rows, names = finished(path, {}), [one.name for one in CANDIDATES]
     assert list(rows) == cells
     for row in rows.values():
         assert list(row["miou"]) == names == list(row["copied"]) and row["voters"] == 80
