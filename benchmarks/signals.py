@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from benchmarks.accuracy import SEEDS, mean_and_interval, scores_3d, worlds
+from benchmarks.accuracy import SEEDS, scores_3d, worlds
+from benchmarks.accuracy_report import mean_and_interval
 from benchmarks.damage import LADDER, observe
 from benchmarks.features import Lengths
 from benchmarks.report import RESULTS, Report
