@@ -28,7 +28,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.accuracy_report import AGREED, METHODS, THREE, summarize
+from benchmarks.accuracy_report import AGREED, METHODS, THREE, VOTES, summarize
 from benchmarks.damage import LADDER, STEPS, Damage, Observed, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.rows import append, read_rows
@@ -43,7 +43,7 @@ from benchmarks.variants import (
 )
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors, refine
-from normlift_ns.core.ablations import variant_config, variant_source
+from normlift_ns.core.ablations import Variant, variant_config, variant_source
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.metrics import class_scores, classify, confusion
 from normlift_ns.evaluation.signals import accuracy_bins
@@ -100,7 +100,7 @@ class Bench:
         row: dict[str, Any] = {}
         for method in METHODS:
             given = (agreed, lifted_scores(agreed, self.classes)) if method in AGREED else (lifted, plain)
-            scores, copied = self._refined(AGREED.get(method, method), *given)
+            scores, copied = self._refined(VOTES[method], *given)
             row[method] = scores_3d(world, scores, self.counted) | {"copied": copied}
             if others and not self.sampled:
                 row[method] |= scores_2d(world, scores)
@@ -119,7 +119,7 @@ class Bench:
             row[f"{name}_bins"] = [float(x) for x in accuracy_bins(key[known], correct[known])]
         return row
 
-    def _refined(self, variant: str, lifted: Lifted, plain: Scores) -> tuple[Scores, float]:
+    def _refined(self, variant: Variant, lifted: Lifted, plain: Scores) -> tuple[Scores, float]:
         """Scores after a variant, and the share of the counted Gaussians that copy."""
         means = self.world.scene.means
         if variant in ("none", "linear"):

@@ -23,7 +23,8 @@ AGREED: dict[str, Variant] = {
     "consensus": "none", "consensus_paper": "paper", "consensus_posterior": "posterior",
 }  # fmt: skip
 """What follows the consensus, by the method's name."""
-METHODS = (*VARIANTS, *AGREED)
+VOTES: dict[str, Variant] = {**{name: name for name in VARIANTS}, **AGREED}
+METHODS = tuple(VOTES)
 THREE = ", 3 views"
 """Ends the names of steps with 3 views."""
 PRESETS = ("preset_half", "preset_every_second_view")
@@ -57,7 +58,7 @@ def summarize(rows: list[dict[str, Any]], report: Report) -> None:
             for method in METHODS:
                 _add_mean(report, f"{prefix}ladder.{step}.{method}.miou", _by_seed(some, method, "miou"))
         for method in (name for name in METHODS if name != "paper"):
-            gains = np.subtract(_by_seed(ladder, "paper", "miou"), _by_seed(ladder, method, "miou"))
+            gains = _difference(ladder, "paper", method)
             _add_mean(report, f"{prefix}ablation.paper_minus_{method}.miou", gains)
         for method in (m for m in (*OTHERS, *PRESETS) if m in ladder[0]):
             group = "preset" if method in PRESETS else "baseline"
@@ -75,7 +76,11 @@ def _by_seed(rows: Sequence[dict[str, Any]], method: str, metric: str) -> list[f
     return [float(np.mean([row[method][metric] for row in rows if row["seed"] == seed])) for seed in seeds]
 
 
-def _add_mean(report: Report, key: str, values: Sequence[float] | np.ndarray) -> None:
+def _difference(rows: Sequence[dict[str, Any]], method: str, other: str) -> list[float]:
+    return [a - b for a, b in zip(_by_seed(rows, method, "miou"), _by_seed(rows, other, "miou"), strict=True)]
+
+
+def _add_mean(report: Report, key: str, values: Sequence[float]) -> None:
     mean, half = mean_and_interval(values)
     report.add(key, mean, "points")
     report.add(f"{key}_ci95", half, "points, half of the 95 % interval over seeds")
@@ -90,13 +95,13 @@ def _add_method(report: Report, key: str, rows: Sequence[dict[str, Any]], method
     """What the docs say of a method on some steps."""
     for metric in (name for name in rows[0][method] if name != "copied"):
         _add_mean(report, f"{key}.{metric}", _by_seed(rows, method, metric))
-    gains = np.subtract(_by_seed(rows, method, "miou"), _by_seed(rows, "none", "miou"))
+    gains = _difference(rows, method, "none")
     _add_mean(report, f"{key}.gain", gains)
     worst = min(rows, key=lambda row: row[method]["miou"] - row["none"]["miou"])
     where = f"{worst['scene']}, {worst['damage']}, seed {worst['seed']}"
     report.add(f"{key}.worst", worst[method]["miou"] - worst["none"]["miou"], f"points over none: {where}")
     report.add(f"{key}.share_worse", *_worse(rows, method))
-    report.add(f"{key}.copied", np.mean([row[method]["copied"] for row in rows]), "share of Gaussians")
+    report.add(f"{key}.copied", float(np.mean([row[method]["copied"] for row in rows])), "share of Gaussians")
 
 
 def _add_reliability(rows: list[dict[str, Any]], steps: Sequence[str], prefix: str, report: Report) -> None:

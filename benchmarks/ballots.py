@@ -43,10 +43,6 @@ class Voters:
     """[M]"""
     classes: int
 
-    def to(self, device: str) -> Voters:
-        """A copy on another device."""
-        return Voters(*(x.to(device) for x in (self.group, self.distance, self.truth)), self.classes)
-
 
 def voters_of(neighbors: Neighbors, truth: Tensor, classes: int, some: Tensor | None = None) -> Voters:
     """Those whose class is known, or some of them."""

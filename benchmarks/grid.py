@@ -18,7 +18,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,7 @@ def main(arguments: argparse.Namespace) -> None:
     start = time.time()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     given = {key: getattr(arguments, key) for key in ("voters", "gaussians", "views", "room_views", "pieces")}
-    settings = Settings(**(asdict(QUICK) if arguments.quick else given) | {"device": device})
+    settings = replace(QUICK if arguments.quick else Settings(**given), device=device)
     scenes = ["demo"] if arguments.quick else arguments.scenes
     seeds = SEEDS[:2] if arguments.quick else SEEDS
     names = [one.name for one in CANDIDATES]

@@ -77,7 +77,7 @@ def pieces(world: World, kind: str, count: int | None = None) -> Pieces:
         number = int(labels.max()) + 1
         shares = shares_of(labels, classes, number, world.classes)
         if kind == "patches":
-            shares = blurred(shares, patch_grid(*labels.shape, count))
+            shares = blurred(shares, patch_grid(labels.shape[0], labels.shape[1], count))
         local.append(labels)
         numbers.append(number)
         content.append(shares)

@@ -94,7 +94,7 @@ class Cell(NamedTuple):
         return self.damage == "noise only" and self.views == "all"
 
     @property
-    def count(self) -> int | None:
+    def limit(self) -> int | None:
         """Number of views, None for all."""
         return STEPS[FEW].views if self.damage == FEW else VIEWS[self.views]
 
@@ -114,7 +114,7 @@ def cells_of(scene: str) -> list[Cell]:
 
 def damage_of(cell: Cell) -> Damage:
     """The damage with the cell's number of views."""
-    return replace(STEPS[cell.damage], views=cell.count)
+    return replace(STEPS[cell.damage], views=cell.limit)
 
 
 Values = Mapping[str, Sequence[float]]

@@ -22,7 +22,7 @@ from benchmarks.sites import Place
 from benchmarks.variants import lifted_scores, only, refined_scores
 from benchmarks.worlds import World, cell_evidence, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors
-from normlift_ns.core.ablations import variant_source
+from normlift_ns.core.ablations import Variant, variant_source
 from normlift_ns.core.metrics import classify
 from tests.scenes import generator, orbit, random_scene
 from tests.test_accuracy import CLASSES, WORDS, exact_maps
@@ -247,8 +247,9 @@ def test_results_are_those_of_the_variants(world):
     found = results([Candidate(), Candidate("linear"), Candidate("paper")], lifted, voters, WORDS.classes)
     plain, counted = lifted_scores(lifted, WORDS.classes), voters.group[:, 0]
     config = RefineConfig(vote="paper", k=9, sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0)
-    for name, variant in (("none", "none"), ("linear", "linear"), ("paper", "paper")):
-        scores = refined_scores(variant, world.scene.means, lifted, plain, only(neighbors, counted), config)
+    names: tuple[Variant, ...] = ("none", "linear", "paper")
+    for name in names:
+        scores = refined_scores(name, world.scene.means, lifted, plain, only(neighbors, counted), config)
         answer = classify(scores.cosine, scores.valid)[counted]
         truth = world.truth[counted]
         ious = [
