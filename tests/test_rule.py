@@ -1,6 +1,7 @@
 """The rule for defaults, on made tables that hit every clause."""
 
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,12 +15,12 @@ CELLS = [cell for scene in CHOICE for cell in cells_of(scene)]
 ROOM = cells_of(CONFIRMATION)
 
 
-def table(cells=CELLS, **gains: Any):
+def table(cells=CELLS, **given: float | Callable[[Cell], float]):
     """Rows in which none has 50 points; a gain is a number or a function of the cell."""
-    gains = {**dict.fromkeys(NAMES[1:], 0.0), **gains}
+    gains: dict[str, Any] = {"one": 0.0, "two": 0.0, **given}
     return {
         cell: {"none": [48.0, 52.0]} | {
-            name: [50 + float(gain(cell) if callable(gain) else gain)] * 2 for name, gain in gains.items()
+            name: [50 + (gain(cell) if callable(gain) else gain)] * 2 for name, gain in gains.items()
         }
         for cell in cells
     }  # fmt: skip
