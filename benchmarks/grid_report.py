@@ -96,6 +96,8 @@ def show(report: Report, names: Sequence[str]) -> None:
     facts = ("mean", "gain", "gain_ci95", "undamaged", "three_views", "worst", "worse", "column", "copied")
     for group in ("choice", "second"):
         some = [name for name in names if f"{group}.{name}.mean" in values]
+        if len(some) == 0:
+            continue
         print(f"\n{group}, points of mIoU and shares\n{'':46}" + "".join(f"{fact[:9]:>10}" for fact in facts))
         for name in sorted(some, key=lambda name: -values[f"{group}.{name}.mean"].value):
             cells = "".join(f"{values[f'{group}.{name}.{fact}'].value:10.2f}" for fact in facts)

@@ -12,13 +12,13 @@ from benchmarks.ballots import _parts, results, voters_of
 from benchmarks.candidates import CANDIDATES, Candidate
 from benchmarks.damage import GROUP, LADDER, STEPS, Damage, observe
 from benchmarks.features import LENGTHS, as_features, mask_features, mixture_features, orthogonal_words, world_looks
-from benchmarks.grid import QUICK, chunks, finished, run_cells
+from benchmarks.grid import QUICK, QUICK_CELLS, chunks, finished, run_cells
 from benchmarks.grid_report import report_of
 from benchmarks.pieces import KINDS, blurred, label_map, observe_pieces, pieces, shares_of
 from benchmarks.rows import RowsError, append, read_rows
 from benchmarks.rule import Cell, cells_of
 from benchmarks.second_room import parts, second, walk
-from benchmarks.sites import Place
+from benchmarks.sites import Place, Site
 from benchmarks.variants import lifted_scores, only, refined_scores
 from benchmarks.worlds import World, cell_evidence, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors
@@ -311,6 +311,20 @@ def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
     assert values["column.kind.superpixels.paper.gain"].value == pytest.approx(
         sum(rows[cells[2]]["miou"]["paper"]) / 2 - sum(rows[cells[2]]["miou"]["none"]) / 2
     )
+
+
+@pytest.mark.gpu
+def test_a_gpu_finds_what_a_cpu_finds():
+    """But for cosines in half precision, and for pixels on the edges of masks."""
+    sizes = replace(QUICK, voters=None)
+    candidates = [one for one in CANDIDATES if one.delta == 0]
+    for cell in cells_of("second"):
+        if cell[1:4] in QUICK_CELLS and cell.views == "all":
+            on = {device: Site(Place.of(cell), replace(sizes, device=device)) for device in ("cpu", "cuda")}
+            found = {device: site.run(cell, 3, candidates) for device, site in on.items()}
+            for name, result in found["cpu"].items():
+                assert found["cuda"][name].miou == pytest.approx(result.miou, abs=1.5), (cell, name)
+                assert found["cuda"][name].copied == pytest.approx(result.copied, abs=0.03), (cell, name)
 
 
 @pytest.mark.slow
