@@ -313,7 +313,7 @@ def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
     )
 
 
-@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: it compares a GPU with a CPU")
 def test_a_gpu_finds_what_a_cpu_finds():
     """But for cosines in half precision, and for pixels on the edges of masks."""
     sizes = replace(QUICK, voters=None)
