@@ -17,10 +17,10 @@ ROOM = cells_of(CONFIRMATION)
 
 def table(cells=CELLS, **given: float | Callable[[Cell], float]):
     """Rows in which none has 50 points; a gain is a number or a function of the cell."""
-    gains: dict[str, Any] = {"one": 0.0, "two": 0.0, **given}
+    gains: dict[str, Any] = {"one": 0.0, "two": 0.0} | given
     return {
         cell: {"none": [48.0, 52.0]} | {
-            name: [50 + (gain(cell) if callable(gain) else gain)] * 2 for name, gain in gains.items()
+            name: [50 + float(gain(cell) if isinstance(gain, Callable) else gain)] * 2 for name, gain in gains.items()
         }
         for cell in cells
     }  # fmt: skip
