@@ -5,28 +5,34 @@
                                                       for CPUs: a sample votes and counts, half of the tabletop's views,
                                                       no 2D accuracy, no A^2 and top-k weights
     python -m benchmarks.accuracy --quick             demo room of 20,000 Gaussians, three steps of the ladder, 2 seeds
+    python -m benchmarks.accuracy --minutes 9         no new observation after so many minutes; the same command goes on
 
-Writes results/accuracy.json: means over seeds with 95 % intervals (Student's t), in points (per cent).
+Writes results/accuracy.json: means over seeds with 95 % intervals (Student's t), in points (per cent). Keys without a
+scene in front are of all scenes. `ablation` is the 13 steps of version 0.1's ladder, `undamaged` its step "noise only",
+`views3` its steps with 3 views, but for "few views"; each says of every method its mean, its gain over no refinement,
+the worst observation, the share of observations that are worse, and the share of Gaussians that copy. The steps that
+came later are in `ladder` alone. Every finished observation is one line of `--rows`.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
-from benchmarks.damage import LADDER, Damage, Observed, observe
+from benchmarks.accuracy_report import AGREED, METHODS, THREE, VOTES, summarize
+from benchmarks.damage import LADDER, STEPS, Damage, Observed, observe
 from benchmarks.report import RESULTS, Report
+from benchmarks.rows import append, read_rows
 from benchmarks.variants import (
-    VARIANTS,
     Scores,
     centre_evidence,
     lifted_scores,
@@ -37,14 +43,12 @@ from benchmarks.variants import (
 )
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors, refine
-from normlift_ns.core.metrics import class_scores, classify, confusion, spearman
+from normlift_ns.core.ablations import Variant, variant_config, variant_source
+from normlift_ns.core.consensus import consensus
+from normlift_ns.core.metrics import class_scores, classify, confusion
 from normlift_ns.evaluation.signals import accuracy_bins
 
 SEEDS = 8
-VARIES = 0.05
-"""Accuracy varies over bins of reliability if their means span at least this much."""
-PRESETS = ("preset_half", "preset_every_second_view")
-OTHERS = {"sfs": "A^2 weights", "occam": "centre pixels", "vala": "gated geometric median", "drsplat": "top-k rays"}
 
 
 def scores_2d(world: World, scores: Scores) -> dict[str, float]:
@@ -82,18 +86,26 @@ class Bench:
             self.others["sfs"] = replace(self.world, evidence=self.world.squared.to(device))
             self.others["drsplat"] = replace(self.world, evidence=top_evidence(self.world))
 
-    def run(self, damage: Damage, seed: int) -> dict[str, Any]:
-        """All variants and methods on one observation."""
+    def run(self, damage: Damage, seed: int, *, others: bool = True) -> dict[str, Any]:
+        """All methods on one observation.
+
+        Args:
+            others: with accuracy in 2D, presets, other methods and bins of reliability.
+        """
         world, known = self.world, self.world.truth >= 0
         observed = observe(world, self.words, damage, seed)
         lifted = lift(observed.evidence, observed.features)
         plain = lifted_scores(lifted, self.classes)
+        agreed = lift(observed.evidence, consensus(observed.evidence, observed.features).features)
         row: dict[str, Any] = {}
-        for variant in VARIANTS:
-            scores = refined_scores(variant, world.scene.means, lifted, plain, self.voting, self.config)
-            row[variant] = scores_3d(world, scores, self.counted)
-            if not self.sampled:
-                row[variant] |= scores_2d(world, scores)
+        for method in METHODS:
+            given = (agreed, lifted_scores(agreed, self.classes)) if method in AGREED else (lifted, plain)
+            scores, copied = self._refined(VOTES[method], *given)
+            row[method] = scores_3d(world, scores, self.counted) | {"copied": copied}
+            if others and not self.sampled:
+                row[method] |= scores_2d(world, scores)
+        if not others:
+            return row
         if not self.sampled:
             row |= self._presets(observed, lifted, plain)
         row["vala"] = scores_3d(
@@ -104,8 +116,18 @@ class Bench:
             row[name] = scores_3d(world, lifted_scores(lift(seen.evidence, seen.features), self.classes), self.counted)
         correct = classify(plain.cosine, plain.valid) == world.truth
         for name, key in (("reliability", lifted.scalars.reliability), ("norm", lifted.scalars.norm)):
-            row[f"{name}_bins"] = accuracy_bins(key[known], correct[known])
+            row[f"{name}_bins"] = [float(x) for x in accuracy_bins(key[known], correct[known])]
         return row
+
+    def _refined(self, variant: Variant, lifted: Lifted, plain: Scores) -> tuple[Scores, float]:
+        """Scores after a variant, and the share of the counted Gaussians that copy."""
+        means = self.world.scene.means
+        if variant in ("none", "linear"):
+            return refined_scores(variant, means, lifted, plain, self.voting, self.config), 0.0
+        config = variant_config(variant, self.config)
+        source = variant_source(variant, means, lifted.directions, lifted.scalars, config, neighbors=self.voting).long()
+        copied = float((source[self.counted] != self.counted).float().mean())
+        return Scores(plain.cosine[source], plain.valid[source]), copied
 
     def _presets(self, observed: Observed, lifted: Lifted, plain: Scores) -> dict[str, Any]:
         """The full variant by faster lifts, as in `benchmarks.presets`."""
@@ -132,95 +154,52 @@ def worlds(quick: bool, names: Sequence[str], views: int | None = None) -> Itera
         yield world, made_words(world.classes)
 
 
-def run_all(
-    quick: bool, names: Sequence[str], views: int | None, voters: int | None, seeds: int, device: str
-) -> list[dict[str, Any]]:
-    """One row per scene, damage and seed."""
-    ladder = {name: LADDER[name] for name in (("mild", "few views", "hard") if quick else LADDER)}
-    rows = []
-    for world, words in worlds(quick, names, views):
+def steps_to_run(quick: bool) -> dict[str, Damage]:
+    """Damages by name: the ladder, what came after it, and the ladder with 3 views."""
+    if quick:
+        return {name: LADDER[name] for name in ("mild", "few views", "hard")}
+    fewer = {name + THREE: replace(damage, views=3) for name, damage in LADDER.items() if name != "few views"}
+    return STEPS | fewer
+
+
+def run_all(arguments: argparse.Namespace, seeds: int, voters: int | None, deadline: float) -> list[dict[str, Any]]:
+    """One row per scene, damage and seed, until the deadline (`time.time`)."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    steps, path = steps_to_run(arguments.quick), arguments.rows
+    run = {"seeds": seeds, "voters": voters, "views": arguments.views, "quick": arguments.quick}
+    rows = read_rows(path, run)
+    done = {(row["scene"], row["damage"], row["seed"]) for row in rows}
+    for world, words in worlds(arguments.quick, arguments.scenes, arguments.views):
         for floaters in (False, True):
-            steps = {name: damage for name, damage in ladder.items() if damage.floaters == floaters}
-            if len(steps) == 0:
+            missing = [
+                (seed, name) for seed in range(seeds) for name, damage in steps.items()
+                if damage.floaters == floaters and (world.name, name, seed) not in done
+            ]  # fmt: skip
+            if len(missing) == 0 or time.time() > deadline:
                 continue
             bench = Bench(with_floaters(world) if floaters else world, words, voters, device, RefineConfig())
-            for seed in range(seeds):
-                for name, damage in steps.items():
-                    rows.append({"scene": world.name, "damage": name, "seed": seed, **bench.run(damage, seed)})
-                    shown = " ".join(f"{v} {rows[-1][v]['miou']:.1f}" for v in VARIANTS)
-                    print(f"{world.name}, {name}, seed {seed}: {shown}", flush=True)
+            for seed, name in missing:
+                if time.time() > deadline:
+                    break
+                found = bench.run(steps[name], seed, others=name in LADDER)
+                rows.append({"scene": world.name, "damage": name, "seed": seed, **found})
+                append(path, rows[-1])
+                shown = " ".join(f"{method} {found[method]['miou']:.1f}" for method in METHODS)
+                print(f"{world.name}, {name}, seed {seed}: {shown}", flush=True)
     return rows
-
-
-def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean over seeds and half the width of its 95 % interval."""
-    n = len(values)
-    half = stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / n**0.5 if n > 1 else float("nan")
-    return float(np.mean(values)), float(half)
-
-
-def summarize(rows: list[dict[str, Any]], report: Report) -> None:
-    """Means over the ladder and per step, with intervals; keys of the tabletop (or the only scene) have no prefix."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    for scene in scenes:
-        prefix = "" if scene == scenes[0] else f"{scene}."
-        of_scene = [row for row in rows if row["scene"] == scene]
-        steps = list(dict.fromkeys(row["damage"] for row in of_scene))
-        seeds = sorted({row["seed"] for row in of_scene})
-        methods = [m for m in (*VARIANTS, *OTHERS, *PRESETS) if m in of_scene[0]]
-
-        def value(method: str, metric: str, seed: int, steps: Sequence[str], rows: list = of_scene) -> float:
-            """Mean over steps of the ladder of one seed."""
-            return float(np.mean([r[method][metric] for r in rows if r["seed"] == seed and r["damage"] in steps]))
-
-        def add(key: str, values: Sequence[float], prefix: str = prefix) -> None:
-            mean, half = mean_and_interval(values)
-            report.add(prefix + key, mean, "points")
-            report.add(f"{prefix}{key}_ci95", half, "points, half of the 95 % interval over seeds")
-
-        for method in methods:
-            group = "ablation" if method in VARIANTS else "preset" if method in PRESETS else "baseline"
-            name = method.removeprefix("preset_")
-            for metric in of_scene[0][method]:
-                add(
-                    f"{group}.{name}.{metric}",
-                    [value(method, metric, s, steps) for s in seeds],
-                )
-            for step in steps if group == "ablation" else ():
-                add(f"ladder.{step}.{name}.miou", [value(method, "miou", s, [step]) for s in seeds])
-        for method in (variant for variant in VARIANTS if variant != "paper"):
-            pairs = [value("paper", "miou", s, steps) - value(method, "miou", s, steps) for s in seeds]
-            add(f"ablation.paper_minus_{method}.miou", pairs)
-        _add_reliability(of_scene, steps, prefix, report)
-
-
-def _add_reliability(rows: list[dict[str, Any]], steps: Sequence[str], prefix: str, report: Report) -> None:
-    """Spearman between ten bins by R (or ||f||) and their accuracy, means over seeds, per step of the ladder."""
-    varying = {"reliability": [], "norm": []}
-    for step in steps:
-        for name, found in varying.items():
-            bins = np.mean([row[f"{name}_bins"] for row in rows if row["damage"] == step], axis=0)
-            value = spearman(torch.arange(10.0), torch.from_numpy(bins))
-            report.add(f"{prefix}{name}.{step}.spearman_bins", value, "Spearman, ten bins")
-            if name == "reliability":
-                report.add(f"{prefix}{name}.{step}.lowest_bin", 100 * bins[0], "points, accuracy of the lowest tenth")
-                report.add(
-                    f"{prefix}{name}.{step}.highest_bin", 100 * bins[-1], "points, accuracy of the highest tenth"
-                )
-            if np.ptp(bins) >= VARIES:
-                found.append(value)
-    for name, found in varying.items():
-        if len(found) > 0:
-            mean = float(np.mean(found))
-            report.add(f"{prefix}{name}.spearman_bins_mean", mean, "mean over steps where accuracy varies")
 
 
 def main(arguments: argparse.Namespace) -> None:
     torch.set_grad_enabled(False)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    start = time.time()
     seeds = 2 if arguments.quick else arguments.seeds
     voters = 4000 if arguments.quick and arguments.voters is None else arguments.voters
-    rows = run_all(arguments.quick, arguments.scenes, arguments.views, voters, seeds, device)
+    deadline = float("inf") if arguments.minutes is None else start + 60 * arguments.minutes
+    rows = run_all(arguments, seeds, voters, deadline)
+    scenes = [name for name in arguments.scenes if name == "demo" or not arguments.quick]
+    expected = len(scenes) * len(steps_to_run(arguments.quick)) * seeds
+    if len(rows) < expected:
+        sys.exit(f"{len(rows)} of {expected} observations are done; the same command goes on")
     report = Report("accuracy")
     report.add("voters", -1 if voters is None else voters, "Gaussians per scene that count; -1: all")
     report.add("seeds", seeds, "repeats")
@@ -236,5 +215,7 @@ if __name__ == "__main__":
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="repeats")
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
+    parser.add_argument("--minutes", type=float, help="no observation begins later than this")
+    parser.add_argument("--rows", type=Path, default=RESULTS / "accuracy_rows.jsonl", help="finished observations")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

@@ -35,6 +35,11 @@ def trained_scene(name: str) -> GaussianScene:
     return GaussianScene(means, quats, scales.exp(), opacities.sigmoid().squeeze(-1))
 
 
+def base_colors(name: str) -> torch.Tensor:
+    """[N, 3] sRGB of a splatfacto checkpoint, the same from all sides."""
+    return (0.5 + 0.28209479177387814 * trained_state(name)["gauss_params.features_dc"]).clamp(0, 1)
+
+
 def training_indices(name: str) -> list[int]:
     """Frames, in order of their names, that nerfstudio's 90 % split trains on."""
     count = len(json.loads((SHARED / "captures" / name / "transforms.json").read_text())["frames"])

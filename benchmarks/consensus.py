@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from benchmarks import damage as damages
-from benchmarks.accuracy import mean_and_interval, scores_3d, worlds
+from benchmarks.accuracy import scores_3d, worlds
+from benchmarks.accuracy_report import mean_and_interval
 from benchmarks.damage import LADDER, Damage, Observed, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import Scores, lifted_scores, only, refined_scores

@@ -1,10 +1,8 @@
-"""2D features as CLIP gives them, and a ladder of damage to masks and features; pure functions with a seed.
+"""A ladder of damage to masks and their features, with the observation that a lift gets; pure functions with a seed.
 
-The feature of a mask is normalise(t + C c + O o + N n): t the text vector of its class, c one direction that all image
-features share (the modality gap), o a direction of the object's own, n noise of this mask in this view, that follows
-the covariance of text vectors, so that it is confusion rather than static. c and o are orthogonal to the classes. With
-the default lengths C, O and N one object in two views has cosine 0.83, two objects 0.64, image and own text 0.34,
-another text 0.25.
+What features are made of stands in `benchmarks.features`. `LADDER` is version 0.1's 13 steps, whose numbers do not
+change: what later steps draw comes from a generator of their own. `STEPS` adds two whose mistakes are not independent
+from mask to mask.
 """
 
 from __future__ import annotations
@@ -16,8 +14,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from benchmarks.features import Lengths, Looks, mask_features, mask_looks, mistaken
 from benchmarks.worlds import Cells, Words, World, block_side
 from normlift_ns import Evidence
+
+LATER = 2**20
+"""Added to the seed of what the steps after version 0.1's draw, so that the others keep their numbers."""
+GROUP = (3, 6)
+"""Fewest and most things that share one mask in a view of damage `grouped`."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,11 @@ class Damage:
     """Factor on the weight of one random view of every five, as if their images had so many times the pixels."""
     floaters: bool = False
     """The scene has 5 % more Gaussians floating before the cameras; see `worlds.with_floaters`."""
+    grouped: float = 0.0
+    """Share of the views in which 3 to 6 of the things in sight, those whose masks are nearest to a random one of them,
+    share one mask; the largest gives the class."""
+    arc: float = 0.0
+    """Every object has one wrong class, the same over this share of all views: neighbours by azimuth around it."""
 
 
 MILD = Damage(wrong=0.1, merged=0.1, dropped=0.1, boundary=0.15)
@@ -65,14 +74,8 @@ LADDER = {
     "floaters": replace(MILD, floaters=True),
     "hard": Damage(2.0, wrong=0.3, merged=0.2, dropped=0.25, boundary=0.35, shifted=0.4),
 }
-
-
-@dataclass(frozen=True)
-class Lengths:
-    """Of the parts of a feature, beside a text vector of length 1."""
-
-    common: float = 2.2
-    own: float = 1.2
+"""Version 0.1's."""
+STEPS = LADDER | {"group": replace(MILD, grouped=0.4), "arc": replace(MILD, arc=0.4)}
 
 
 class Observed(NamedTuple):
@@ -86,24 +89,39 @@ class Observed(NamedTuple):
     views: list[int]
 
 
-def observe(world: World, words: Words, damage: Damage, seed: int, lengths: Lengths | None = None) -> Observed:
-    """Masks and features of the world after the damage. The same arguments give the same result on any device."""
-    g = torch.Generator().manual_seed(seed)
+def observe(world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | None = None) -> Observed:
+    """Masks and features of the world after the damage. The same arguments give the same result on any device.
+
+    Args:
+        words: what features are made of; with `Looks` they are histograms of what the damaged masks show.
+        lengths: of the parts of features that are made of words.
+    """
+    g, later = (torch.Generator().manual_seed(seed + more) for more in (0, LATER))
     cells = world.cells
     label = masks_of_cells(cells, world.classes, damage, g)
     size = torch.bincount(_key(cells.view, label, world.classes)[label >= 0], minlength=len(cells.maps) * world.classes)
-    joined, dropped = _merge_and_drop(size.view(-1, world.classes), damage, g)
+    size = size.view(-1, world.classes)
+    joined, dropped = _merge_and_drop(size, damage, g)
+    if damage.grouped > 0:
+        joined = _grouped(cells, label, size, damage, later).gather(1, joined)
     half = _halves(cells, label, world.classes, damage, g)
     final = torch.where(label >= 0, joined[cells.view, label.clamp(min=0)], -1)
     gone = (final < 0) | dropped[cells.view, final.clamp(min=0)]
-    chosen = _choose_views(len(cells.maps), damage, g)
+    chosen = choose_views(len(cells.maps), damage, g)
     keep = torch.zeros(len(cells.maps), dtype=torch.bool)
     keep[chosen] = True
     key = torch.where(gone, -1, _key(cells.view, final, world.classes) * 2 + half)
     present, index = key[keep[cells.view]].unique(return_inverse=True)
     index = index - int(len(present) > 0 and int(present[0]) < 0)
     present = present[present >= 0]
-    features = _features(present // 2 % world.classes, words, damage, lengths or Lengths(), g)
+    masks, view = present // 2 % world.classes, present // (2 * world.classes)
+    forced = _arc(world, words.classes, damage, later)[view, masks] if damage.arc > 0 else torch.full_like(masks, -1)
+    if isinstance(words, Looks):
+        whole = torch.full((len(cells.view),), -1)
+        whole[keep[cells.view]] = index
+        features = mask_looks(words, whole, masks, forced, damage.wrong, g)
+    else:
+        features = mask_features(words, masks, forced, damage.wrong, damage.noise, lengths or Lengths(), g)
     evidence = world.evidence
     if damage.dominant > 1:
         evidence = _weighted(evidence, _factors(len(cells.maps), damage, g).to(evidence.rows.weight))
@@ -111,7 +129,7 @@ def observe(world: World, words: Words, damage: Damage, seed: int, lengths: Leng
         evidence = evidence.select_views(chosen)
     renumbered = torch.full((len(cells.maps),), -1)
     renumbered[chosen] = torch.arange(len(chosen))
-    region_view = renumbered[present // (2 * world.classes)].int()
+    region_view = renumbered[view].int()
     columns = index[None]
     return Observed(evidence.regroup(columns, region_view), features.to(world.scene.means.device), columns, chosen)
 
@@ -150,6 +168,33 @@ def _merge_and_drop(size: Tensor, damage: Damage, g: torch.Generator) -> tuple[T
     return partner, torch.rand(views, classes, generator=g) < damage.dropped
 
 
+def _grouped(cells: Cells, label: Tensor, size: Tensor, damage: Damage, g: torch.Generator) -> Tensor:
+    """[V, K] what every mask becomes part of."""
+    views, classes = size.shape
+    partner = torch.arange(classes).repeat(views, 1)
+    key, there = _key(cells.view, label.clamp(min=0), classes), (label >= 0).float()
+    middle = torch.zeros(views * classes, 2).index_add_(0, key, cells.centre * there[:, None])
+    middle = (middle / size.view(-1, 1).clamp(min=1)).view(views, classes, 2)
+    for view in torch.randperm(views, generator=g)[: round(damage.grouped * views)].tolist():
+        things = (size[view] > 0).nonzero().squeeze(1)
+        count = int(torch.randint(GROUP[0], GROUP[1] + 1, (), generator=g))
+        first = int(torch.randint(0, max(1, len(things)), (), generator=g))
+        if len(things) >= GROUP[0]:
+            far = (middle[view, things] - middle[view, things[first]]).norm(dim=1)
+            group = things[far.argsort()[:count]]
+            partner[view, group] = group[size[view, group].argmax()]
+    return partner
+
+
+def _arc(world: World, classes: Tensor, damage: Damage, g: torch.Generator) -> Tensor:
+    """[V, K] wrong class of every object in the views of its arc, -1 in the others."""
+    rank = world.azimuth_rank
+    views = len(rank)
+    start = torch.randint(0, views, (world.classes,), generator=g)
+    wrong = mistaken(torch.arange(world.classes), classes, g)
+    return torch.where((rank - start) % views < round(damage.arc * views), wrong, -1)
+
+
 def _halves(cells: Cells, label: Tensor, classes: int, damage: Damage, g: torch.Generator) -> Tensor:
     """[C] 0 or 1: side of the cut of its mask that a cell lies on."""
     views = len(cells.maps)
@@ -161,25 +206,12 @@ def _halves(cells: Cells, label: Tensor, classes: int, damage: Damage, g: torch.
     return (((cells.centre - middle[key]) * across[key]).sum(1) > 0).long() * cut[key]
 
 
-def _choose_views(views: int, damage: Damage, g: torch.Generator) -> list[int]:
+def choose_views(views: int, damage: Damage, g: torch.Generator) -> list[int]:
+    """The views that are used, in order."""
     if damage.views is None:
         return list(range(views))
     start = int(torch.randint(0, views, (), generator=g))
     return sorted({(start + i * views // damage.views) % views for i in range(damage.views)})
-
-
-def _features(masks: Tensor, words: Words, damage: Damage, lengths: Lengths, g: torch.Generator) -> Tensor:
-    """[S, D] unit features of masks of the given classes."""
-    classes, others = words.classes, words.others
-    basis = torch.linalg.qr(classes.T).Q
-    random = torch.randn(len(classes) + 1, classes.shape[1], generator=g)
-    free = normalize(random - random @ basis @ basis.T, dim=1)
-    near = torch.softmax(20 * (classes @ classes.T).fill_diagonal_(-torch.inf), dim=1)
-    mistaken = torch.multinomial(near[masks], 1, generator=g).squeeze(1) if len(masks) > 0 else masks
-    shown = torch.where(torch.rand(len(masks), generator=g) < damage.wrong, mistaken, masks)
-    noise = normalize(torch.randn(len(masks), len(others), generator=g) @ (others - others.mean(0)), dim=1)
-    mixed = classes[shown] + lengths.common * free[-1] + lengths.own * free[masks] + damage.noise * noise
-    return normalize(mixed, dim=1)
 
 
 def _factors(views: int, damage: Damage, g: torch.Generator) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import nan
@@ -17,7 +17,11 @@ TITLES = {
     "linear": "linear averaging",
     "norm_only": "norm only",
     "support_only": "support only",
-    "full": "full",
+    "paper": "the paper's vote",
+    "posterior": "own evidence",
+    "consensus": "consensus",
+    "consensus_paper": "consensus, the paper's vote",
+    "consensus_posterior": "consensus, own evidence",
 }
 PRESETS = {
     "exact": "float64 (--precision double)",
@@ -65,11 +69,18 @@ def documents() -> Documents:
     """All results files that the pages speak of, by their names."""
     names = (
         "cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu",
-        "overhead",
+        "overhead", "grid",
     )  # fmt: skip
     return {name: read(RESULTS / f"{name}.json") for name in names}
 
 
 def steps(accuracy: Document) -> list[str]:
     """Names of the steps of the ladder of damage."""
-    return [k.split(".")[1] for k in accuracy.values if k.startswith("ladder.") and k.endswith(".full.miou")]
+    start, end = "tabletop.ladder.", ".paper.miou"
+    return [k.removeprefix(start).removesuffix(end) for k in accuracy.values if k.startswith(start) and k.endswith(end)]
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(cells) + " |" for cells in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]]) + "\n"

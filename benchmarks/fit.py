@@ -25,7 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.accuracy import mean_and_interval, worlds
+from benchmarks.accuracy import worlds
+from benchmarks.accuracy_report import mean_and_interval
 from benchmarks.damage import LADDER, Damage, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import Scores, lifted_scores

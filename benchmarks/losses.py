@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.accuracy import mean_and_interval
+from benchmarks.accuracy_report import mean_and_interval
 from benchmarks.damage import LADDER, Observed, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import Scores, lifted_scores

@@ -60,11 +60,14 @@ def plot_accuracy(document: Document, target: Path) -> Path:
     mpl.rcParams["svg.hashsalt"] = "accuracy"
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     axes = figure.subplots()
-    for i, name in enumerate(TITLES):
-        values = [document.values[f"ladder.{step}.{name}.miou"] for step in names]
-        bars = [document.values[f"ladder.{step}.{name}.miou_ci95"] for step in names]
-        places = [x + 0.13 * (i - 2.5) for x in range(len(names))]
-        axes.bar(places, values, 0.13, yerr=bars, label=TITLES[name], error_kw={"linewidth": 0.6})
+    start = "tabletop.ladder"
+    methods = [name for name in TITLES if f"{start}.{names[0]}.{name}.miou" in document.values]
+    width = 0.8 / len(methods)
+    for i, name in enumerate(methods):
+        values = [document.values[f"{start}.{step}.{name}.miou"] for step in names]
+        bars = [document.values[f"{start}.{step}.{name}.miou_ci95"] for step in names]
+        places = [x + width * (i - (len(methods) - 1) / 2) for x in range(len(names))]
+        axes.bar(places, values, width, yerr=bars, label=TITLES[name], error_kw={"linewidth": 0.6})
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_ylabel("mIoU over Gaussians, points")
     axes.legend(fontsize=8, ncols=3)

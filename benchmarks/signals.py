@@ -19,8 +19,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from benchmarks.accuracy import SEEDS, mean_and_interval, scores_3d, worlds
-from benchmarks.damage import LADDER, Lengths, observe
+from benchmarks.accuracy import SEEDS, scores_3d, worlds
+from benchmarks.accuracy_report import mean_and_interval
+from benchmarks.damage import LADDER, observe
+from benchmarks.features import Lengths
 from benchmarks.report import RESULTS, Report
 from benchmarks.variants import lifted_scores, refined_scores
 from benchmarks.worlds import Words, World

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from benchmarks.accuracy import OTHERS
-from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps
+from benchmarks.accuracy_report import OTHERS
+from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps, table
+from benchmarks.grid_tables import columns, verdicts
 from benchmarks.hard_case import DOUBLE, QUANTITIES
 from benchmarks.numerics import CASES
 from benchmarks.signals import STEP
 
-PREFIXES = {"tabletop": "", "demo": "demo."}
+PREFIXES = {"tabletop": "tabletop.", "demo": "demo."}
 """Prefix of the keys of accuracy.json, by scene."""
 FLAGS = {
     "exact": "`--precision double`", "float32": "default", "half_resolution": "`--lift-downscale 2`",
@@ -23,7 +22,10 @@ def tables(found: Documents) -> dict[str, str]:
     accuracy, fit, signals, h100 = (found[name] for name in ("accuracy", "fit", "signals", "h100"))
     return {
         **{f"origin-{name}": f"`{one.command}` on {one.hardware}.\n" for name, one in found.items()},
-        **{f"ablation-{scene}": ablation(accuracy, scene) for scene in PREFIXES},
+        "ablation-both": ablation(accuracy, "both scenes", "", others=False),
+        "undamaged": ablation(accuracy, "undamaged", "", "undamaged", others=False),
+        "views3": ablation(accuracy, "3 views", "", "views3", others=False),
+        **{f"ablation-{scene}": ablation(accuracy, scene, prefix) for scene, prefix in PREFIXES.items()},
         **{f"damage-{scene}": damage(accuracy, scene) for scene in PREFIXES},
         **{f"reliability-{scene}": reliability(accuracy, scene) for scene in PREFIXES},
         "evidence": evidence(signals),
@@ -41,39 +43,43 @@ def tables(found: Documents) -> dict[str, str]:
         "numerics-cases": numerics_cases(),
         "numerics-errors": numerics_errors(found["numerics"], found["numerics_gpu"]),
         "overhead": overhead(found["overhead"]),
+        "grid-choice": verdicts(found["grid"], "choice"),
+        "grid-second": verdicts(found["grid"], "second"),
+        "grid-columns": columns(found["grid"]),
     }
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(cells) + " |" for cells in (header, *rows)]
-    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]]) + "\n"
-
-
-def ablation(accuracy: Document, scene: str) -> str:
-    """Means over the ladder of damage."""
-    prefix, rows = PREFIXES[scene], []
-    for name, label in TITLES.items():
-        key = f"{prefix}ablation.{name}"
-        gain = "" if name == "full" else accuracy.interval(f"{prefix}ablation.full_minus_{name}.miou")
-        rows.append((label, *(accuracy.interval(f"{key}.{c}") for c in ("miou", "macc", "miou_2d")), gain))
-    for name, label in OTHERS.items():
+def ablation(accuracy: Document, label: str, prefix: str, group: str = "ablation", *, others: bool = True) -> str:
+    """Means over steps of damage, and beside them the worst observation and what is copied."""
+    v, rows = accuracy.values, []
+    for name, title in TITLES.items():
+        key = f"{prefix}{group}.{name}"
+        if f"{key}.miou" not in v:
+            continue
+        scores = (accuracy.interval(f"{key}.{c}") for c in ("miou", "macc", "miou_2d"))
+        worst = f"{v[f'{key}.worst']:+.1f}" if f"{key}.worst" in v and name != "none" else ""
+        shares = (f"{100 * v[f'{key}.{x}']:.0f} %" if f"{key}.{x}" in v else "" for x in ("share_worse", "copied"))
+        gain = accuracy.interval(f"{key}.gain") if name != "none" else ""
+        rows.append((title, *scores, gain, worst, *shares))
+    for name, title in OTHERS.items() if others else ():
         key = f"{prefix}baseline.{name}"
-        rows.append((f"*{label}*", accuracy.interval(f"{key}.miou"), accuracy.interval(f"{key}.macc"), "", ""))
-    return table((scene, "mIoU", "mAcc", "mIoU in held-out views", "full is better by"), rows)
+        rows.append((f"*{title}*", accuracy.interval(f"{key}.miou"), accuracy.interval(f"{key}.macc"), *[""] * 5))
+    header = ("mIoU", "mAcc", "mIoU in held-out views", "better than without", "worst", "worse by > 1", "copied")
+    return table((label, *header), rows)
 
 
 def damage(accuracy: Document, scene: str) -> str:
     """mIoU of every variant on every step."""
     start = f"{PREFIXES[scene]}ladder"
-    rows = [(step, *(accuracy.interval(f"{start}.{step}.{name}.miou") for name in TITLES)) for step in steps(accuracy)]
-    return table((f"{scene}, mIoU", *TITLES.values()), rows)
+    names = [name for name in TITLES if f"{start}.{steps(accuracy)[0]}.{name}.miou" in accuracy.values]
+    rows = [(step, *(accuracy.interval(f"{start}.{step}.{name}.miou") for name in names)) for step in steps(accuracy)]
+    return table((f"{scene}, mIoU", *(TITLES[name] for name in names)), rows)
 
 
 def reliability(accuracy: Document, scene: str) -> str:
     """How well R and the norm rank accuracy."""
     v, prefix, rows = accuracy.values, PREFIXES[scene], []
-    for step in steps(accuracy):
+    for step in (step for step in steps(accuracy) if f"{prefix}reliability.{step}.lowest_bin" in v):
         low, high = (v[f"{prefix}reliability.{step}.{end}_bin"] for end in ("lowest", "highest"))
         ranks = (f"{v[f'{prefix}{name}.{step}.spearman_bins']:.2f}" for name in ("reliability", "norm"))
         rows.append((step, *ranks, f"{low:.0f} to {high:.0f} %"))
@@ -105,9 +111,9 @@ def opacity(signals: Document) -> str:
 
 def views(signals: Document) -> str:
     """mIoU by number of views, before and after the vote."""
-    counts = [k.split(".")[:3:2] for k in signals.values if ".views." in k and k.endswith(".full.miou")]
+    counts = [k.split(".")[:3:2] for k in signals.values if ".views." in k and k.endswith(".paper.miou")]
     rows = [
-        (f"{scene}, {n}", *(signals.interval(f"{scene}.views.{n}.{x}.miou") for x in ("none", "full")))
+        (f"{scene}, {n}", *(signals.interval(f"{scene}.views.{n}.{x}.miou") for x in ("none", "paper")))
         for scene, n in counts
     ]
     return table(("views", "before", "after"), rows)
@@ -152,7 +158,7 @@ def presets(document: Document, accuracy: Document, losses: Document) -> str:
     for name, label in PRESETS.items():
         seconds, memory = f"{v[f'{name}.s']:.3g} s", f"{v[f'{name}.peak_gib']:.2f} GiB"
         error, other = f"{v[f'{name}.rms_error']:.2g}", f"{100 * v[f'{name}.other_share']:.2g} %"
-        key = "ablation.full.miou" if name == "float32" else f"preset.{name}.miou"
+        key = "tabletop." + ("ablation.paper.miou" if name == "float32" else f"preset.{name}.miou")
         task = (accuracy.interval(key), losses.interval(name, 2))
         rows.append((label, FLAGS.get(name, "benchmark only"), seconds, memory, error, other, *task))
     header = ("preset", "how", "time", "peak memory", "RMS error", "directions off by > 0.1", "mIoU, tabletop")

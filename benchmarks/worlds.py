@@ -17,12 +17,12 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from benchmarks.captures import SHARED, all_cameras, trained_scene, training_indices
+from benchmarks.captures import SHARED, all_cameras, base_colors, trained_scene, training_indices
 from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
 from normlift_ns.core.evidence import MASKED
 from normlift_ns.core.metrics import NO_CLASS
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.demo import demo_cameras, demo_room, held_out_cameras, view_labels
+from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras, view_labels
 from normlift_ns.encoders.source import joint_partition
 
 BLOCKS = 40
@@ -68,6 +68,8 @@ class World:
     held_out: list[Camera]
     held_out_maps: Tensor
     """[V', H, W] exact masks."""
+    colors: Tensor | None = None
+    """[N, 3] sRGB in 0..1, of the picture that a region's look is taken from."""
 
     @cached_property
     def squared(self) -> Evidence:
@@ -84,6 +86,18 @@ class World:
             labels.append(torch.where(chosen, chosen.flatten().cumsum(0).view_as(classes) - 1, MASKED).int())
             truth.append(classes[chosen])
         return rasterize_evidence(self.scene, self.held_out, labels).rows, torch.cat(truth)
+
+    @cached_property
+    def azimuth_rank(self) -> Tensor:
+        """[V, K] place of every training camera in the order of their azimuths around each object, z up."""
+        eyes = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in self.cameras])
+        means, truth, ranks = self.scene.means.double().cpu(), self.truth.cpu(), []
+        for c in range(self.classes):
+            of_class = truth == c
+            middle = means[of_class].mean(0) if bool(of_class.any()) else eyes.mean(0)
+            beside = eyes - middle
+            ranks.append(torch.atan2(beside[:, 1], beside[:, 0]).argsort().argsort())
+        return torch.stack(ranks, dim=1)
 
     def to(self, device: str) -> World:
         """Tensors of the lift on another device."""
@@ -147,19 +161,27 @@ def tabletop(views: int | None = None) -> World:
     truth = truth_of(evidence, cells, 12)
     return World(
         "tabletop", scene, [cameras[i] for i in train], evidence, cells, truth, 12,
-        [cameras[i] for i in held_out], maps[held_out],
+        [cameras[i] for i in held_out], maps[held_out], base_colors("tabletop"),
     )  # fmt: skip
 
 
-def demo(num_gaussians: int = 40_000) -> World:
+def demo(num_gaussians: int = 40_000, views: int = 24, width: int = 320) -> World:
     """The demo room: thirteen classes, known of every Gaussian but floaters, whether any view sees it or not."""
-    room = demo_room(num_gaussians)
-    cameras, held_out = demo_cameras(), held_out_cameras()
+    size = width, width * 3 // 4
+    return world_of_room("demo", demo_room(num_gaussians), demo_cameras(views, *size), held_out_cameras(4, *size))
+
+
+def world_of_room(name: str, room: DemoRoom, cameras: list[Camera], held_out: list[Camera]) -> World:
+    """A room of known classes, seen from two sets of cameras."""
+    drawn = room
+    if torch.cuda.is_available():
+        drawn = replace(room, scene=room.scene.to("cuda"), labels=room.labels.to("cuda"))
     maps, held_out_maps = (
-        torch.stack([view_labels(room, camera).long() - 1 for camera in some]) for some in (cameras, held_out)
+        torch.stack([view_labels(drawn, camera).cpu().long() - 1 for camera in some]) for some in (cameras, held_out)
     )
     evidence, cells = cell_evidence(room.scene, cameras, maps)
-    return World("demo", room.scene, cameras, evidence, cells, room.labels, len(room.names), held_out, held_out_maps)
+    classes = len(room.names)
+    return World(name, room.scene, cameras, evidence, cells, room.labels, classes, held_out, held_out_maps, room.colors)
 
 
 def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
@@ -177,7 +199,9 @@ def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
     joined = GaussianScene(*(torch.cat([getattr(x, f.name) for x in (scene, floaters)]) for f in fields(scene)))
     evidence, cells = cell_evidence(joined, world.cameras, world.cells.maps)
     truth = torch.cat([world.truth, torch.full((count,), NO_CLASS)])
-    return replace(world, name=f"{world.name}_floaters", scene=joined, evidence=evidence, cells=cells, truth=truth)
+    colors = None if world.colors is None else torch.cat([world.colors, torch.full((count, 3), 0.6)])
+    changed = {"scene": joined, "evidence": evidence, "cells": cells, "truth": truth, "colors": colors}
+    return replace(world, name=f"{world.name}_floaters", **changed)
 
 
 def _optical_depth(means: Tensor, opacities: Tensor, camera: Camera) -> Tensor:

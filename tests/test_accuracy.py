@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.accuracy import Bench, summarize
-from benchmarks.damage import LADDER, Damage, Lengths, observe
+from benchmarks.accuracy import Bench
+from benchmarks.accuracy_report import METHODS, summarize
+from benchmarks.damage import LADDER, STEPS, Damage, observe
+from benchmarks.features import LENGTHS, mask_features
 from benchmarks.fit import MOST, observation
 from benchmarks.losses import coarse_evidence
 from benchmarks.report import Report
@@ -85,9 +87,8 @@ def test_truth_is_the_class_of_pure_and_heavy_gaussians(world):
 
 def test_features_have_the_geometry_that_is_documented():
     words, g = made_words(12), generator(0)
-    from benchmarks.damage import _features  # noqa: PLC0415
-
-    rows = _features(torch.arange(12).repeat(40), words, Damage(), Lengths(), g).view(40, 12, -1)
+    masks = torch.arange(12).repeat(40)
+    rows = mask_features(words, masks, torch.full_like(masks, -1), 0.0, 1.2, LENGTHS["clip"], g).view(40, 12, -1)
     same = torch.einsum("vkd,wkd->vwk", rows, rows)[torch.triu_indices(40, 40, 1).unbind()].mean()
     other = torch.einsum("vkd,vld->vkl", rows, rows)[
         :, torch.triu_indices(12, 12, 1)[0], torch.triu_indices(12, 12, 1)[1]
@@ -207,14 +208,32 @@ def test_rows_and_their_summary(world):
     rows = []
     bench = Bench(world, WORDS, None, "cpu", RefineConfig(k=9))
     for seed in range(2):
-        for name in ("mild", "hard"):
-            rows.append({"scene": "tiny", "damage": name, "seed": seed, **bench.run(LADDER[name], seed)})
+        for name, damage in (("mild", LADDER["mild"]), ("noise only", LADDER["noise only"]), ("arc", STEPS["arc"])):
+            found = bench.run(damage, seed, others=name in LADDER)
+            rows.append({"scene": "tiny", "damage": name, "seed": seed, **found})
+        found = bench.run(replace(LADDER["mild"], views=3), seed, others=False)
+        rows.append({"scene": "tiny", "damage": "mild, 3 views", "seed": seed, **found})
     report = Report("accuracy")
     summarize(rows, report)
     values = {metric.key: metric.value for metric in report.metrics}
-    for variant in VARIANTS:
-        expected = sum(row[variant]["miou"] for row in rows) / 4
-        assert values[f"ablation.{variant}.miou"] == pytest.approx(expected)
+    ladder = [row for row in rows if row["damage"] in ("mild", "noise only")]
+    three = [row for row in rows if row["damage"] == "mild, 3 views"]
+    for method in METHODS:
+        expected = sum(row[method]["miou"] for row in ladder) / 4
+        assert values[f"ablation.{method}.miou"] == pytest.approx(expected)
+        assert values[f"tiny.ablation.{method}.miou"] == pytest.approx(expected)
+        clean = [row[method]["miou"] for row in ladder if row["damage"] == "noise only"]
+        assert values[f"undamaged.{method}.miou"] == pytest.approx(sum(clean) / 2)
+        assert values[f"views3.ablation.{method}.miou"] == pytest.approx(sum(row[method]["miou"] for row in three) / 2)
+        gains = [row[method]["miou"] - row["none"]["miou"] for row in ladder]
+        assert values[f"ablation.{method}.worst"] == pytest.approx(min(gains))
+        assert values[f"ablation.{method}.share_worse"] == sum(gain < -1 for gain in gains) / 4
+        assert values[f"ablation.{method}.copied"] == pytest.approx(sum(row[method]["copied"] for row in ladder) / 4)
+    assert values["consensus.share_worse"] == values["ablation.consensus.share_worse"]
+    assert values["ablation.none.copied"] == values["ablation.none.gain"] == 0 < values["ablation.paper.copied"]
+    assert values["ladder.arc.none.miou"] == pytest.approx(
+        sum(r["none"]["miou"] for r in rows if r["damage"] == "arc") / 2
+    )
     for other in ("sfs", "occam", "vala", "drsplat"):
         assert 0 < values[f"baseline.{other}.miou"] <= 100
     assert values["ablation.paper_minus_none.miou"] == pytest.approx(
