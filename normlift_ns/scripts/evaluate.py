@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Column, Table
 
@@ -219,7 +219,7 @@ def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
 
 def _short(number: int, row: Row) -> Row:
     """A numbered row of the study of coverage, without what only programs need."""
-    found = {"": number}
+    found: dict[str, Any] = {"": number}
     for name, value in row.items():
         if name not in ("box", "camera_to_world", "lifted_reliability"):
             numbers = isinstance(value, list) and all(isinstance(x, float) for x in value)

@@ -215,9 +215,11 @@ def _photographs(scene: Scene, manifest: Mapping[str, Any]) -> _Photographs:
         if name in used:
             lifted.append((name, camera))
         else:
-            others.append((name, camera, "no features" if name in unusable else "max_views"))
-    others += [(name, camera, "held out") for name, camera in zip(scene.held_out.names, scene.held_out.cameras)]
-    reasons = [why for *_, why in others]
+            why: Why = "no features" if name in unusable else "max_views"
+            others.append((name, camera, why))
+    for name, camera in zip(scene.held_out.names, scene.held_out.cameras):
+        others.append((name, camera, "held out"))
+    reasons: list[Why] = [why for *_, why in others]
     lifted = [lifted[i] for i in spread(len(lifted), MOST_VIEWS)]
     others = [others[i] for i in spread(len(others), MOST_VIEWS)]
     return _Photographs(
