@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from rich.table import Column, Table
 
@@ -82,7 +82,8 @@ class NormLiftEval:
         def evaluated(config: Path) -> EvaluatedRun:
             run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
             names.append((run.scene.name, str(run.scene.checkpoint_path)))
-            return EvaluatedRun(run.scene, run.field, run.texts, self.refined)
+            texts = cast(Any, None) if self.protocol == "none" else run.texts  # nothing is asked then
+            return EvaluatedRun(run.scene, run.field, texts, self.refined)
 
         # Scenes are large: one is held at a time, unless they are studied.
         runs: Iterable[EvaluatedRun] = (evaluated(config) for config in self.load_config)

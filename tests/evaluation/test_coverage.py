@@ -15,9 +15,10 @@ from normlift_ns import Camera, GaussianScene, SemanticField, lift, rasterize_ev
 from normlift_ns.core.scene import camera_summary
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.coverage import gain, poses, study
+from normlift_ns.evaluation.coverage import gain, photographs, poses
 from normlift_ns.evaluation.coverage.gain import FAINT, Known, choose_views, gains
-from normlift_ns.evaluation.coverage.study import Coverage, coverage_of, lifted_names
+from normlift_ns.evaluation.coverage.photographs import lifted_names
+from normlift_ns.evaluation.coverage.study import Coverage, coverage_of
 from normlift_ns.raster.settings import RasterSettings
 
 
@@ -246,9 +247,26 @@ def test_old_manifests():
     for facts in ({}, {"statistics": {"views": 6, "left_out": 2}}, {"statistics": {"views": 4, "left_out": 0}}):
         with pytest.raises(InputError, match="does not tell which photographs were lifted"):
             lifted_names(scene, facts)
-    for names in (["gone.png"], "0.png", 3):
-        with pytest.raises(InputError, match="no longer has"):
-            lifted_names(scene, {"views_lifted": names})
+    with pytest.raises(InputError, match="no longer has"):
+        lifted_names(scene, {"views_lifted": ["gone.png"]})
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"views_lifted": "0.png"},
+        {"views_lifted": [3]},
+        {"views_lifted": [["0.png"]]},
+        {"views_lifted": ["0.png"], "views_without_features": None},
+        {"statistics": 3},
+        {"statistics": {"views": 8.5, "left_out": 0}},
+        {"statistics": {"views": 8, "left_out": 0}, "options": {"max_views": 0}},
+        {"statistics": {"views": 8, "left_out": 0}, "options": []},
+    ],
+)
+def test_damaged_records(facts):
+    with pytest.raises(InputError, match="damaged"):
+        lifted_names(wall(), facts)
 
 
 def test_cameras_that_see_nothing():
@@ -267,7 +285,7 @@ def test_bounds(wrong, unchecked):
 
 
 def test_many_photographs_are_sampled(monkeypatch):
-    monkeypatch.setattr(study, "MOST_VIEWS", 2)
+    monkeypatch.setattr(photographs, "MOST_VIEWS", 2)
     scene = wall()
     found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert [photograph.name for photograph in found.photographs] in (["4.png", "h.png"], ["h.png", "4.png"])

@@ -38,6 +38,9 @@ PIXELS = 20_000
 FAINT = 0.1
 """Share of its largest weight below which a view hardly sees a Gaussian."""
 
+_PART = 2**24
+"""Entries that are looked at at once."""
+
 
 class Drawn(NamedTuple):
     """How weights are rasterized: as for the lift."""
@@ -144,11 +147,13 @@ def known_of_lift(scalars: Scalars, lifted: SparseRows, surface: Float64[Tensor,
 
 def gains(known: Known, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
     """gain(v) of every view, beside those that are known."""
-    row, added = views.row_index(), views.weight.double()
     before = known.expected(known.weight, known.squared)
-    after = known.expected(known.weight[row] + added, known.squared[row] + added**2, row)
-    rise = known.surface[row] * (after - before[row]).clamp(min=0)
-    found = torch.zeros(count, dtype=torch.float64, device=rise.device).index_add_(0, views.column.long(), rise)
+    found = torch.zeros(count, dtype=torch.float64, device=before.device)
+    parts = (x.split(_PART) for x in (views.row_index(), views.column, views.weight))
+    for row, column, weight in zip(*parts):
+        added = weight.double()
+        after = known.expected(known.weight[row] + added, known.squared[row] + added**2, row)
+        found.index_add_(0, column.long(), known.surface[row] * (after - before[row]).clamp(min=0))
     return _ratio(found, known.surface.sum())
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import refuse_run_files
-from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import unsupported
 from normlift_ns.core.scene import Scene
@@ -29,21 +28,18 @@ from normlift_ns.evaluation.coverage.gain import (
     view_weights,
     views_that_see,
 )
+from normlift_ns.evaluation.coverage.photographs import Photographs, Why, photographs_of
 from normlift_ns.evaluation.coverage.poses import SEES, Pose, suggest_poses
 from normlift_ns.evaluation.coverage.regions import Evidenced, Region, weak_regions
 from normlift_ns.evaluation.options import pose_files
 from normlift_ns.evaluation.votes import own_vote
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.observing import spread
 from normlift_ns.options import REACH
 from normlift_ns.ranges import check_number, check_path
 from normlift_ns.raster.settings import RasterSettings
 
-Why = Literal["max_views", "no features", "held out"]
 RELIABLE = 0.5
 """R above which a Gaussian is reliable: more than one view that agrees with itself gives, at beta 1."""
-MOST_VIEWS = 256
-"""Photographs that are looked at, of those that were lifted and of those that were not."""
 PHOTOGRAPHS = 12
 """Photographs that are suggested."""
 
@@ -116,17 +112,6 @@ class Coverage:
         return write_poses(stem, self.poses, self.pictures, documents=documents, overwrite=overwrite)
 
 
-class _Photographs(NamedTuple):
-    """All that can be looked at, the lifted ones first."""
-
-    lifted: int
-    names: list[str]
-    cameras: list[Camera]
-    why: list[Why]
-    """Of those that were not lifted."""
-    left_out: dict[Why, int]
-
-
 def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str | None = None) -> Coverage:
     """Which regions lack reliable evidence, which photographs left out of the lift would help most, and new poses that
     would see the worst regions.
@@ -154,7 +139,7 @@ def coverage_of(
 ) -> Coverage:
     """`coverage` of a scene and its semantics."""
     check_number("min_reliability", min_reliability)
-    photographs = _photographs(scene, field.manifest)
+    photographs = photographs_of(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), own_vote(field.manifest)
     gaussians, scalars = scene.gaussians.to(device), field.scalars.map(lambda x: x.to(device))
     drawn = Drawn(gaussians, scene.rasterize_mode, RasterSettings.recorded(field.manifest), power)
@@ -182,56 +167,7 @@ def coverage_of(
     )
 
 
-def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], set[str]]:
-    """Names of the photographs that were lifted, and of those that had no features.
-
-    Raises:
-        ValueError: the manifest does not tell, or names photographs that the scene no longer has.
-    """
-    names = list(scene.train.names)
-    used, unusable = manifest.get("views_lifted"), manifest.get("views_without_features", [])
-    if used is None and manifest.get("statistics", {}).get("left_out") == 0:  # version 0.1 has only counts
-        used = [names[i] for i in spread(len(names), manifest.get("options", {}).get("max_views"))]
-        if len(used) != manifest["statistics"].get("views"):
-            used = None
-    if used is None:
-        raise InputError(
-            "the run does not tell which photographs were lifted: it is of an older version, and some had no features; "
-            "lift again with: ns-normlift --load-config ..."
-        )
-    if not isinstance(used, list) or not isinstance(unusable, list) or not set(used) <= set(names):
-        raise InputError(
-            f"the run was lifted from photographs that {scene.name} no longer has; restore the data set, say where it "
-            "is with --data, or lift again"
-        )
-    return set(used), set(unusable)
-
-
-def _photographs(scene: Scene, manifest: Mapping[str, Any]) -> _Photographs:
-    used, unusable = lifted_names(scene, manifest)
-    lifted: list[tuple[str, Camera]] = []
-    others: list[tuple[str, Camera, Why]] = []
-    for name, camera in zip(scene.train.names, scene.train.cameras):
-        if name in used:
-            lifted.append((name, camera))
-        else:
-            why: Why = "no features" if name in unusable else "max_views"
-            others.append((name, camera, why))
-    for name, camera in zip(scene.held_out.names, scene.held_out.cameras):
-        others.append((name, camera, "held out"))
-    reasons: list[Why] = [why for *_, why in others]
-    lifted = [lifted[i] for i in spread(len(lifted), MOST_VIEWS)]
-    others = [others[i] for i in spread(len(others), MOST_VIEWS)]
-    return _Photographs(
-        len(lifted),
-        [name for name, *_ in (*lifted, *others)],
-        [camera for _, camera, *_ in (*lifted, *others)],
-        [why for *_, why in others],
-        {why: reasons.count(why) for why in dict.fromkeys(reasons)},
-    )
-
-
-def _suggested(photographs: _Photographs, known: Known, left: SparseRows, parts: Sequence[Tensor]) -> list[Photograph]:
+def _suggested(photographs: Photographs, known: Known, left: SparseRows, parts: Sequence[Tensor]) -> list[Photograph]:
     names, count = photographs.names[photographs.lifted :], len(photographs.why)
     seen = shown_shares(left, count, known.surface, parts)
     return [
@@ -250,7 +186,7 @@ def _columns(weights: SparseRows, some: range, count: int) -> SparseRows:
 
 
 def _remarks(
-    photographs: _Photographs, regions: Sequence[Region], poses: Sequence[Pose], min_reliability: float
+    photographs: Photographs, regions: Sequence[Region], poses: Sequence[Pose], min_reliability: float
 ) -> list[str]:
     found = []
     if len(regions) == 0:
@@ -265,11 +201,9 @@ def _remarks(
         )
     if len(photographs.why) == 0:
         found.append("No photograph was left out of the lift, so none can be suggested.")
-    if len(photographs.why) < sum(photographs.left_out.values()):
-        found.append(
-            f"Of {sum(photographs.left_out.values()):,} photographs left out, {MOST_VIEWS}, evenly spread, were looked "
-            "at."
-        )
+    total = sum(photographs.left_out.values())
+    if len(photographs.why) < total:
+        found.append(f"Of {total:,} photographs left out, {len(photographs.why)}, evenly spread, were looked at.")
     if len(photographs.cameras) == 1:
         found.append("The scene has a single camera; what it does not see cannot be told.")
     return found
