@@ -32,11 +32,11 @@ _WITHOUT_TRUTH = ("coverage", "timing")
 class NormLiftEval:
     """Evaluate lifted runs: a table, and a JSON file in the shape of ns-eval's."""
 
-    protocol: Literal["scannet", "lerf", "masks", "none"]
-    """scannet: 3D, one Gaussian per labelled vertex. lerf: 2D, polygons of LERF-OVS. masks: instance masks of any
-    capture, 3D and 2D. none: no truth and no score, for --study coverage and timing."""
     load_config: tuple[Path, ...]
     """Paths to config YAML files of lifted runs, one per scene."""
+    protocol: Literal["scannet", "lerf", "masks", "none"] = "none"
+    """scannet: 3D, one Gaussian per labelled vertex. lerf: 2D, polygons of LERF-OVS. masks: instance masks of any
+    capture, 3D and 2D. none: no truth and no score, for --study coverage and timing."""
     labels: tuple[Path, ...] = ()
     """Truth of every run, in the same order. scannet: *_vh_clean_2.labels.ply; lerf: folder of JSON files; masks:
     folder of masks; none: nothing."""

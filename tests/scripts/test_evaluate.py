@@ -78,7 +78,7 @@ def looked(monkeypatch, workspace: Path, output: Path, *flags: object) -> int:
 
 
 def test_coverage_needs_no_truth(workspace, tmp_path, monkeypatch, capsys):
-    flags = ("--protocol", "none", "--study", "coverage")
+    flags = ("--study", "coverage")
     assert looked(monkeypatch, workspace, tmp_path / "next.json", *flags) == 0
     shown = said(capsys)
     document = json.loads((tmp_path / "next.json").read_text())

@@ -88,7 +88,7 @@ def write_poses(
         for draft, content in zip(drafts, more.values()):
             draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf8")
         for i, (draft, pose, picture) in enumerate(zip(drafts[len(more) :], poses, pictures), 1):
-            save_picture(draft, f"pose {i}: sees region {', '.join(map(str, pose.regions))}", picture)
+            save_picture(draft, f"pose {i}, sees: region {', '.join(map(str, pose.regions))}", picture)
     return written
 
 

@@ -23,11 +23,11 @@ from normlift_ns.evaluation.options import POSES
 from normlift_ns.observing import spread
 from normlift_ns.raster.rasterize import render
 
-REGIONS = 6
+REGIONS = 4
 """Regions that candidates look at, those that lack most."""
-PLACES, RING = 16, 12
+PLACES, RING = 12, 12
 """Places of photographs, and azimuths of the ring, from which a region is looked at."""
-LOOKED_AT = 24
+LOOKED_AT = 10
 """Candidates per region whose weights are rasterized."""
 SEES = 0.3
 """A view sees a region if it shows at least this share of it as well as any photograph does."""
@@ -36,7 +36,7 @@ NEAREST = 0.15
 FEW = 0.05
 """Share of the pixels in which something may be nearer."""
 _DEPTH_PIXELS = 5_000
-_DEPTH_VIEWS = 48
+_DEPTH_VIEWS = 16
 
 
 @dataclass(frozen=True)
