@@ -366,3 +366,23 @@ def test_a_camera_that_looks_straight_down():
     down = poses.look_at(torch.tensor([0.0, 0, 2]).double(), torch.zeros(3).double(), up, like)
     there = down.world_to_camera @ torch.tensor([0.0, 0, 0, 1])
     assert there.tolist() == pytest.approx([0, 0, 2, 1], abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["", ".", ".."])
+def test_a_name_is_needed(one_side, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="no name of a file"):
+        one_side.save(name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_a_gpu_says_the_same(one_side):
+    scene = wall()
+    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)), device="cuda")
+    assert [photograph.name for photograph in found.photographs] == [x.name for x in one_side.photographs]
+    gained = [photograph.gain for photograph in one_side.photographs]
+    assert [photograph.gain for photograph in found.photographs] == pytest.approx(gained, rel=1e-3)
+    assert found.regions[0].size == pytest.approx(one_side.regions[0].size, abs=2)
+    for mine, other in zip(found.poses, one_side.poses):
+        torch.testing.assert_close(mine.camera.world_to_camera, other.camera.world_to_camera, rtol=0, atol=1e-2)

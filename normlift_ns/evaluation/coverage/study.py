@@ -106,6 +106,8 @@ class Coverage:
         ['next.json', 'next_camera_path.json']
         """
         place = check_path("path", path)
+        if place.name in ("", ".."):
+            raise InputError(f"{place} is no name of a file; give one such as next.json")
         stem = place.with_suffix("")
         refuse_run_files(place, *pose_files(stem), instead="name")
         documents = {place: self.to_json()}
