@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from normlift_ns.core.scene import Scene as Scene
     from normlift_ns.core.scene import View as View
     from normlift_ns.errors import InputError as InputError
+    from normlift_ns.evaluation.coverage.study import Coverage as Coverage
+    from normlift_ns.evaluation.coverage.study import coverage as coverage
     from normlift_ns.front_door import lift_run as lift_run
     from normlift_ns.front_door import open_run as open_run
     from normlift_ns.front_door import open_scene as open_scene
@@ -54,6 +56,7 @@ _HOMES = {
     "core.refine": ("refine", "unsupported"),
     "core.scene": ("Scene", "View"),
     "errors": ("InputError",),
+    "evaluation.coverage.study": ("Coverage", "coverage"),
     "front_door": ("lift_run", "open_run", "open_scene"),
     "lifted_run": ("LiftedRun",),
     "options": (

@@ -118,6 +118,8 @@ def lift_scene(
             "cameras_held_out": camera_summary(scene.held_out.cameras),
             "features": source.identity,
             "options": asdict(options),
+            "views_lifted": [views.names[index] for index in used],
+            "views_without_features": [name for name in views.names if name not in names],
             "gsplat_rules": drawing.rules,
             "backend": drawing.backend,
             "statistics": {**counts, **agreed, **_statistics(lifted.scalars), **shares},

@@ -17,6 +17,20 @@ MARGIN = 0.02
 """By which a score must exceed every background word (section "Mask thresholding" of the paper; SFS's code has 0)."""
 
 
+POSES = 5
+"""New poses that the study of coverage suggests, at most."""
+
+
+def pose_files(stem: Path) -> tuple[Path, ...]:
+    """All files that new poses may be written to: a camera path, and a picture of each.
+
+    >>> [path.name for path in pose_files(Path("next"))][:2]
+    ['next_camera_path.json', 'next_pose_1.png']
+    """
+    pictures = (stem.with_name(f"{stem.name}_pose_{i}.png") for i in range(1, POSES + 1))
+    return (stem.with_name(f"{stem.name}_camera_path.json"), *pictures)
+
+
 @dataclass(frozen=True)
 class ScannetOptions:
     """Protocol scannet; --labels gives one *_vh_clean_2.labels.ply per run."""

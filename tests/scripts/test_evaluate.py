@@ -76,6 +76,50 @@ def test_the_default_output_is_not_replaced_either(workspace, tmp_path, monkeypa
     assert json.loads(Path("output.json").read_text())["experiment_name"] == "room"
 
 
+def looked(monkeypatch, workspace: Path, output: Path, *flags: object) -> int:
+    config = workspace / "outputs" / "room" / "normlift" / "t" / "config.yml"
+    given = ("--load-config", config, "--output-path", output, *flags)
+    return run_entry(monkeypatch, evaluate.entrypoint, *given)
+
+
+def test_coverage_needs_no_truth(workspace, tmp_path, monkeypatch, capsys):
+    flags = ("--study", "coverage")
+    assert looked(monkeypatch, workspace, tmp_path / "next.json", *flags) == 0
+    shown = said(capsys)
+    document = json.loads((tmp_path / "next.json").read_text())
+    assert document["results"] == {}
+    (found,) = document["studies"]["coverage"]
+    assert found["left_out"] == {"held out": 2}
+    assert {photograph["why"] for photograph in found["photographs"]} == {"held out"}
+    assert 0 < found["reliability"] < 1
+    files = {path.name for path in tmp_path.iterdir()}
+    pictures = {f"next_coverage_pose_{i}.png" for i in range(1, len(found["poses"]) + 1)}
+    path = {"next_coverage_camera_path.json"} if len(pictures) > 0 else set()
+    assert files == {"next.json"} | pictures | path
+    assert "photographs" in shown
+    assert "next.json" in shown
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert looked(monkeypatch, workspace, tmp_path / "next.json", *flags) == 1
+    assert "next.json exists" in said(capsys)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("existing", ["next_coverage_camera_path.json", "next_coverage_pose_5.png"])
+def test_coverage_replaces_nothing_unasked(existing, workspace, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("normlift_ns.front_door.open_run", None)
+    (tmp_path / existing).write_text("mine")
+    assert looked(monkeypatch, workspace, tmp_path / "next.json", "--protocol", "none", "--study", "coverage") == 1
+    assert f"{existing} exists; give another --output-path, or --overwrite True." in said(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == [existing]
+
+
+@pytest.mark.parametrize("flags", [(), ("--study", "ablation"), ("--study", "coverage", "--labels", ".")])
+def test_protocol_none_scores_nothing(flags, workspace, tmp_path, monkeypatch, capsys):
+    assert looked(monkeypatch, workspace, tmp_path / "next.json", "--protocol", "none", *flags) == 1
+    assert "protocol none takes runs (--load-config), no --labels, and --study coverage" in said(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
 def stand_ins(path: Path, words: dict[str, str]) -> Path:
     """Vectors of words, each that of a colour."""
     vectors = ColourEncoder().text(list(words.values())).numpy()

@@ -1,0 +1,388 @@
+"""Where to look next: gains against a loop, regions and photographs of a wall of which the lift saw one side only."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from normlift_ns import Camera, GaussianScene, SemanticField, lift, rasterize_evidence
+from normlift_ns.core.scene import camera_summary
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.coverage import gain, photographs, poses
+from normlift_ns.evaluation.coverage.gain import FAINT, Known, choose_views, gains
+from normlift_ns.evaluation.coverage.photographs import lifted_names
+from normlift_ns.evaluation.coverage.study import Coverage, coverage_of
+from normlift_ns.raster.settings import RasterSettings
+
+
+@dataclass
+class Photographs:
+    """Cameras with names, and no images."""
+
+    names: list[str]
+    cameras: list[Camera]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass
+class Wall:
+    """A thick wall across x = 0, whose two sides are different Gaussians."""
+
+    gaussians: GaussianScene
+    train: Photographs
+    held_out: Photographs
+    rasterize_mode: str = "classic"
+    name: str = "wall"
+    renderer: None = None
+    background: Tensor = field(default_factory=lambda: torch.zeros(3))
+
+    def colors(self, camera: Camera) -> Tensor:
+        return torch.full((len(self.gaussians), 3), 0.5)
+
+
+def looking(eye: tuple[float, float, float], target=(0.0, 0.0, 0.0), width=96, height=72) -> Camera:
+    """A camera at a place, z up."""
+    eye_, target_ = torch.tensor(eye).double(), torch.tensor(target).double()
+    forward = torch.nn.functional.normalize(target_ - eye_, dim=0)
+    right = torch.nn.functional.normalize(forward.cross(torch.tensor([0.0, 0, 1]).double(), dim=0), dim=0)
+    pose = torch.eye(4).double()
+    pose[:3, :3] = torch.stack([right, forward.cross(right, dim=0), forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye_
+    K = torch.tensor([[width * 0.6, 0, width / 2], [0, width * 0.6, height / 2], [0, 0, 1]])
+    return Camera(K, pose.float(), width, height)
+
+
+SIDE = 24
+"""Gaussians along an edge of the wall."""
+
+
+def wall() -> Any:
+    """Eight photographs, four of each side, and one held out of the far side."""
+    line = torch.linspace(-1, 1, SIDE)
+    y, z = (x.flatten() for x in torch.meshgrid(line, line, indexing="ij"))
+    near, far = (torch.stack([torch.full_like(y, x), y, z], 1) for x in (-0.15, 0.15))
+    means = torch.cat([near, far])
+    n = len(means)
+    scales = torch.tensor([0.002, 0.055, 0.055]).expand(n, 3).contiguous()
+    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4).contiguous()
+    scene = GaussianScene(means, quats, scales, torch.full((n,), 0.99))
+    places = [(-3.0, y, 0.2) for y in (-0.9, -0.3, 0.3, 0.9)] + [(3.0, y, 0.2) for y in (-0.9, -0.3, 0.3, 0.9)]
+    train = Photographs([f"{i}.png" for i in range(8)], [looking(place) for place in places])
+    return Wall(scene, train, Photographs(["h.png"], [looking((3.0, 0.0, 0.4))]))
+
+
+def lifted(scene: Any, used: list[int], *, blank: tuple[int, ...] = ()) -> SemanticField:
+    """The scene lifted from some photographs, with one region each; those in `blank` have no features."""
+    cameras = [scene.train.cameras[i] for i in used]
+    labels = [torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in cameras]
+    evidence = rasterize_evidence(scene.gaussians, cameras, labels)
+    found = lift(evidence, torch.tensor([[0.8, 0.6]]).expand(len(used), 2).contiguous())
+    facts = {
+        "views_lifted": [scene.train.names[i] for i in used],
+        "views_without_features": [scene.train.names[i] for i in blank],
+        "cameras": camera_summary(scene.train.cameras),
+        "options": {"beta": 1.0, "weight_power": 1, "vote": {"k": 6}},
+    }
+    return SemanticField.build(found, scene.gaussians.means, provenance=facts)
+
+
+@pytest.fixture(scope="module")
+def one_side() -> Coverage:
+    """What is said of a lift that saw the near side."""
+    scene = wall()
+    return coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)))
+
+
+def test_the_far_side_is_the_region_and_its_photographs_are_chosen(one_side):
+    found = one_side
+    region, *others = found.regions
+    assert others == []
+    assert region.size > 0.95 * SIDE * SIDE
+    assert region.centre == pytest.approx([0.15, 0, 0], abs=0.1)
+    assert region.box["min"][0] == region.box["max"][0] == pytest.approx(0.15)
+    assert 0.4 < region.share < 0.6
+    assert region.reliability < 0.2
+    assert region.lifted_reliability > 0.7  # four views see it through cracks
+    assert region.views < 0.5
+    assert found.left_out == {"max_views": 3, "no features": 1, "held out": 1}
+    why = {photograph.name: photograph.why for photograph in found.photographs}
+    assert why == {"4.png": "max_views", "5.png": "no features", "6.png": "max_views", "7.png": "max_views"} | {
+        "h.png": "held out"
+    }
+    assert all(photograph.regions == [1] for photograph in found.photographs)
+    first, second, *_ = (photograph.gain for photograph in found.photographs)
+    # R of the far side, half of the surface, goes to 1 / 2, and with two views to 2 / 3
+    assert first == pytest.approx(region.share * (1 / 2 - region.reliability), rel=0.2)
+    assert second == pytest.approx(region.share / 6, rel=0.3)
+    assert found.remarks == []
+
+
+def test_photographs_of_the_other_side_come_first():
+    scene = wall()
+    found = coverage_of(scene, lifted(scene, [0, 1]))
+    names = [photograph.name for photograph in found.photographs]
+    assert set(names[:2]) <= {"4.png", "5.png", "6.png", "7.png", "h.png"}
+    assert found.photographs[0].gain > 3 * found.photographs[-1].gain
+
+
+def test_scale_of_the_pictures_does_not_matter(one_side):
+    """Weights of the lift count pixels of another size than those that the study looks at."""
+    scene = wall()
+    whole = lifted(scene, [0, 1, 2, 3], blank=(5,))
+    larger = replace(whole, scalars=replace(whole.scalars, weight=16 * whole.scalars.weight))
+    one, other = one_side, coverage_of(scene, larger)
+    assert [p.name for p in one.photographs] == [p.name for p in other.photographs]
+    assert [p.gain for p in one.photographs] == pytest.approx([p.gain for p in other.photographs])
+
+
+def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[Known, SparseRows, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    dense = torch.rand(n, views, generator=g, dtype=torch.float64) * (torch.rand(n, views, generator=g) < 0.6)
+    before = torch.rand(n, 3, generator=g, dtype=torch.float64) * (torch.rand(n, 3, generator=g) < 0.5)
+    surface = torch.cat([dense, before], 1).amax(1)
+    norm = torch.rand(n, generator=g, dtype=torch.float64)
+    row, column = dense.nonzero(as_tuple=True)
+    sparse = SparseRows.from_coo(row, column, dense[row, column], n)
+    return Known(norm, before.sum(1), (before**2).sum(1), surface, 0.7), sparse, torch.cat([before, dense], 1)
+
+
+def looped(known: Known, columns: Tensor, view: int, chosen: list[int]) -> float:
+    """The gain by the formula, one Gaussian after the other."""
+    total = 0.0
+    for j in range(len(known.norm)):
+        reliabilities = []
+        for views in (chosen, [*chosen, view]):
+            w = [float(known.weight[j])] + [float(columns[j, 3 + v]) for v in views]
+            squares = float(known.squared[j]) + sum(x**2 for x in w[1:])
+            noise = (FAINT * float(known.surface[j])) ** 2
+            n = sum(w) ** 2 / (squares + noise) if squares + noise > 0 else 0.0
+            reliabilities.append(float(known.norm[j]) * n / (n + known.beta))
+        total += float(known.surface[j]) * max(0.0, reliabilities[1] - reliabilities[0])
+    return total / float(known.surface.sum())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gains_are_those_of_a_loop(seed):
+    known, views, columns = random_case(seed)
+    expected = [looped(known, columns, v, []) for v in range(5)]
+    assert gains(known, views, 5).tolist() == pytest.approx(expected, rel=1e-12)
+    chosen = choose_views(known, views, 5, 3)
+    before: list[int] = []
+    for view, found in chosen:
+        rest = {v: looped(known, columns, v, before) for v in range(5) if v not in before}
+        assert found == pytest.approx(max(rest.values()), rel=1e-12)
+        assert view == max(rest, key=rest.__getitem__)
+        before.append(view)
+
+
+def test_greedy_comes_close_to_the_best_of_all_choices():
+    """At least 1 - 1 / e of the best pair, as greedy choices under diminishing returns do."""
+    for seed in range(20):
+        known, views, columns = random_case(seed)
+        best = max(looped(known, columns, a, []) + looped(known, columns, b, [a]) for a, b in permutations(range(5), 2))
+        assert sum(x for _, x in choose_views(known, views, 5, 2)) >= 0.63 * best
+
+
+def test_similar_views_gain_little_after_each_other():
+    known = Known(*(torch.tensor(x, dtype=torch.float64) for x in ([1.0, 1], [0.0, 0], [0.0, 0], [1.0, 1])), beta=1.0)
+    row, column = torch.tensor([0, 0, 1]), torch.tensor([0, 1, 2])
+    views = SparseRows.from_coo(row, column, torch.tensor([1.0, 1.0, 0.9], dtype=torch.float64), 2)
+    assert [view for view, _ in choose_views(known, views, 3, 3)] == [0, 2, 1]
+
+
+def test_a_view_that_hardly_sees_something_is_no_whole_view():
+    known = Known(*(torch.tensor([x], dtype=torch.float64) for x in (1.0, 0.0, 0.0, 1.0)), beta=1.0)
+    views = SparseRows.from_coo(
+        torch.tensor([0, 0]), torch.tensor([0, 1]), torch.tensor([1.0, 0.001], dtype=torch.float64), 1
+    )
+    clear, faint = gains(known, views, 2).tolist()
+    assert clear == pytest.approx(0.5, abs=0.01)
+    assert faint < 1e-3
+
+
+def test_weights_are_shares_of_the_picture():
+    scene = wall()
+    drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
+    small, large = (gain.view_weights(drawn, scene.train.cameras, pixels=pixels) for pixels in (1728, 10**9))
+    assert small.row_sums().sum() == pytest.approx(
+        float(large.row_sums().sum()), rel=0.1
+    )  # the blur of a pixel is wider in the small one
+    assert 0.1 < float(large.row_sums().sum()) / 8 < 1
+
+
+def test_everything_reliable_is_said():
+    scene = wall()
+    scene = replace(scene, held_out=Photographs([], []))
+    found = coverage_of(scene, lifted(scene, list(range(8))))
+    assert found.regions == []
+    assert found.photographs == []
+    assert found.left_out == {}
+    assert found.remarks[0].startswith("No region lacks evidence")
+    assert "No photograph was left out" in found.remarks[1]
+
+
+def test_one_camera():
+    scene = wall()
+    scene = replace(scene, train=Photographs(["0.png"], scene.train.cameras[:1]), held_out=Photographs([], []))
+    found = coverage_of(scene, lifted(scene, [0]), min_reliability=0.6)
+    n_eff = 1 / (1 + FAINT**2)
+    assert found.regions[0].reliability == pytest.approx(n_eff / (n_eff + 1))
+    assert found.regions[0].lifted_reliability == pytest.approx(0.5)  # one view that agrees with itself
+    assert any("a single camera" in remark for remark in found.remarks)
+
+
+def test_old_manifests():
+    scene = wall()
+    old = {"statistics": {"views": 3, "left_out": 0}, "options": {"max_views": 3}}
+    assert lifted_names(scene, old) == ({"0.png", "4.png", "7.png"}, set())
+    for facts in ({}, {"statistics": {"views": 6, "left_out": 2}}, {"statistics": {"views": 4, "left_out": 0}}):
+        with pytest.raises(InputError, match="does not tell which photographs were lifted"):
+            lifted_names(scene, facts)
+    with pytest.raises(InputError, match="no longer has"):
+        lifted_names(scene, {"views_lifted": ["gone.png"]})
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"views_lifted": "0.png"},
+        {"views_lifted": [3]},
+        {"views_lifted": [["0.png"]]},
+        {"views_lifted": ["0.png"], "views_without_features": None},
+        {"statistics": 3},
+        {"statistics": {"views": 8.5, "left_out": 0}},
+        {"statistics": {"views": 8, "left_out": 0}, "options": {"max_views": 0}},
+        {"statistics": {"views": 8, "left_out": 0}, "options": []},
+    ],
+)
+def test_damaged_records(facts):
+    with pytest.raises(InputError, match="damaged"):
+        lifted_names(wall(), facts)
+
+
+def test_cameras_that_see_nothing():
+    scene, field_ = wall(), lifted(wall(), [0, 1])
+    away = [looking((-3.0, 0.0, 0.0), (-9.0, 0.0, 0.0)) for _ in range(8)]
+    blind = replace(scene, train=Photographs(scene.train.names, away), held_out=Photographs([], []))
+    with pytest.raises(InputError, match="no photograph shows a Gaussian"):
+        coverage_of(blind, field_)
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), True])
+def test_bounds(wrong, unchecked):
+    scene = wall()
+    with pytest.raises(InputError, match="min_reliability"):
+        coverage_of(scene, lifted(scene, [0]), min_reliability=wrong)
+
+
+def test_many_photographs_are_sampled(monkeypatch):
+    monkeypatch.setattr(photographs, "MOST_VIEWS", 2)
+    scene = wall()
+    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
+    assert [photograph.name for photograph in found.photographs] in (["4.png", "h.png"], ["h.png", "4.png"])
+    assert "Of 5 photographs left out, 2, evenly spread, were looked at." in found.remarks
+
+
+def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
+    """With the far side in no photograph but one from aslant, poses see all of it."""
+    scene = wall()
+    aslant = looking((1.2, 2.6, 0.2))
+    scene = replace(scene, held_out=Photographs(["h.png"], [aslant]))
+    scene.train.cameras[4:] = [looking((0.9, 2.8 + 0.1 * i, 0.2)) for i in range(4)]
+    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
+    assert 1 <= len(found.poses) <= 5
+    pose = found.poses[0]
+    drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
+    seen = gain.view_weights(drawn, [pose.camera, aslant]).select_rows(torch.arange(SIDE * SIDE, 2 * SIDE * SIDE))
+    whole, slanted = (float(seen.weight[seen.column == view].sum()) for view in (0, 1))
+    assert whole > 0.05  # share of the picture
+    assert whole > 0.5 * slanted
+    eye = pose.camera_to_world()[:3, 3]
+    assert float(eye[0]) > 0.3  # not in the wall, nor behind it
+    assert pose.regions[0] == 1
+    assert pose.shown >= 0.3
+    assert found.poses[0].gain >= found.poses[-1].gain > 0
+    assert found.pictures[0].image.shape[:2] == found.pictures[0].reliability.shape
+    height, width = found.pictures[0].reliability.shape
+    assert float(found.pictures[0].reliability[height // 2, width // 2]) < 0.2  # it looks where R is low
+
+
+def test_free_places():
+    scene = wall()
+    drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
+    space = poses.space_of(drawn, scene.train.cameras[:4])
+    assert space.up.tolist() == pytest.approx([0, 0, 1], abs=0.1)
+    assert space.depth == pytest.approx(2.85, abs=0.1)
+    assert space.spacing == pytest.approx(0.6)
+    places = {
+        "before the wall": ((-1.0, 0.0, 0.0), True),
+        "in the wall": ((0.0, 0.0, 0.0), False),
+        "behind it": ((1.0, 0.0, 0.0), False),
+        "beside a camera": ((-3.2, 0.3, 0.2), True),
+        "behind the cameras": ((-6.0, 0.0, 0.0), False),
+    }
+    found = space.free(torch.tensor([place for place, _ in places.values()], dtype=torch.float64))
+    assert dict(zip(places, found.tolist())) == {name: free for name, (_, free) in places.items()}
+
+
+def test_camera_path_is_what_nerfstudio_reads(one_side, tmp_path):
+    paths = pytest.importorskip("nerfstudio.cameras.camera_paths")
+    found = one_side
+    written = found.save(tmp_path / "next.json")
+    assert [path.name for path in written][:2] == ["next.json", "next_camera_path.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in written}
+    read = paths.get_path_from_json(json.loads(written[1].read_text()))
+    cameras = [pose.camera for pose in found.poses]
+    assert len(read) == len(cameras) == len(written) - 2
+    for i, camera in enumerate(cameras):
+        flipped = camera.world_to_camera.inverse() * torch.tensor([1.0, -1, -1, 1])
+        torch.testing.assert_close(read.camera_to_worlds[i], flipped[:3], rtol=0, atol=1e-5)
+        K = read.get_intrinsics_matrices()[i]
+        torch.testing.assert_close(K, camera.K, rtol=1e-5, atol=1e-4)
+        assert (int(read.width[i]), int(read.height[i])) == (camera.width, camera.height)
+    document = json.loads(written[0].read_text())
+    assert document["regions"][0]["size"] == found.regions[0].size
+    assert "pictures" not in document
+    assert len(document["poses"]) == len(cameras)
+    with pytest.raises(FileExistsError):
+        found.save(tmp_path / "next.json")
+    fewer = replace(found, poses=found.poses[:1], pictures=found.pictures[:1])
+    fewer.save(tmp_path / "next.json", overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == {"next.json", "next_camera_path.json", "next_pose_1.png"}
+
+
+def test_a_camera_that_looks_straight_down():
+    like = looking((1.0, 0, 0))
+    up = torch.tensor([0.0, 0, 1]).double()
+    down = poses.look_at(torch.tensor([0.0, 0, 2]).double(), torch.zeros(3).double(), up, like)
+    there = down.world_to_camera @ torch.tensor([0.0, 0, 0, 1])
+    assert there.tolist() == pytest.approx([0, 0, 2, 1], abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["", ".", ".."])
+def test_a_name_is_needed(one_side, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="no name of a file"):
+        one_side.save(name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_a_gpu_says_the_same(one_side):
+    scene = wall()
+    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3], blank=(5,)), device="cuda")
+    assert [photograph.name for photograph in found.photographs] == [x.name for x in one_side.photographs]
+    gained = [photograph.gain for photograph in one_side.photographs]
+    assert [photograph.gain for photograph in found.photographs] == pytest.approx(gained, rel=1e-3)
+    assert found.regions[0].size == pytest.approx(one_side.regions[0].size, abs=2)
+    for mine, other in zip(found.poses, one_side.poses):
+        torch.testing.assert_close(mine.camera.world_to_camera, other.camera.world_to_camera, rtol=0, atol=1e-2)
