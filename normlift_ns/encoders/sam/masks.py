@@ -171,8 +171,8 @@ class SamMasks:
         masks = self._whole(found, crops, size)
         masks, changed = clean_masks(masks, rules.region_area)
         boxes, score = boxes_of(masks), found.stability * found.predicted_iou
-        kept = {level: torch.searchsorted(chosen, index) for level, index in kept.items()}
-        last = _distinct(kept, boxes, (~changed).float(), rules)
+        places: dict[Level, Tensor] = {level: torch.searchsorted(chosen, index) for level, index in kept.items()}
+        last = _distinct(places, boxes, (~changed).float(), rules)
         return {
             level: masks[index[mask_nms(masks[index], score[index], rules.suppression)]]
             for level, index in last.items()
