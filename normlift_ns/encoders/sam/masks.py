@@ -16,7 +16,7 @@ What survives keeps the order of the third and fourth step, which decides where 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from itertools import product
@@ -39,6 +39,8 @@ Level = Literal["default", "s", "m", "l"]
 LEVELS: tuple[Level, ...] = get_args(Level)
 Box = tuple[int, int, int, int]
 """(x0, y0, x1, y1), the ends outside."""
+_ASIDE = 2**22
+"""Wider than any image; float32 holds every whole number up to four times that."""
 
 
 @dataclass(frozen=True)
@@ -153,9 +155,8 @@ class SamMasks:
         alone: dict[Level, list[Tensor]] = {level: [] for level in levels}  # what stays of each crop
         for i, embedding in enumerate(embeddings):
             found, before = self._candidates(embedding, crops[i], i, size), sum(len(part.crop) for part in parts)
-            stay: dict[Level, Tensor] = {
-                level: _distinct(found.of(level), found.boxes, found.predicted_iou, rules) for level in levels
-            }
+            every: dict[Level, Tensor] = {level: found.of(level) for level in levels}
+            stay = _distinct(every, found.boxes, found.predicted_iou, rules)
             some = torch.cat(list(stay.values())).unique()
             parts.append(found.at(some))
             for level, index in stay.items():
@@ -163,19 +164,19 @@ class SamMasks:
         found = _Candidates(*map(torch.cat, zip(*parts)))
         area = torch.tensor([(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in crops], device=self.device)
         smaller_first = 1 / area[found.crop]
-        kept: dict[Level, Tensor] = {
-            level: _distinct(torch.cat(index), found.boxes, smaller_first, rules) for level, index in alone.items()
-        }
+        joined: dict[Level, Tensor] = {level: torch.cat(index) for level, index in alone.items()}
+        kept = _distinct(joined, found.boxes, smaller_first, rules)
         chosen = torch.cat(list(kept.values())).unique()
         found = found.at(chosen)
         masks = self._whole(found, crops, size)
         masks, changed = clean_masks(masks, rules.region_area)
         boxes, score = boxes_of(masks), found.stability * found.predicted_iou
-        result: dict[Level, Tensor] = {}
-        for level, index in kept.items():
-            last = _distinct(torch.searchsorted(chosen, index), boxes, (~changed).float(), rules)
-            result[level] = masks[last[mask_nms(masks[last], score[last], rules.suppression)]]
-        return result
+        places: dict[Level, Tensor] = {level: torch.searchsorted(chosen, index) for level, index in kept.items()}
+        last = _distinct(places, boxes, (~changed).float(), rules)
+        return {
+            level: masks[index[mask_nms(masks[index], score[index], rules.suppression)]]
+            for level, index in last.items()
+        }
 
     def _candidates(self, embedding: Tensor, crop: Box, number: int, size: tuple[int, int]) -> _Candidates:
         """The masks of one crop that are good enough and do not end where it ends."""
@@ -250,8 +251,19 @@ def cut_off(boxes: Int64[Tensor, "n 4"], crop: Box, size: tuple[int, int], edge:
     return (near_crop & ~near_image).any(dim=1)
 
 
-def _distinct(index: Tensor, boxes: Tensor, scores: Tensor, rules: MaskRules) -> Tensor:
-    """Non-maximum suppression of boxes; what stays, highest score first, earlier ones first among equals."""
+def _distinct(
+    groups: Mapping[Level, Int64[Tensor, " k"]], boxes: Int64[Tensor, "n 4"], scores: Float[Tensor, " n"],
+    rules: MaskRules,
+) -> dict[Level, Int64[Tensor, " k"]]:  # fmt: skip
+    """Non-maximum suppression of boxes within each group; what stays, highest score first, earlier ones first among
+    equals.
+
+    All groups go through one call, because each waits for the GPU: the boxes of every group are put aside.
+    """
     from torchvision.ops import nms  # noqa: PLC0415 (takes a second, and not everybody asks SAM)
 
-    return index[nms(boxes[index].float(), scores[index], rules.box_iou)]
+    index = torch.cat(list(groups.values()))
+    sizes = torch.tensor([len(group) for group in groups.values()], device=index.device)
+    group = torch.repeat_interleave(torch.arange(len(groups), device=index.device), sizes)
+    stays = nms((boxes[index] + group[:, None] * _ASIDE).float(), scores[index], rules.box_iou)
+    return {level: index[stays[group[stays] == i]] for i, level in enumerate(groups)}

@@ -13,8 +13,6 @@ from torch.nn.functional import pad
 
 _CHUNK = {"cuda": 2**29, "cpu": 2**26}
 """Elements of the largest temporary array."""
-_ADDS_IN_FLOAT32 = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 8)
-"""Whether torch.mm of half-precision matrices can return its float32 sums."""
 _FORCED = 3
 """Masks that stay, best first, where none is scored well enough."""
 
@@ -123,13 +121,14 @@ def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     return both
 
 
-def _counted(part: Bool[Tensor, "m p"]) -> Float[Tensor, "m m"]:
-    """Products of all rows, added up in float32; on a GPU in tensor cores, where this version of torch lets them."""
-    if part.is_cuda and _ADDS_IN_FLOAT32:
-        half = pad(part.half(), (0, -part.shape[1] % 8))  # rows begin where tensor cores like it
-        return torch.mm(half, half.T, out_dtype=torch.float32)
-    whole = part.float()
-    return whole @ whole.T
+def _counted(part: Bool[Tensor, "m p"]) -> Tensor:
+    """Products of all rows; on a GPU in tensor cores, whole numbers of 8 bits added up in 32, where torch can."""
+    if part.is_cuda and hasattr(torch, "_int_mm"):
+        count, pixels = part.shape
+        whole = pad(part.view(torch.int8), (0, -pixels % 16, 0, max(32 - count, -count % 16)))  # what tensor cores take
+        return torch._int_mm(whole, whole.T)[:count, :count]  # pyright: ignore[reportPrivateImportUsage]
+    exact = part.float()
+    return exact @ exact.T
 
 
 def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
