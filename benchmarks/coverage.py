@@ -24,7 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.accuracy import SEEDS, mean_and_interval, worlds
+from benchmarks.accuracy import SEEDS, worlds
+from benchmarks.accuracy_report import mean_and_interval
 from benchmarks.damage import LADDER, Observed, observe
 from benchmarks.report import RESULTS, Report, stopwatch
 from benchmarks.worlds import Words, World
