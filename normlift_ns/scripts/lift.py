@@ -179,6 +179,8 @@ def summary(run: LiftedRun, before: dict[str, float], total: float, queries: tup
         table.add_row("left out", f"{numbers['left_out']} images without features")
     features = facts["features"]
     table.add_row("2D features", features["kind"] if "kind" in features else features["regions"]["kind"])
+    if "consensus" in numbers:
+        table.add_row("consensus", "; ".join(map(consensus_of, numbers["consensus"]["agreement"])))
     table.add_row("reliability R", quantiles)
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} without any reliable neighbour"
@@ -199,6 +201,20 @@ def summary(run: LiftedRun, before: dict[str, float], total: float, queries: tup
         "next", plain(f"ns-normlift-query --load-config {shlex.quote(str(run.config))} --text {shlex.quote(text)}")
     )
     return Panel(table, title=Text("Lifted", style="bold green"), expand=False)
+
+
+def consensus_of(agreement: float) -> str:
+    """What the consensus found in a level of regions.
+
+    >>> consensus_of(0.3)
+    'regions overlap by chance (agreement 0.30 of 0.40 at least), features stay as they were'
+    """
+    from normlift_ns.core.consensus import CHANCE, THINGS  # noqa: PLC0415 (torch is there by now)
+
+    found = f"agreement {agreement:.2f}"
+    if agreement <= CHANCE:
+        return f"regions overlap by chance ({found} of {CHANCE:.2f} at least), features stay as they were"
+    return f"{found}, features agreed" if agreement >= THINGS else f"{found}, features agreed in part"
 
 
 def entrypoint() -> None:
