@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from contextlib import suppress
+from functools import cache
 from importlib.util import find_spec
 from threading import Thread
 from typing import TypeVar
@@ -46,9 +47,17 @@ def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[
 
 
 def wake(device: str) -> None:
-    """Lets a GPU start, which takes a second, while other work goes on."""
+    """Lets a GPU start, which takes a second, while other work goes on.
+
+    What fails then fails again where the GPU is wanted, and is told there.
+    """
+
+    def start() -> None:
+        with suppress(Exception):  # as the docstring says
+            torch.empty(1, device=device)
+
     if device.startswith("cuda"):
-        Thread(target=partial(torch.empty, 1, device=device), name="wake", daemon=True).start()
+        Thread(target=start, name="wake", daemon=True).start()
 
 
 def choose_device(device: str) -> str:

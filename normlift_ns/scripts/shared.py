@@ -71,6 +71,8 @@ def run_process(command: type[Command]) -> NoReturn:
     except SystemExit as stop:
         code = stop.code
     atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        _flushed(stream, tell=False)  # what those functions have printed
     os._exit(code)
 
 

@@ -168,6 +168,6 @@ def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(bod
     slow = "class Slow:\n    def __del__(self):\n        print('taken down')\nkept = Slow()\n"
     program = PROGRAM.format(body=textwrap.indent(body, " " * 8)).replace("run_command", "run_process")
     program = slow + "import atexit; atexit.register(print, 'duty')\n" + program
-    state = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
+    state = os.environ | {"XDG_STATE_HOME": str(tmp_path), "PYTHONUNBUFFERED": ""}
     done = subprocess.run([sys.executable, "-c", program], env=state, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
