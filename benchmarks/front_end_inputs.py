@@ -120,10 +120,8 @@ class Injected(SamNetwork):
         return 600 * (radius - away) + 12 * waves, 0.8 + 0.2 * torch.sin(phase)
 
 
-def injected_sam(
-    size: Size, model: Any, device: str, precision: SamPrecision = "auto", compiled: bool = False
-) -> SamMasks:
+def injected_sam(size: Size, model: Any, device: str, precision: SamPrecision = "auto") -> SamMasks:
     Injected.side = size.vision[3]
     sam = SamMasks("nobody/nothing", rules=MaskRules(points_per_side=size.points), device=device, precision=precision)
-    vars(sam)["network"] = Injected(model, device, precision, compiled)
+    vars(sam)["network"] = Injected(model, device, precision)
     return sam

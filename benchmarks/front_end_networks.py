@@ -1,4 +1,4 @@
-"""Times and errors of SAM's network alone, in every precision, compiled and as it is."""
+"""Times and errors of SAM's network alone, in every precision."""
 
 from __future__ import annotations
 
@@ -66,27 +66,19 @@ def decode_all(network: SamNetwork, embeddings: list[Tensor], points: Tensor) ->
 def add_networks(
     report: Report, model: Any, pixels: Tensor, points: Tensor, device: str, exact: Exact, variants: bool
 ) -> None:
-    """Times of the network in other precisions and, where asked for, compiled."""
-    others: list[tuple[SamPrecision, bool]] = [
-        ("float16", False),
-        ("bfloat16", False),
-        ("float16", True),
-        ("bfloat16", True),
-    ]
-    kinds: list[tuple[SamPrecision, bool]] = [("float32", False), *(others if variants else [])]
-    for precision, compiled in kinds:
-        network = SamNetwork(model, device, precision, compiled)
-        name = f"sam_{'compiled_' * compiled}{precision}"
-        if not compiled:
-            unit, error = f"s/image, {len(pixels)} crops", exact.encoder_error(network, pixels)
-            report.add(f"{name}_encoder_s", seconds(lambda network=network: network.embed(pixels), device), unit, error)
+    """Times of the network in other precisions."""
+    others: list[SamPrecision] = ["float16", "bfloat16"]
+    for precision in ["float32", *(others if variants else [])]:
+        network = SamNetwork(model, device, precision)
+        unit, error = f"s/image, {len(pixels)} crops", exact.encoder_error(network, pixels)
+        time_s = seconds(lambda network=network: network.embed(pixels), device)
+        report.add(f"sam_{precision}_encoder_s", time_s, unit, error)
         embeddings, unit = network.embed(pixels), f"s/image, {len(pixels) * len(points)} prompts"
-        with going_on(name, compiled):
-            start = time.perf_counter()
-            error = exact.decoder_error(network)
-            report.add(f"{name}_first_s", time.perf_counter() - start, "first call, compilation included")
-            time_s = seconds(lambda network=network, e=embeddings: decode_all(network, e, points), device)
-            report.add(f"{name}_decoder_s", time_s, unit, error)
+        start = time.perf_counter()
+        error = exact.decoder_error(network)
+        report.add(f"sam_{precision}_first_s", time.perf_counter() - start, "first call, compilation included")
+        time_s = seconds(lambda network=network, e=embeddings: decode_all(network, e, points), device)
+        report.add(f"sam_{precision}_decoder_s", time_s, unit, error)
     if variants:
         for name, half, compiled in (("half", True, False), ("compiled", False, True), ("compiled_half", True, True)):
             with going_on(name, compiled):

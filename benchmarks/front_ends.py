@@ -7,7 +7,7 @@ compiled kernels are empty.
 
     python -m benchmarks.front_ends               SAM ViT-H and CLIP ViT-B-16, images of 988 x 731
     python -m benchmarks.front_ends --quick       small networks and images, which runs anywhere
-    python -m benchmarks.front_ends --variants    also other precisions, compiled networks, and where kernels spend time
+    python -m benchmarks.front_ends --variants    also other precisions, compiled encoders, and where kernels spend time
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from benchmarks.front_end_inputs import (
     random_sam,
     with_copies,
 )
-from benchmarks.front_end_networks import Exact, add_networks, decode_all, going_on, seconds
+from benchmarks.front_end_networks import Exact, add_networks, decode_all, seconds
 from benchmarks.report import RESULTS, Report
 from normlift_ns.encoders import source as source_module
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
@@ -110,14 +110,14 @@ def plain() -> Iterator[None]:
         network_module.kernels_apply = kernels_apply
 
 
-def cold(size: Size, device: str, compiled: bool) -> None:
+def cold(size: Size, device: str) -> None:
     """Prints the seconds of some images, the first of this process; networks are there."""
     g = torch.Generator().manual_seed(0)
     model = random_sam(size, device)
     with tempfile.TemporaryDirectory() as folder:
         encoder = random_clip(size, Path(folder), device)
         _ = encoder.network
-    source = RegionFeatures(injected_sam(size, model, device, compiled=compiled), encoder)
+    source = RegionFeatures(injected_sam(size, model, device), encoder)
     shape = (size.cold, size.height, size.width, 3)
     images = torch.randint(0, 256, shape, generator=g, dtype=torch.uint8)
     start, first = time.perf_counter(), 0.0
@@ -126,12 +126,12 @@ def cold(size: Size, device: str, compiled: bool) -> None:
     print(json.dumps([time.perf_counter() - start, first]))
 
 
-def cold_seconds(quick: bool, device: str, compiled: bool = False) -> tuple[float, float]:
+def cold_seconds(quick: bool, device: str) -> tuple[float, float]:
     """Of a process of its own without compiled kernels: of all images, and until the first is done."""
     with tempfile.TemporaryDirectory() as folder:
         caches = {name: f"{folder}/{name}" for name in ("TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR")}
         command = [sys.executable, "-m", "benchmarks.front_ends", "--cold", "--device", device]
-        command += ["--quick"] * quick + ["--compiled"] * compiled
+        command += ["--quick"] * quick
         done = subprocess.run(command, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(done.stderr)
@@ -235,10 +235,6 @@ def main(quick: bool, output: Path, device: str, variants: bool) -> None:
     )
     report.add("cold_first_s", first_s, "s of these for the first")
     if variants:
-        with going_on("compiled decoder", True):
-            report.add(
-                f"cold_{size.cold}_compiled_s", cold_seconds(quick, device, True)[0], "the same, decoder compiled"
-            )
         print_profile(lambda: source.view(image, ""), device)
     patches = PatchFeatures(encoder, size.patches)
     near = PatchFeatures(exact, size.patches).features(image, "")
@@ -252,13 +248,12 @@ def main(quick: bool, output: Path, device: str, variants: bool) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small networks and images")
-    parser.add_argument("--variants", action="store_true", help="other precisions, compiled networks, a profile")
+    parser.add_argument("--variants", action="store_true", help="other precisions, compiled encoders, a profile")
     parser.add_argument("--cold", action="store_true", help="only some images in this process, which are timed")
-    parser.add_argument("--compiled", action="store_true", help="these with a compiled decoder")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()
     if arguments.cold:
-        cold(SMALL if arguments.quick else Size(), arguments.device, arguments.compiled)
+        cold(SMALL if arguments.quick else Size(), arguments.device)
     else:
         main(arguments.quick, arguments.output, arguments.device, arguments.variants)

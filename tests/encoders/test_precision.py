@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-import normlift_ns.encoders.sam.decoder as decoder_module
 from normlift_ns.encoders.build import make_regions
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
@@ -75,25 +74,6 @@ def test_errors_are_no_larger_than_those_of_transformers(tmp_path, embedding, pr
     assert 0 < here < (1.5 if precision == "float32" else 0.8) * there
 
 
-def test_a_compiled_decoder_gets_batches_of_one_size(checkpoint, embedding, expected, monkeypatch):
-    asked = []
-
-    def compile_nothing(function, **options):
-        assert options == {"dynamic": False}
-
-        def answer(image, placed, prompts):
-            asked.append(len(prompts))
-            return function(image, placed, prompts)
-
-        return answer
-
-    monkeypatch.setattr(decoder_module.torch, "compile", compile_nothing)
-    network = SamNetwork(load_sam(str(checkpoint)), "cpu", "float32", compiled=True)
-    parts = list(network.prompt(embedding, POINTS, (SIDE, SIDE)))
-    close(tuple(map(torch.cat, zip(*parts))), expected, 2e-6)
-    assert asked == [16, 16] and [len(part[1]) for part in parts] == [16, 5]
-
-
 def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
     network = SamNetwork.load(str(checkpoint), "cpu", "float16")
     huge = 1e6 * embedding  # beyond float16
@@ -119,10 +99,9 @@ def test_the_option_reaches_the_network(checkpoint):
 
 
 @needs_cuda
-@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize(("precision", "bound"), [("float32", 1e-4), ("float16", 8e-3), ("bfloat16", 4e-2)])
-def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected, precision, bound, compiled):
-    network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision, compiled)
+def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected, precision, bound):
+    network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision)
     close(network.decode(embedding.cuda(), POINTS), expected, bound)
 
 

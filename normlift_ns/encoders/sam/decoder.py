@@ -16,13 +16,14 @@ image, thousands per point, is in the precision of the decoder:
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import gelu, layer_norm, linear, pad, scaled_dot_product_attention
+from torch.nn.functional import gelu, layer_norm, linear, scaled_dot_product_attention
+
+from normlift_ns.core.gpu import kernels_apply
 
 Answers = tuple[Float[Tensor, "p 3 y x"], Float[Tensor, "p 3"]]
 """Logits and predicted IoU of the three masks of each point."""
@@ -31,32 +32,24 @@ Answers = tuple[Float[Tensor, "p 3 y x"], Float[Tensor, "p 3"]]
 class MaskDecoder:
     """The decoder of a model, on the model's device."""
 
-    def __init__(self, model: Any, dtype: torch.dtype, compiled: int | None = None) -> None:
+    def __init__(self, model: Any, dtype: torch.dtype) -> None:
         """
         Args:
             model: transformers' SamModel.
             dtype: of the image in the decoder, and of the logits.
-            compiled: points per call of a compiled decoder, to which all calls are filled up; None: not compiled.
         """
-        self._model, self._dtype, self._compiled = model, dtype, compiled
+        self._model, self._dtype = model, dtype
         self._positions = model.get_image_wide_positional_embeddings().detach().flatten(2)[0].T.contiguous()
         self._upscaling = _upscaling(model, dtype)
-        self._norms = [_norm(layer.layer_norm4, dtype) for layer in model.mask_decoder.transformer.layers]
-        self._answer: Callable[..., Answers] = self._decode
-        if compiled is not None:
-            self._answer = torch.compile(self._decode, dynamic=False)
+        self._norms = [_Norm.of(layer.layer_norm4, dtype) for layer in model.mask_decoder.transformer.layers]
 
     @torch.no_grad()
     def __call__(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "p 2"]) -> Answers:
         """The masks of points, (x, y) in pixels of the input."""
-        count = len(points)
-        if self._compiled is not None:
-            points = pad(points, (0, 0, 0, max(0, self._compiled - count)))
         labels = torch.ones(1, len(points), 1, dtype=torch.int32, device=points.device)
         prompts, dense = self._model.get_prompt_embeddings(input_points=points[None, :, None], input_labels=labels)
         image = (embedding + dense).flatten(2)[0].T
-        masks, ious = self._answer(image.to(self._dtype), (image + self._positions).to(self._dtype), prompts[0])
-        return masks[:count], ious[:count]
+        return self._decode(image.to(self._dtype), (image + self._positions).to(self._dtype), prompts[0])
 
     def _decode(self, image: Tensor, placed: Tensor, prompts: Tensor) -> Answers:
         """
@@ -144,9 +137,19 @@ def _to_tokens(attention: Any, where: Tensor, what: Tensor, keys: Tensor, scores
     return torch.baddbmm(every, shares.transpose(1, 2), rows.flatten(1, 2).to(keys.dtype))
 
 
-def _norm(norm: Any, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
-    weight, bias = norm.weight.detach().to(dtype), norm.bias.detach().to(dtype)
-    return partial(layer_norm, normalized_shape=weight.shape, weight=weight, bias=bias, eps=norm.eps)
+class _Norm(NamedTuple):
+    """A layer norm over the last axis."""
+
+    weight: Tensor
+    bias: Tensor
+    eps: float
+
+    @classmethod
+    def of(cls, norm: Any, dtype: torch.dtype) -> _Norm:
+        return cls(norm.weight.detach().to(dtype), norm.bias.detach().to(dtype), norm.eps)
+
+    def __call__(self, values: Tensor) -> Tensor:
+        return layer_norm(values, self.weight.shape, self.weight, self.bias, self.eps)
 
 
 class _Upscaling(NamedTuple):
@@ -157,11 +160,15 @@ class _Upscaling(NamedTuple):
     weights: tuple[Tensor, Tensor]
     """[4 O, C] each: a position becomes four, row by row, with O channels."""
     biases: tuple[Tensor, Tensor]
-    """[4 O]."""
-    norm: Callable[[Tensor], Tensor]
+    """[O] each."""
+    norm: _Norm
 
     def __call__(self, keys: Float[Tensor, "p n c"], wanted: Float[Tensor, "p m o"]) -> Float[Tensor, "p m y x"]:
         """Products of the channels of every pixel with those of each mask."""
+        if kernels_apply(keys) and keys.dtype != torch.float32:
+            from normlift_ns.kernels.upscaling import upscaled_masks  # noqa: PLC0415 (only where Triton is)
+
+            return upscaled_masks(keys, self.weights, self.biases, self.norm, wanted, self.side)
         pixels = gelu(self.norm(self._grow(0, keys)))  # [P, N, 4, O]
         pixels = gelu(self._grow(1, pixels))  # [P, N, 4, 4, O]
         found = wanted @ pixels.flatten(1, 3).transpose(1, 2)
@@ -169,12 +176,12 @@ class _Upscaling(NamedTuple):
         return places.permute(0, 1, 2, 4, 6, 3, 5, 7).flatten(5, 7).flatten(2, 4)
 
     def _grow(self, step: int, pixels: Tensor) -> Tensor:
-        return linear(pixels, self.weights[step], self.biases[step]).unflatten(-1, (4, -1))
+        return linear(pixels, self.weights[step], self.biases[step].repeat(4)).unflatten(-1, (4, -1))
 
 
 def _upscaling(model: Any, dtype: torch.dtype) -> _Upscaling:
     decoder, side = model.mask_decoder, model.config.prompt_encoder_config.image_embedding_size
     steps = decoder.upscale_conv1, decoder.upscale_conv2
     first, second = (step.weight.detach().permute(2, 3, 1, 0).flatten(0, 2).to(dtype).contiguous() for step in steps)
-    biases = steps[0].bias.detach().to(dtype).repeat(4), steps[1].bias.detach().to(dtype).repeat(4)
-    return _Upscaling(side, (first, second), biases, _norm(decoder.upscale_layer_norm, dtype))
+    biases = steps[0].bias.detach().to(dtype), steps[1].bias.detach().to(dtype)
+    return _Upscaling(side, (first, second), biases, _Norm.of(decoder.upscale_layer_norm, dtype))

@@ -35,19 +35,14 @@ class SamNetwork:
     """A SAM on a device, in one precision: products of matrices in that, sums and normalisations in float32. In the
     mask decoder what belongs to prompts, not to positions of the image, is float32 in any case."""
 
-    def __init__(self, model: Any, device: str, precision: SamPrecision = "auto", compiled: bool = False) -> None:
-        """
-        Args:
-            compiled: let torch.compile make kernels of the mask decoder, which takes half a minute once. It pays where
-                there are hundreds of images.
-        """
+    def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         self._model = model.to(device)
         self._device = torch.device(device)
         self._dtype: torch.dtype = getattr(torch, resolve_precision(precision, device))
         self._side: int = model.config.vision_config.image_size
         images, prompts, masks = _BATCHES["cuda" if self._device.type == "cuda" else "cpu"]
         self._images, self._prompts = Batches(images), Batches(prompts)
-        self._decoder = MaskDecoder(self._model, self._dtype, prompts if compiled else None)
+        self._decoder = MaskDecoder(self._model, self._dtype)
         self.masks = Batches(masks)
         """For what is done with masks at the size of the image."""
 
