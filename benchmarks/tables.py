@@ -36,7 +36,7 @@ def tables(found: Documents) -> dict[str, str]:
         "held-out": held_out(fit),
         "presets": presets(found["presets"], accuracy, found["losses"]),
         "stages": stages(h100),
-        "core-gpu": every_metric(h100),
+        "growth": growth(h100),
         "core-cpu": every_metric(found["cpu"]),
         "forms": every_metric(found["forms"], "_tol0.01_"),
         "numerics-rule": numerics_rule(),
@@ -166,14 +166,47 @@ def presets(document: Document, accuracy: Document, losses: Document) -> str:
 
 
 def stages(h100: Document) -> str:
-    """Seconds of the stages of a lift, in the columns of the paper's table."""
-    v, rows = h100.values, []
-    for case in [k.removesuffix(".total_s") for k in v if k.endswith(".total_s")]:
-        size = f"{v[f'{case}.gaussians'] / 1e6:.2f} M, {v[f'{case}.views']:.0f}"
-        post = v[f"{case}.reliability_s"] + v[f"{case}.neighbors_s"] + v[f"{case}.vote_s"]
-        times = (v[f"{case}.evidence_lift_s"], post, v[f"{case}.total_s"])
-        rows.append((case, size, *(f"{t:.3f} s" for t in times), f"{v[f'{case}.peak_gib']:.1f} GiB"))
-    return table(("", "Gaussians, views", "lift", "reliability, neighbours, vote", "total", "peak memory"), rows)
+    """Seconds of the stages of a lift on a GPU with their errors against float64, one column per scene."""
+    v, error = h100.values, {metric.key: metric.error for metric in h100.metrics}
+    scenes = [key.removesuffix(".total_s") for key in v if key.endswith(".total_s")]
+
+    def row(name: str, key: str, form: str, scale: float = 1.0, *, with_error: bool = False) -> list[str]:
+        cells = [form.format(v[f"{one}.{key}"] / scale) for one in scenes]
+        if with_error:
+            off = (error[f"{one}.{key}"] for one in scenes)
+            cells = [f"{cell}, {'0' if e == 0 else f'{e:.0e}'}" for cell, e in zip(cells, off)]
+        return [name, *cells]
+
+    rows = [
+        row("Gaussians", "gaussians", "{:.2f} M", 1e6),
+        row("views", "views", "{:.0f}"),
+        row("RGB render of the views, stock gsplat", "rgb_s", "{:.3f} s"),
+        row("evidence", "evidence_s", "{:.3f} s", with_error=True),
+        row("lift: reliability and directions", "lift_s", "{:.3f} s", with_error=True),
+        row("evidence + lift over RGB", "evidence_lift_over_rgb", "{:.2f}"),
+        row("neighbours, K = 36", "neighbors_s", "{:.3f} s", with_error=True),
+        row("vote", "vote_s", "{:.3f} s", with_error=True),
+        row("all of it", "total_s", "{:.2f} s"),
+        row("one text query", "query_ms", "{:.1f} ms"),
+        row("peak memory of the GPU", "peak_gib", "{:.1f} GiB"),
+        row("stock gsplat's 512-channel backward", "gsplat512_s", "{:.1f} s"),
+        row("intersections of the first view", "intersections_per_view", "{:.2f} M", 1e6),
+        row("contributors per pixel", "contributors_per_pixel", "{:.0f}"),
+        row("entries of the evidence", "nonzeros", "{:.1f} M", 1e6),
+    ]
+    return table(("", *scenes), rows)
+
+
+def growth(h100: Document) -> str:
+    """Time for evidence as one quantity grows."""
+    found = [m for m in h100.metrics if m.key.startswith("growth.")]
+    names = [m.key.split(".", 1)[1].removesuffix(".evidence_s").rsplit("_", 1) for m in found]
+    rows = []
+    for what in dict.fromkeys(name for name, _ in names):
+        mine = [(size, metric.value) for (name, size), metric in zip(names, found) if name == what]
+        label = {"scale": "side of the image", "n": "Gaussians"}.get(what, what)
+        rows.append((label, ", ".join(f"{size}: {1e3 * time:.0f}" for size, time in mine)))
+    return table(("quantity", "milliseconds"), rows)
 
 
 def overhead(document: Document) -> str:

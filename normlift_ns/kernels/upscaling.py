@@ -13,6 +13,7 @@ from torch import Tensor
 
 _BLOCK = 64
 """Positions of a program."""
+_WARPS = 4
 
 
 @triton.jit
@@ -46,8 +47,8 @@ def _upscale(
         normed = centred * tl.rsqrt(spread + eps)[:, None] * gain[None, :] + offset[None, :]
         pixel = _gelu(normed).to(keys.dtype.element_ty)
         for j in range(4):
-            matrix = second + (j * last + o)[None, :] * middle + m[:, None]
-            finer = tl.dot(pixel, tl.load(matrix, mask=of_o[None, :] & of_m[:, None], other=0.0))
+            finest = second + (j * last + o)[None, :] * middle + m[:, None]
+            finer = tl.dot(pixel, tl.load(finest, mask=of_o[None, :] & of_m[:, None], other=0.0))
             finer = _gelu(finer + bias[None, :])
             row, column = 2 * (i // 2) + j // 2, 2 * (i % 2) + j % 2
             for mask in tl.static_range(MASKS):
@@ -80,6 +81,6 @@ def upscaled_masks(
     _upscale[(triton.cdiv(positions, _BLOCK), prompts)](
         keys.contiguous(), weights[0], biases[0], norm[0], norm[1], weights[1], biases[1], wanted.contiguous(), masks,
         positions, side, channels, middle, last, norm[2],
-        MASKS=wanted.shape[1], BLOCK=_BLOCK, C=padded[0], M=padded[1], L=padded[2], num_warps=4,
+        MASKS=wanted.shape[1], BLOCK=_BLOCK, C=padded[0], M=padded[1], L=padded[2], num_warps=_WARPS,
     )  # fmt: skip
     return masks
