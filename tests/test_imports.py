@@ -39,7 +39,7 @@ FOREIGN = {
     "kernels": {"torch", "jaxtyping", "triton"},
     "core": BASE | {"xxhash", "msgspec"},
     "raster": {"torch", "numpy", "jaxtyping", "numba", "gsplat"},
-    "encoders": BASE | {"xxhash", "open_clip", "matplotlib", "skimage", "PIL", "huggingface_hub", "torchvision"},
+    "encoders": BASE | {"xxhash", "open_clip", "skimage", "PIL", "huggingface_hub", "torchvision"},
     "observing": {"torch", "jaxtyping", "xxhash"},
     "objects": BASE,
     "lifting": {"torch", "jaxtyping"},

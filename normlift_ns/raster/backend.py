@@ -13,6 +13,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.errors import InputError
 from normlift_ns.raster.projection import Projected, Tiles, World, assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
@@ -38,6 +39,17 @@ class Job:
         """What a camera sees of them, and in which tiles."""
         projected = project(self.world, camera, self.settings, self.antialiased)
         return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
+
+
+def check_gpu(backend: str, job: Job) -> None:
+    """Raises ValueError for a job that is not in float32 on a GPU."""
+    means = job.scene.means
+    if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
+        other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
+        raise InputError(
+            f'backend "{backend}" computes in float32 on a GPU, not in {other} on {means.device.type}: leave the '
+            "backend out, and the fastest that can do it is taken"
+        )
 
 
 class Batch(NamedTuple):

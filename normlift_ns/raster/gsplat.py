@@ -21,7 +21,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
 from normlift_ns.options import KNOWN_RULES
-from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.backend import Batch, Job, check_gpu
 from normlift_ns.raster.projection import camera_depths, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
@@ -123,12 +123,7 @@ def _project_enormous(
 def check(job: Job, *, pictures: bool = False) -> None:
     """Raises ValueError for a scene that is not float32 on a GPU, and for other constants than those that the
     installed gsplat has compiled."""
-    means = job.scene.means
-    if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
-        raise InputError(
-            f"gsplat computes in float32 on a GPU; this scene is {means.dtype} on {means.device}, and wanted is "
-            f'{job.dtype}. Move it (scene.to("cuda")), or use backend="torch", which knows every device and precision'
-        )
+    check_gpu("gsplat", job)
     compiled = installed_rules()
     ours = compiled.per_axis and not job.settings.per_axis
     names = _COMPILED if ours else (*_COMPILED, *_EXTENT)

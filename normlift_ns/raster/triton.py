@@ -16,7 +16,7 @@ from normlift_ns.kernels import composite as pictures
 from normlift_ns.kernels.lists import Grid, Lists, list_cells
 from normlift_ns.kernels.projection import Rules, Splats, project
 from normlift_ns.kernels.regions import Limits, places, region_sums
-from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.backend import Batch, Job, check_gpu
 from normlift_ns.raster.settings import RasterSettings
 
 CELL, SMALL_CELL = (16, 16), (16, 8)
@@ -31,13 +31,8 @@ _SHORT = 2**15
 
 def check(job: Job, *, pictures: bool = False) -> None:
     """Raises ValueError for a scene that is not float32 on a GPU, and for tiles that cannot be halved into cells."""
-    means, size = job.scene.means, job.settings.tile_size
-    if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
-        raise InputError(
-            f'backend "triton" computes in float32 on a GPU; this scene is {means.dtype} on {means.device}, and wanted '
-            f'is {job.dtype}. Move it (scene.to("cuda")), or use backend="torch", which knows every device and '
-            "precision"
-        )
+    size = job.settings.tile_size
+    check_gpu("triton", job)
     if size < 1 or size & (size - 1) != 0:
         raise InputError(f'backend "triton" needs a tile_size that is a power of two, got {size}; use backend="torch"')
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from normlift_ns.options import SourceOptions
 from normlift_ns.ranges import check_options
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
-from normlift_ns.scripts.shared import CONSOLE, run_command, say
+from normlift_ns.scripts.shared import CONSOLE, run_process, say
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -40,10 +41,11 @@ class Demo:
 
     def main(self) -> dict[str, float]:
         """Runs the demo; returns mIoU before and after refinement."""
+        CONSOLE.rule("A room made in code")
+        warnings.simplefilter("ignore", FutureWarning)  # of packages that others must mend
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
         from normlift_ns.observing import spread  # noqa: PLC0415
 
-        CONSOLE.rule("A room made in code")
         room = demo_room(self.num_gaussians)
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
@@ -111,4 +113,4 @@ def _show(*words: object) -> None:
 
 
 if __name__ == "__main__":
-    run_command(Demo)
+    run_process(Demo)

@@ -14,7 +14,7 @@ from typing import Any
 
 from normlift_ns.core.files import clean
 from normlift_ns.errors import InputError
-from normlift_ns.options import AskOptions, SourceOptions, SplatOptions
+from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.ranges import check_texts, shown
 from normlift_ns.runs.files import FIELD_FOLDER, field_folder, refuse_existing_run, run_directory, texts_cache
 from normlift_ns.scripts.glance import glance
@@ -202,6 +202,20 @@ def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> N
     readable_folder(splat.images, "--images")
     readable_folder(splat.masks, "--masks")
     readable_file(splat.world_transform, "--world-transform")
+
+
+def check_effect(lift: LiftOptions) -> None:
+    """Options of something that is switched off."""
+    usual = LiftOptions()
+    for name in ("consensus_power", "consensus_sample"):
+        if not lift.consensus and getattr(lift, name) != getattr(usual, name):
+            raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Add that, or leave it out.")
+    if lift.vote.vote != "posterior" and lift.vote.prior != usual.vote.prior:
+        raise InputError("--prior is for --vote posterior. Add that, or leave it out.")
+    if not lift.refine and lift.vote != usual.vote:
+        changed = [name for name, value in vars(usual.vote).items() if getattr(lift.vote, name) != value]
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
+        raise InputError(f"With --refine False there is no vote: leave {flags} out.")
 
 
 def check_source(source: SourceOptions, queries: Iterable[str], data: Path | None = None) -> None:

@@ -15,7 +15,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions, pose_files
 from normlift_ns.ranges import check_device, check_options
 from normlift_ns.scripts.early import check_lifted, readable_file, readable_folder, writable_file
-from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say, say_opening
 
 if TYPE_CHECKING:
     from normlift_ns.evaluation.protocols import EvaluatedRun
@@ -69,6 +69,7 @@ class NormLiftEval:
     def main(self) -> Evaluation:
         """Evaluates, writes and prints."""
         self._check()
+        say_opening(*self.load_config)
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.coverage.files import write_poses  # noqa: PLC0415
         from normlift_ns.evaluation.coverage.study import coverage_of  # noqa: PLC0415

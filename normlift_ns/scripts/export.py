@@ -13,7 +13,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import MIN_SIZE, REACH, AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
 from normlift_ns.scripts.early import check_lifted, has_question, writable_file
-from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say, say_opening
 
 
 @dataclass
@@ -61,6 +61,7 @@ class NormLiftExport:
         refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
         for file in files:
             writable_file(file, "--output-dir")
+        say_opening(self.load_config)
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.objects import find_objects  # noqa: PLC0415
 

@@ -18,7 +18,14 @@ from rich.text import Text
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.ranges import check_device, check_options
-from normlift_ns.scripts.early import check_config, check_new_run, check_source, check_splat, writable_folder
+from normlift_ns.scripts.early import (
+    check_config,
+    check_effect,
+    check_new_run,
+    check_source,
+    check_splat,
+    writable_folder,
+)
 from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
 
 if TYPE_CHECKING:
@@ -108,6 +115,7 @@ class NormLift:
             check_splat(self.load_ply, self.load_gsplat, self.splat)
         else:
             check_config(self.load_config, self.data, self.load_step)
+        check_effect(self.lift)
         check_source(self.source, self.queries)
         check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
         writable_folder(self.export_langsplat, "--export-langsplat")
@@ -141,7 +149,7 @@ class NormLift:
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
-    """One bar per stage, with the time left."""
+    """One bar per stage, with the time left; a line per stage where nobody watches."""
     names = {
         "features": "2D features",
         "lift": "lift, reliability",
@@ -154,6 +162,16 @@ def progress_bars() -> Iterator[Report]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
+    begun: set[str] = set()
+
+    def tell(stage: str, done: int, total: int) -> None:
+        if stage not in begun:
+            begun.add(stage)
+            say(f"{names.get(stage, stage)} …")
+
+    if not CONSOLE.is_terminal:
+        yield tell
+        return
     with Progress(*columns, console=CONSOLE) as progress:
         tasks: dict[str, TaskID] = {}
 

@@ -17,7 +17,7 @@ from normlift_ns.options import AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.scripts.early import check_lifted, different, writable_file, writable_folder
-from normlift_ns.scripts.shared import run_command, run_process, say
+from normlift_ns.scripts.shared import run_command, run_process, say, say_opening
 
 if TYPE_CHECKING:
     from normlift_ns.question import Question
@@ -62,6 +62,7 @@ class NormLiftQuery:
     def main(self) -> list[dict[str, Any]]:
         """Asks, writes and prints; returns the rows of the table."""
         self._check()
+        say_opening(self.load_config)
         from normlift_ns.runs.question import save_question  # noqa: PLC0415 (--help should not wait for NumPy)
         from normlift_ns.scripts.prompting import answer_lines, converse, show  # noqa: PLC0415
 

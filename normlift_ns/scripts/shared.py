@@ -146,6 +146,11 @@ def say(text: str) -> None:
     CONSOLE.print(plain(text), soft_wrap=True)
 
 
+def say_opening(*paths: Path) -> None:
+    """The first sign of life, on standard error, which no program reads."""
+    say_error("Opening " + ", ".join(map(str, paths)))
+
+
 def say_error(text: str) -> None:
     """A message on standard error, as it is."""
     with suppress(OSError):  # nobody can be told

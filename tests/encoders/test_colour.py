@@ -1,6 +1,8 @@
 """The colour encoder against its own formulas."""
 
+import json
 import math
+from importlib.resources import files
 
 import pytest
 import torch
@@ -11,7 +13,8 @@ from skimage.color import lab2rgb, rgb2lab
 
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.texts import colours as space
-from normlift_ns.encoders.texts.colours import SIGMA, colour_names
+from normlift_ns.encoders.texts.colours import SIGMA, ColourTexts, colour_names
+from normlift_ns.errors import InputError
 
 COLOUR = ColourEncoder()
 rgb = st.tuples(*[st.floats(0, 1, width=32)] * 3)
@@ -31,6 +34,21 @@ def shading_coordinates(colours: torch.Tensor) -> torch.Tensor:
 
 def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.linalg.vector_norm(shading_coordinates(a) - shading_coordinates(b), dim=1)
+
+
+def test_the_names_are_those_of_the_survey():
+    """As matplotlib ships them."""
+    table = json.loads(files("normlift_ns.encoders.texts").joinpath("xkcd.json").read_text())
+    assert {f"xkcd:{name}": colour for name, colour in table.items()} == XKCD_COLORS
+
+
+def test_coarse_names_are_understood_but_not_offered():
+    colour = ColourTexts()
+    assert colour.rows(["shit brown"]).shape == (1, 343)
+    for text in ("wooden shield", "pupe", "shift", "vomitt"):
+        with pytest.raises(InputError) as error:
+            colour.rows([text])
+        assert not any(word in str(error.value).split("such as")[1] for word in ("shit", "poo", "vomit", "puke"))
 
 
 def test_the_cosine_is_the_kernel_within_the_documented_error():

@@ -171,3 +171,20 @@ def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(bod
     state = os.environ | {"XDG_STATE_HOME": str(tmp_path), "PYTHONUNBUFFERED": ""}
     done = subprocess.run([sys.executable, "-c", program], env=state, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
+
+
+@pytest.mark.parametrize("command", ["lift", "query", "export", "evaluate"])
+def test_ctrl_c_while_a_command_is_loaded(command):
+    """Its modules raise what Python raises for Ctrl-C."""
+    program = f"""
+import sys
+class Stop:
+    def find_spec(self, name, path=None, target=None):
+        if name == "normlift_ns.scripts.{command}":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Stop())
+from normlift_ns.scripts import start
+start.{command}()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "Interrupted.\n")

@@ -1,7 +1,7 @@
 """A joint space of image regions and texts without learned weights: colours, as they look under changing light.
 
-A region is its mean CIELAB colour, a text the colours that it names (the 949 names of the XKCD colour survey, which
-matplotlib ships). Shade multiplies the light of a surface by a factor, under which L* + 16, a* and b* all change by
+A region is its mean CIELAB colour, a text the colours that it names (the 949 names of the XKCD colour survey, in
+`xkcd.json`). Shade multiplies the light of a surface by a factor, under which L* + 16, a* and b* all change by
 one factor too. Colours are therefore compared in coordinates that discount it, close to those of CIELAB at L* = 50::
 
     p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
@@ -21,10 +21,12 @@ of sRGB: with L L^T the kernel matrix of the anchors, phi(x) = L^-1 k(anchors, x
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +46,8 @@ _LEVELS = 7
 _LEVEL_POWER = 1.5
 """Above 1, the lattice is denser among dark colours, whose coordinates change fast."""
 _JITTER = 1e-10
+_COARSE = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop", "puke", "shit", "snot", "vomit"})
+"""Words of the survey that are understood, but not offered."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +143,12 @@ def _words(text: str) -> list[str]:
 def _names() -> dict[str, np.ndarray]:
     """CIELAB colour of every name. The survey has eleven names twice, as "blue green" and "blue/green": the former
     counts."""
-    from matplotlib.colors import XKCD_COLORS, to_rgb  # noqa: PLC0415 (what other encoders do without is not loaded)
-    from skimage.color import rgb2lab  # noqa: PLC0415
+    from skimage.color import rgb2lab  # noqa: PLC0415 (what other encoders do without is not loaded)
 
-    colours = sorted(XKCD_COLORS.items(), key=lambda item: "/" in item[0], reverse=True)
-    names = [" ".join(_words(name.removeprefix("xkcd:"))) for name, _ in colours]
-    lab = rgb2lab(np.array([to_rgb(colour) for _, colour in colours]))
+    table = json.loads(Path(__file__).with_name("xkcd.json").read_text(encoding="utf8"))
+    colours = sorted(table.items(), key=lambda item: "/" in item[0], reverse=True)
+    names = [" ".join(_words(name)) for name, _ in colours]
+    lab = rgb2lab(np.array([list(bytes.fromhex(colour[1:])) for _, colour in colours]) / 255)
     return dict(zip(names, lab))
 
 
@@ -170,6 +174,7 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _unknown(prompt: str) -> str:
     names = list(_names())
     near = [name for word in [prompt.lower(), *_words(prompt)] for name in difflib.get_close_matches(word, names)]
+    near = [name for name in near if _COARSE.isdisjoint(name.split())]
     shown = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
         f"text {prompt!r} contains no colour name; the colour encoder knows the names of the XKCD colour survey only, "
