@@ -212,10 +212,6 @@ def check_effect(lift: LiftOptions) -> None:
             raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Add that, or leave it out.")
     if lift.vote.vote != "posterior" and lift.vote.prior != usual.vote.prior:
         raise InputError("--prior is for --vote posterior. Add that, or leave it out.")
-    if not lift.refine and lift.vote != usual.vote:
-        changed = [name for name, value in vars(usual.vote).items() if getattr(lift.vote, name) != value]
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
-        raise InputError(f"With --refine False there is no vote: leave {flags} out.")
 
 
 def check_source(source: SourceOptions, queries: Iterable[str], data: Path | None = None) -> None:
