@@ -67,8 +67,8 @@ def add_networks(
     report: Report, model: Any, pixels: Tensor, points: Tensor, device: str, exact: Exact, variants: bool
 ) -> None:
     """Times of the network in other precisions."""
-    others: list[SamPrecision] = ["float16", "bfloat16"]
-    for precision in ["float32", *(others if variants else [])]:
+    precisions: list[SamPrecision] = ["float32", "float16", "bfloat16"]
+    for precision in precisions if variants else precisions[:1]:
         network = SamNetwork(model, device, precision)
         unit, error = f"s/image, {len(pixels)} crops", exact.encoder_error(network, pixels)
         time_s = seconds(lambda network=network: network.embed(pixels), device)

@@ -71,12 +71,12 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
     Raises:
         ValueError: some lines could not be answered; each of them was printed with its `error`.
     """
-    if lines is None:
-        lines = [] if sys.stdin is None else sys.stdin.buffer
+    stdin: Any = sys.stdin  # None where it is closed
+    given: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
     if sys.stdout is None:
         raise InputError("the standard output is closed; --stdin prints its answers there")
     failed = asked = 0
-    for line in lines:
+    for line in given:
         text = line.decode("utf8", "replace").lstrip("\ufeff").strip()  # Windows begins files with that character
         if text == "":
             continue
