@@ -70,7 +70,7 @@ def plot_accuracy(document: Document, target: Path) -> Path:
         axes.bar(places, values, width, yerr=bars, label=TITLES[name], error_kw={"linewidth": 0.6})
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_ylabel("mIoU over Gaussians, points")
-    axes.legend(fontsize=8, ncols=3)
+    figure.legend(loc="outside upper center", fontsize=8, ncols=4)
     axes.grid(axis="y", alpha=0.3)
     return _saved(figure, target)
 

@@ -316,7 +316,7 @@ def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: it compares a GPU with a CPU")
 def test_a_gpu_finds_what_a_cpu_finds():
-    """But for cosines in half precision, and for which of equal directions is copied."""
+    """But for cosines in half precision, and for pixels on the edges of masks."""
     sizes = replace(QUICK, voters=None)
     candidates = [one for one in CANDIDATES if one.delta == 0]
     for cell in cells_of("second"):
@@ -325,7 +325,7 @@ def test_a_gpu_finds_what_a_cpu_finds():
             found = {device: site.run(cell, 3, candidates) for device, site in on.items()}
             for name, result in found["cpu"].items():
                 assert found["cuda"][name].miou == pytest.approx(result.miou, abs=1.5), (cell, name)
-                assert found["cuda"][name].copied == pytest.approx(result.copied, abs=0.06), (cell, name)
+                assert found["cuda"][name].copied == pytest.approx(result.copied, abs=0.03), (cell, name)
 
 
 @pytest.mark.slow

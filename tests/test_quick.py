@@ -137,6 +137,20 @@ def test_lines_are_answered_as_they_come(lifted, monkeypatch):
         answer_lines(run, {}, lines())
 
 
+def test_lines_of_windows_and_closed_streams(lifted, monkeypatch):
+    run, shown = quick.open_quick(lifted), io.StringIO()
+    assert run is not None
+    monkeypatch.setattr(sys, "stdout", shown)
+    answer_lines(run, {}, [b"\xef\xbb\xbfred\r\n"])
+    assert json.loads(shown.getvalue())["text"] == "red"
+    monkeypatch.setattr(sys, "stdin", None)
+    answer_lines(run, {})
+    assert len(shown.getvalue().splitlines()) == 1
+    monkeypatch.setattr(sys, "stdout", None)
+    with pytest.raises(InputError, match="standard output is closed"):
+        answer_lines(run, {}, [b"red"])
+
+
 def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     run = quick.open_quick(lifted)

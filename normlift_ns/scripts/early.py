@@ -205,7 +205,7 @@ def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> N
 
 
 def check_effect(lift: LiftOptions) -> None:
-    """Options of something that is switched off."""
+    """Raises ValueError for options of something that is switched off."""
     usual = LiftOptions()
     for name in ("consensus_power", "consensus_sample"):
         if not lift.consensus and getattr(lift, name) != getattr(usual, name):

@@ -30,7 +30,7 @@ def test_a_person_finds_the_fox(fox_run: Path, tmp_path: Path, pictures: Path) -
         assert "No query yet." in tab.status()
 
         tab.choose("Output type", "overlay")
-        tab.until(lambda: coloured(tab.picture()).mean() < 0.001, "grey, as nothing is asked", timeout=180)
+        tab.until(lambda: coloured(tab.picture()).mean() < 0.001, "grey, as nothing is asked", timeout=60)
         tab.type("Prompts", "orange; crimson")
         tab.press("Query")
         tab.says("crimson")
@@ -49,9 +49,7 @@ def test_a_person_finds_the_fox(fox_run: Path, tmp_path: Path, pictures: Path) -
 
         tab.choose("Prompt shown", "1: crimson")
         tab.until(
-            lambda: (coloured(tab.picture()) & orange).sum() < 0.05 * orange.sum(),
-            "the fox is not crimson",
-            timeout=180,
+            lambda: (coloured(tab.picture()) & orange).sum() < 0.05 * orange.sum(), "the fox is not crimson", timeout=60
         )
         tab.choose("Prompt shown", "0: orange")
 

@@ -12,7 +12,10 @@ import pytest
 import yaml
 
 from normlift_ns.encoders import weights
+from normlift_ns.errors import InputError
+from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.scripts import evaluate, export, lift, query
+from normlift_ns.scripts.early import check_effect
 from normlift_ns.scripts.glance import glance
 from tests.scripts.conftest import run_entry, said
 
@@ -286,3 +289,17 @@ def test_a_mistake_costs_little_and_imports_nothing_heavy(module, flags, config,
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     assert after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime < MOST_SECONDS
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"consensus_power": 2.0}, "--consensus-power is for --consensus True"),
+        ({"consensus_sample": 9}, "--consensus-sample is for --consensus True"),
+        ({"vote": RefineConfig(prior=2.0)}, "--prior is for --vote posterior"),
+    ],
+)
+def test_options_of_what_is_off_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        check_effect(LiftOptions(**options))
+    check_effect(LiftOptions(consensus=True, consensus_power=2.0, vote=RefineConfig(vote="posterior", prior=2.0)))
