@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: test test-slow torture demo bench lint format clean
+.PHONY: test test-slow test-viser1 soak torture demo bench lint format clean
 
 .venv/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 12) else f"Python 3.10 to 3.12 is needed, this is {v[0]}.{v[1]}; try: make PYTHON=python3.11 $(MAKECMDGOALS)")'
@@ -21,6 +21,14 @@ test: lint
 
 test-slow: .venv/installed
 	$(BIN)/pytest -m slow
+
+# The viewer with viser 1.x, in an environment of its own
+test-viser1: .venv/installed
+	$(BIN)/pytest -m slow tests/browser/test_viser1.py
+
+# A monkey before both viewers: make soak MINUTES=30 SEED=1
+soak: .venv/installed
+	NORMLIFT_SOAK=$(or $(MINUTES),30) NORMLIFT_SEED=$(or $(SEED),$$(date +%s)) $(BIN)/pytest -s -m slow tests/browser/test_monkey.py
 
 torture: .venv/installed
 	NORMLIFT_TORTURE=40 $(BIN)/pytest -m slow tests/torture

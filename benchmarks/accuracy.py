@@ -97,9 +97,10 @@ class Bench:
         lifted = lift(observed.evidence, observed.features)
         plain = lifted_scores(lifted, self.classes)
         agreed = lift(observed.evidence, consensus(observed.evidence, observed.features).features)
+        voting = replace(agreed, scalars=lifted.scalars)  # with R as regions were seen, as `normlift_ns.lifting` does
         row: dict[str, Any] = {}
         for method in METHODS:
-            given = (agreed, lifted_scores(agreed, self.classes)) if method in AGREED else (lifted, plain)
+            given = (voting, lifted_scores(agreed, self.classes)) if method in AGREED else (lifted, plain)
             scores, copied = self._refined(VOTES[method], *given)
             row[method] = scores_3d(world, scores, self.counted) | {"copied": copied}
             if others and not self.sampled:
@@ -130,7 +131,7 @@ class Bench:
         return Scores(plain.cosine[source], plain.valid[source]), copied
 
     def _presets(self, observed: Observed, lifted: Lifted, plain: Scores) -> dict[str, Any]:
-        """The full variant by faster lifts, as in `benchmarks.presets`."""
+        """The default vote by faster lifts, as in `benchmarks.presets`."""
         means = self.world.scene.means
         read = partial(lifted.directions, dtype=torch.float16)
         given = {"own": lifted.scalars.own_evidence, "neighbors": self.neighbors}
@@ -140,7 +141,7 @@ class Bench:
         columns = observed.evidence.columns_of(views)
         fewer = lift(observed.evidence.select_views(views), observed.features[columns])
         scores = lifted_scores(fewer, self.classes)
-        second = refined_scores("paper", means, fewer, scores, self.neighbors, self.config)
+        second = refined_scores(self.config.vote, means, fewer, scores, self.neighbors, self.config)
         found = {"half": half, "every_second_view": second}
         return {f"preset_{name}": scores_3d(self.world, scores, self.counted) for name, scores in found.items()}
 

@@ -1,9 +1,9 @@
 """What a semantic field costs on disk in its three forms, and what each does to queries, with and without consensus.
 
 On the tabletop capture the exact instance masks are the regions; features are real CLIP text vectors of the objects'
-names, disturbed anew in every view by noise of a given length. Errors are measured on all 1,203 names of the vector
-file, against float64 directions. On the tabletop, the demo room and the fox, the colour encoder sees masks or, where
-there are none, superpixels; its errors are measured on the survey's colour names.
+names, disturbed anew in every view by noise of a given length. Errors are measured on every eighth of the 1,203 names
+of the vector file, against float64 directions. On the tabletop, the demo room and the fox, the colour encoder sees
+masks or, where there are none, superpixels; its errors are measured on the survey's colour names.
 
     python -m benchmarks.forms
 """
@@ -37,6 +37,7 @@ from normlift_ns.encoders.source import joint_partition
 
 NOISE = (0.0, 0.05, 0.5, 1.5)
 TOLERANCES = (1e-3, 1e-2, 5e-2)
+CASES = (*(f"noise{noise}" for noise in NOISE), "demo_colour", "tabletop_colour", "fox_colour")
 
 
 def mask_labels() -> list[Tensor]:
@@ -69,26 +70,30 @@ class Case(NamedTuple):
     """[Q, D], float64."""
 
 
-def clip_cases() -> Iterator[Case]:
+def clip_cases(some: Sequence[str]) -> Iterator[Case]:
     """The tabletop with noise of several lengths."""
+    if not any(name.startswith("noise") for name in some):
+        return
     evidence, means = mask_evidence(), trained_scene("tabletop").means
     vectors = np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float64)
     names = normalize(torch.from_numpy(vectors), dim=1)
     index = {name: i for i, name in enumerate(json.loads((SHARED / "clip_vectors" / "lvis_v1_names.json").read_text()))}
     mapping = json.loads((SHARED / "clip_vectors" / "tabletop_map.json").read_text())
     classes = names[[index[mapping[str(i)]] for i in range(1, 13)]]
-    for noise in NOISE:
+    for noise in (noise for noise in NOISE if f"noise{noise}" in some):
         features = classes.repeat(evidence.num_views, 1)
         g = torch.Generator().manual_seed(0)
         features = features + noise * torch.randn(features.shape, generator=g, dtype=torch.float64) / 512**0.5
-        yield Case(f"noise{noise}", means, evidence, normalize(features, dim=1), names)
+        yield Case(f"noise{noise}", means, evidence, normalize(features, dim=1), names[::8])
 
 
-def colour_cases() -> Iterator[Case]:
+def colour_cases(some: Sequence[str]) -> Iterator[Case]:
     """Mean colours of masks, or of superpixels where there are none."""
     encoder, room = ColourEncoder(), demo_room()
+    names = [name.removesuffix("_colour") for name in some if name.endswith("_colour")]
     queries = encoder.text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
-    for name, scene in (("demo", room.scene), *((name, trained_scene(name)) for name in ("tabletop", "fox"))):
+    for name in names:
+        scene = room.scene if name == "demo" else trained_scene(name)
         cameras = demo_cameras() if name == "demo" else training_cameras(name)
         images = [view_image(room, x) for x in cameras] if name == "demo" else photographs(name, cameras)
         labels = (
@@ -110,13 +115,13 @@ def photographs(name: str, cameras: Sequence[Camera]) -> list[Tensor]:
     return [torch.from_numpy(np.array(picture)) for picture in pictures]
 
 
-def compare(case: Case, report: Report, table: Table) -> None:
+def compare(case: Case, tolerances: Sequence[float], report: Report, table: Table) -> None:
     """All forms of one case at every tolerance."""
     lifted = lift(case.evidence, case.features.float())
     some = torch.randperm(len(case.means), generator=torch.Generator().manual_seed(0))[:20000]
     exact = lift(case.evidence, case.features).directions(some) @ case.queries.T
     measured: dict[tuple[str, int | None], float] = {}
-    for tolerance in TOLERANCES:
+    for tolerance in tolerances:
         forms = SemanticField.build(lifted, case.means, tolerance=tolerance).manifest["forms"]
         chosen = min((f for f in forms if forms[f]["bound"] <= tolerance), key=lambda f: forms[f]["bytes"])
         for form, facts in forms.items():
@@ -130,25 +135,29 @@ def compare(case: Case, report: Report, table: Table) -> None:
             row = (case.name, f"{tolerance:g}", form + mark, str(key[1] or ""), f"{size:.1f}", bound, error)
             table.add_row(*row)
             report.add(f"{case.name}_tol{tolerance:g}_{form}_bytes", size, "bytes per Gaussian", measured[key])
+            print(*row, flush=True)
             if key[1] is not None:
                 dimension = case.features.shape[1]
                 report.add(f"{case.name}_tol{tolerance:g}_rank", key[1], f"of {dimension}", measured[key])
 
 
-def main(output: Path) -> None:
+def main(arguments: argparse.Namespace) -> None:
     torch.set_grad_enabled(False)
-    report = Report("forms")
+    report, some = Report("forms"), arguments.cases
     table = Table("case", "tolerance", "form", "rank", "bytes per Gaussian", "bound", "measured")
-    for case in chain(clip_cases(), colour_cases()):
-        compare(case, report, table)
+    for case in chain(clip_cases(some), colour_cases(some)):
+        compare(case, arguments.tolerances, report, table)
         agreed = consensus(case.evidence, case.features)
         report.add(f"{case.name}_agreement", agreed.agreement[0], "of 1")
-        compare(case._replace(name=f"{case.name}_consensus", features=agreed.features), report, table)
+        other = case._replace(name=f"{case.name}_consensus", features=agreed.features)
+        compare(other, arguments.tolerances, report, table)
     Console(width=120).print(table)
-    report.write(output)
+    report.write(arguments.output)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES)
+    parser.add_argument("--tolerances", nargs="+", type=float, default=list(TOLERANCES))
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
-    main(parser.parse_args().output)
+    main(parser.parse_args())

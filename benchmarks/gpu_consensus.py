@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Evidence
-from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians
+from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians, seen_weights
 from normlift_ns.core.sparse import SparseRows
 
 GAUSSIANS, VIEWS, REGIONS, THINGS = 1_930_000, 177, 128, 1600
@@ -96,7 +96,8 @@ def main(quick: bool, output: Path) -> None:
     size, features = evidence.num_regions, table(evidence.num_regions).to(device)
     chosen, chance = sampled_gaussians(evidence.rows, size, 50)
     rows = evidence.rows.select_rows(chosen)
-    overlaps = region_overlaps(rows, evidence.region_view, chance)
+    total = seen_weights(evidence, chosen)
+    overlaps = region_overlaps(rows, evidence.region_view, chance, total)
     sampled, whole = (consensus(evidence, features, sample=k) for k in (50, 1000))
     distance = float((1 - (sampled.features * whole.features).sum(1)).mean())
     print(f"{evidence.nnz:,} entries; {len(chosen):,} Gaussians with {rows.weight.numel():,}")
@@ -107,7 +108,8 @@ def main(quick: bool, output: Path) -> None:
     tasks = {
         "sample": lambda: sampled_gaussians(evidence.rows, size, 50),
         "select": lambda: evidence.rows.select_rows(chosen),
-        "overlaps": lambda: region_overlaps(rows, evidence.region_view, chance),
+        "weights": lambda: seen_weights(evidence, chosen),
+        "overlaps": lambda: region_overlaps(rows, evidence.region_view, chance, total),
         "sum": partial(agreed, features, overlaps),
         "all": lambda: consensus(evidence, features),
     }

@@ -2,7 +2,7 @@
 
     python -m benchmarks.grid                       all scenes, every Gaussian votes; for a GPU
     python -m benchmarks.grid --minutes 9           no new cell after so many minutes; the same command goes on later
-    python -m benchmarks.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second
+    python -m benchmarks.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second third
                                                     for CPUs: a sample votes and counts
     python -m benchmarks.grid --quick               a small demo room, three cells per kind of region, for the tests
 
@@ -131,7 +131,7 @@ def main(arguments: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=[*CHOICE, CONFIRMATION], choices=[*CHOICE, CONFIRMATION])
+    parser.add_argument("--scenes", nargs="+", default=[*CHOICE, *CONFIRMATION], choices=[*CHOICE, *CONFIRMATION])
     parser.add_argument("--voters", type=int, help="Gaussians of a scene that vote and count; all by default")
     parser.add_argument("--gaussians", type=int, help="of each room; 40,000 by default")
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")

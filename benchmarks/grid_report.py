@@ -39,17 +39,19 @@ def report_of(rows: Mapping[Cell, Mapping[str, Any]], names: Sequence[str], expe
     values = {cell: row["miou"] for cell, row in rows.items()}
     groups = {
         "choice": {cell: row for cell, row in rows.items() if cell.scene in CHOICE},
-        "second": {cell: row for cell, row in rows.items() if cell.scene == CONFIRMATION},
+        **{room: {cell: row for cell, row in rows.items() if cell.scene == room} for room in CONFIRMATION},
     }
     if len(groups["choice"]) > 0:
         decision = decide(values, names)
-        whole = set(rows) == {cell for scene in (*CHOICE, CONFIRMATION) for cell in cells_of(scene)}
+        whole = set(rows) == {cell for scene in (*CHOICE, *CONFIRMATION) for cell in cells_of(scene)}
         final = whole and all(value is None for value in sizes.values())
         report.add(f"decision.default.{decision.default}", final, FINAL)
         report.add(f"decision.choice.{decision.choice}", final, FINAL)
         if decision.confirmed is not None:
-            report.add("decision.confirmed", decision.confirmed, "1: by the second room, 0: refuted there")
-        for group, verdicts in (("choice", decision.verdicts), ("second", decision.confirmation)):
+            report.add(
+                "decision.confirmed", decision.confirmed, f"1: by {' and '.join(decision.confirmation)}, 0: refuted"
+            )
+        for group, verdicts in (("choice", decision.verdicts), *decision.confirmation.items()):
             for name, found in verdicts.items():
                 _add_verdict(report, f"{group}.{name}", name, found, groups[group])
         for name in shown(names, decision):
@@ -94,7 +96,7 @@ def show(report: Report, names: Sequence[str]) -> None:
     """Prints the decision, and what the clauses say of every candidate, best mean first, in few characters."""
     values = {metric.key: metric for metric in report.metrics}
     facts = ("mean", "gain", "gain_ci95", "undamaged", "three_views", "worst", "worse", "column", "copied")
-    for group in ("choice", "second"):
+    for group in ("choice", *CONFIRMATION):
         some = [name for name in names if f"{group}.{name}.mean" in values]
         if len(some) == 0:
             continue

@@ -5,7 +5,8 @@
 
 The field has 144 grid regions per view and D = 512, in each of its forms: CLIP-like features that differ in every view
 (evidence, float16), and those of 32 classes without noise, which have a basis of rank 32 (low_rank). The question is
-one prompt against four negatives. Times are the least of 20: the machine may be doing other things.
+one prompt against four negatives. Times are the least of 20: the machine may be doing other things. The keys view.* are
+those of `benchmarks.view` and panel.* those of `benchmarks.panel`, on a lift by colours; --quick leaves them out.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -22,14 +24,21 @@ from nerfstudio.cameras.cameras import Cameras
 
 from benchmarks.captures import SHARED, trained_scene, trained_state, training_cameras
 from benchmarks.cpu import clip_like_table, grid_labels
+from benchmarks.panel import add_fox_panel
 from benchmarks.report import RESULTS, Report
+from benchmarks.view import add_fox_view
 from normlift_ns import Camera, SemanticField, asking, lift, rasterize_evidence
 from normlift_ns.core.query import relevancy
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
+from normlift_ns.nerfstudio_plugin.said import drawable, found_table, said
 from normlift_ns.options import CANONICAL_NEGATIVES, Storage
 from normlift_ns.question import Question
+from normlift_ns.session import actions
+from normlift_ns.session.history import History
+from normlift_ns.session.prompts import prompts_of
+from normlift_ns.session.space import Space
+from normlift_ns.session.state import State
 from normlift_ns.viewer.display import make_display
-from normlift_ns.viewer.status import report as status
 
 REPEATS, CLASSES, SAMPLE = 20, 32, 20_000
 
@@ -94,13 +103,24 @@ def measure(
     answer = asking.answer(field, means, question)
     error = (answer.relevancy[some].double() - exact).abs().max()
 
-    def whole() -> None:
-        model.normlift._answer_to(question, "")
+    def posed() -> State:
+        return actions.ask(State(Space(field, means)), prompts_of(question), question)  # nothing is remembered
 
+    def told(state: State) -> None:
+        said(state, "", "", drawn)
+        found_table(state)
+
+    def whole() -> None:
+        state = posed()
+        cast(Any, model.normlift)._show(History.of(state))
+        told(state)
+
+    drawn, state = drawable(model.splats()[0]["opacities"]), posed()
+    told(state)
     report.add(f"fox_{name}_relevancy_ms", least(device, lambda: asking.answer(field, means, question)), "ms", error)
     report.add(f"fox_{name}_threshold_ms", least(device, lambda: asking.reselect(answer, 0.55, 0.1)), "ms")
     report.add(f"fox_{name}_display_ms", least(device, lambda: make_display(field, answer)), "ms")
-    report.add(f"fox_{name}_status_ms", least(device, lambda: status(answer, None)), "ms")
+    report.add(f"fox_{name}_status_ms", least(device, lambda: told(state)), "ms")
     report.add(f"fox_{name}_answer_ms", least(device, whole), "ms", error)
 
 
@@ -126,6 +146,9 @@ def main(quick: bool, device: str, output: Path) -> None:
     report.add("fox_overlay_ms", least(device, lambda: model.get_outputs_for_camera(camera)), "ms per frame")
     model.show(None)
     report.add("fox_stock_ms", least(device, lambda: model.get_outputs_for_camera(camera)), "ms per frame")
+    if not quick:
+        add_fox_view(report)
+        add_fox_panel(report)
     report.write(output)
 
 

@@ -9,43 +9,16 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
+from benchmarks.made_room import Part, Plan, built, look
 from benchmarks.worlds import World, world_of_room
-from normlift_ns import Camera, GaussianScene
-from normlift_ns.demo import DemoRoom
-from normlift_ns.demo.shapes import (
-    ON_SURFACE,
-    Array,
-    Distance,
-    box,
-    capsule,
-    cavity,
-    cone,
-    cover,
-    length,
-    place,
-    sphere,
-    surface_points,
-    torus,
-    union,
-)
+from normlift_ns import Camera
+from normlift_ns.demo.shapes import box, capsule, cavity, cone, place, sphere, torus, union
 
 LENGTH, WIDTH, HEIGHT = 5.2, 3.4, 2.4
 """Of the floor in x and y, and of the walls, metres. There is a ceiling lamp, but no ceiling."""
 SEED = 7
-POINTS_PER_GAUSSIAN = 12
-STRAYS, FLOATERS = 0.08, 0.03
-"""Shares of all Gaussians."""
-MIN_THICKNESS = 1e-3
-"""Metres."""
 FIELD_OF_VIEW = 68.0
 """Horizontal, degrees."""
-
-Part = tuple[str, tuple[float, float, float], float, Distance]
-"""Name, sRGB, Gaussians per square metre relative to the walls, shape."""
 
 
 def parts() -> list[Part]:
@@ -101,56 +74,7 @@ def parts() -> list[Part]:
     ]  # fmt: skip
 
 
-def second_room(num_gaussians: int = 40_000, seed: int = SEED) -> DemoRoom:
-    """Builds the room: surfaces, faint strays about them, faint floaters of no class. Same arguments, same room."""
-    rng, all_parts = np.random.default_rng(seed), parts()
-    strays, floaters = int(STRAYS * num_gaussians), int(FLOATERS * num_gaussians)
-    means, normals, scales, labels = _surface(all_parts, num_gaussians - strays - floaters, rng)
-    colors = np.array([color for _, color, *_ in all_parts])[labels]
-    colors = colors * (0.8 + 0.12 * normals[:, 2:] + 0.08 * normals[:, :1]) * rng.normal(1, 0.03, (len(labels), 1))
-    opacities = np.full(len(labels), 0.95)
-    chosen = rng.choice(len(labels), strays)
-    beside = means[chosen] + normals[chosen] * scales[chosen, :1] * rng.uniform(-4, 4, (strays, 1))
-    of_stray = np.argmin([np.abs(shape(beside)) for *_, shape in all_parts], axis=0)
-    half = np.array([LENGTH, WIDTH]) / 2
-    floating = rng.uniform((-half[0], -half[1], 0.1), (half[0], half[1], HEIGHT), (floaters, 3))
-    turned = rng.normal(size=(floaters, 3))
-    turned /= length(turned)[:, None]
-    means = np.concatenate([means, beside, floating])
-    normals = np.concatenate([normals, normals[chosen], turned])
-    scales = np.concatenate([scales, scales[chosen], rng.uniform(0.006, 0.05, (floaters, 3))])
-    faint = np.exp(rng.uniform(np.log(0.002), np.log(0.15), strays + floaters))
-    opacities = np.concatenate([opacities, faint])
-    colors = np.concatenate([colors, colors[chosen], rng.uniform(0.3, 0.9, (floaters, 3))]).clip(0, 1)
-    labels = np.concatenate([labels, of_stray, np.full(floaters, -1)])
-    upper = normals * np.where(normals[:, 2:] < 0, -1, 1)
-    quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)
-    quats /= length(quats)[:, None]
-    scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
-    names = tuple(name for name, *_ in all_parts)
-    return DemoRoom(scene, torch.from_numpy(colors).float(), torch.from_numpy(labels), names)
-
-
-def _surface(
-    all_parts: list[Part], count: int, rng: np.random.Generator
-) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Means, normals, scales and classes of Gaussians on all surfaces but those inside other parts."""
-    low, high = np.array([-LENGTH / 2, -WIDTH / 2, 0]), np.array([LENGTH / 2, WIDTH / 2, HEIGHT])
-    area = 2 * HEIGHT * (LENGTH + WIDTH) + 4 * LENGTH * WIDTH + 60  # about, each part times its density
-    samples = []
-    for i, (_, _, dense, shape) in enumerate(all_parts):
-        points = surface_points(shape, low, high, POINTS_PER_GAUSSIAN * count * dense / area, rng)
-        others = union(*(other for j, (*_, other) in enumerate(all_parts) if j != i))
-        samples.append(points[others(points) > ON_SURFACE])
-    bounds = np.cumsum([len(points) for points in samples])
-    counts = np.diff(np.rint(bounds / bounds[-1] * count).astype(int), prepend=0)
-    with np.errstate(invalid="ignore"):  # both sides of a thin board in one patch
-        covers = [cover(shape, points, n, rng) for (*_, shape), points, n in zip(all_parts, samples, counts)]
-    means, normals, radii, thickness = (np.concatenate(values) for values in zip(*covers))
-    normals[~np.isfinite(normals).all(axis=1)] = (0, 0, 1)
-    thickness = np.nan_to_num(thickness, nan=MIN_THICKNESS).clip(MIN_THICKNESS)
-    radii = np.nan_to_num(radii, nan=MIN_THICKNESS).clip(MIN_THICKNESS)
-    return means, normals, np.stack([radii, radii, thickness], axis=1), np.repeat(np.arange(len(all_parts)), counts)
+PLAN = Plan(LENGTH, WIDTH, HEIGHT, tuple(parts()), SEED)
 
 
 def walk(count: int = 30, phase: float = 0.0, width: int = 320, height: int = 240) -> list[Camera]:
@@ -162,23 +86,11 @@ def walk(count: int = 30, phase: float = 0.0, width: int = 320, height: int = 24
         t = 2 * math.pi * (i + phase) / count
         eye = (1.9 * math.cos(t), 0.75 * math.sin(2 * t), 1.3 + 0.4 * math.sin(3 * t + 1))
         target = (-1.5 * math.cos(t + 0.6), -1.2 * math.sin(t + 0.6), 0.55 + 0.35 * math.cos(2 * t))
-        found.append(_look(eye, target, width, height))
+        found.append(look(eye, target, width, height, FIELD_OF_VIEW))
     return found
-
-
-def _look(place: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int) -> Camera:
-    eye = torch.tensor(place, dtype=torch.float64)
-    forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - eye, dim=0)
-    right = torch.nn.functional.normalize(forward.cross(eye.new_tensor([0, 0, 1]), dim=0), dim=0)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, forward.cross(right, dim=0), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(K, pose.float(), width, height)
 
 
 def second(num_gaussians: int = 40_000, views: int = 30, width: int = 320) -> World:
     """The room as a world: sixteen classes, 30 views, 5 held-out views between them."""
     size = width, width * 3 // 4
-    return world_of_room("second", second_room(num_gaussians), walk(views, 0.0, *size), walk(5, 0.37, *size))
+    return world_of_room("second", built(PLAN, num_gaussians), walk(views, 0.0, *size), walk(5, 0.37, *size))

@@ -16,9 +16,10 @@ from benchmarks.features import LENGTHS, Looks, orthogonal_words, world_looks
 from benchmarks.pieces import Pieces, observe_pieces, pieces
 from benchmarks.rule import Cell, damage_of
 from benchmarks.second_room import second
+from benchmarks.third_room import third
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Evidence, lift, nearest_neighbors
-from normlift_ns.core.consensus import agreed, region_overlaps, sampled_gaussians
+from normlift_ns.core.consensus import agreed, region_overlaps, sampled_gaussians, seen_weights
 
 NEIGHBORS = 36
 SAMPLE = 50
@@ -106,8 +107,9 @@ class Site:
             by_table.setdefault(one.consensus, []).append(one)
         tables = agreed_tables(observed.evidence, observed.features, [p for p in by_table if p is not None])
         found: dict[str, Result] = {}
-        for power, some in by_table.items():
-            lifted = lift(observed.evidence, observed.features if power is None else tables[power])
+        seen = lift(observed.evidence, observed.features)
+        for power, some in by_table.items():  # R as regions were seen, as `normlift_ns.lifting` has it
+            lifted = seen if power is None else replace(lift(observed.evidence, tables[power]), scalars=seen.scalars)
             found |= results(some, lifted, self.voters, classes.to(observed.features.device))
         return {one.name: found[one.name] for one in candidates}
 
@@ -117,7 +119,8 @@ def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float])
     if len(powers) == 0:
         return {}
     chosen, chance = sampled_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
-    overlaps = region_overlaps(evidence.rows.select_rows(chosen), evidence.region_view, chance)
+    rows, total = evidence.rows.select_rows(chosen), seen_weights(evidence, chosen)
+    overlaps = region_overlaps(rows, evidence.region_view, chance, total)
     return {power: agreed(features, overlaps, power) for power in powers}
 
 
@@ -127,7 +130,7 @@ def base_world(scene: str, settings: Settings) -> World:
     if scene == "tabletop":
         return tabletop(settings.views)
     given = {"num_gaussians": settings.gaussians, "views": settings.room_views, "width": settings.room_width}
-    room = demo if scene == "demo" else second
+    room = {"demo": demo, "second": second, "third": third}[scene]
     return room(**{key: value for key, value in given.items() if value is not None})
 
 

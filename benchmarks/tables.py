@@ -45,6 +45,7 @@ def tables(found: Documents) -> dict[str, str]:
         "overhead": overhead(found["overhead"]),
         "grid-choice": verdicts(found["grid"], "choice"),
         "grid-second": verdicts(found["grid"], "second"),
+        "grid-third": verdicts(found["grid"], "third"),
         "grid-columns": columns(found["grid"]),
     }
 
@@ -131,7 +132,7 @@ def mixtures(signals: Document) -> str:
 def parameters(fit: Document) -> str:
     """What was fitted."""
     names = ("k", "sigma_d", "tau", "gamma", "delta")
-    groups = (("fitted, the defaults", "fitted"), ("fitted for plain voting", "fitted_knn"))
+    groups = (("fitted, for `--vote paper`", "fitted"), ("fitted for plain voting", "fitted_knn"))
     rows = [(label, *(f"{fit.values[f'{group}.{x}']:g}" for x in names)) for label, group in groups]
     return table(("", *names), rows)
 
@@ -158,7 +159,7 @@ def presets(document: Document, accuracy: Document, losses: Document) -> str:
     for name, label in PRESETS.items():
         seconds, memory = f"{v[f'{name}.s']:.3g} s", f"{v[f'{name}.peak_gib']:.2f} GiB"
         error, other = f"{v[f'{name}.rms_error']:.2g}", f"{100 * v[f'{name}.other_share']:.2g} %"
-        key = "tabletop." + ("ablation.paper.miou" if name == "float32" else f"preset.{name}.miou")
+        key = "tabletop." + ("ablation.posterior.miou" if name == "float32" else f"preset.{name}.miou")
         task = (accuracy.interval(key), losses.interval(name, 2))
         rows.append((label, FLAGS.get(name, "benchmark only"), seconds, memory, error, other, *task))
     header = ("preset", "how", "time", "peak memory", "RMS error", "directions off by > 0.1", "mIoU, tabletop")

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from normlift_ns.asking import Answer as Answer
     from normlift_ns.asking import Finding as Finding
     from normlift_ns.core.ablations import refine_variant as refine_variant
+    from normlift_ns.core.consensus import Consensus as Consensus
+    from normlift_ns.core.consensus import consensus as consensus
     from normlift_ns.core.evidence import Evidence as Evidence
     from normlift_ns.core.field import SemanticField as SemanticField
     from normlift_ns.core.gaussians import Camera as Camera
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
     from normlift_ns.front_door import lift_run as lift_run
     from normlift_ns.front_door import open_run as open_run
     from normlift_ns.front_door import open_scene as open_scene
+    from normlift_ns.insight.floaters import Floaters as Floaters
+    from normlift_ns.insight.histogram import Histogram as Histogram
+    from normlift_ns.insight.why import Why as Why
     from normlift_ns.lifted_run import LiftedRun as LiftedRun
     from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
     from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
@@ -47,6 +52,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "asking": ("Answer", "Finding"),
     "core.ablations": ("refine_variant",),
+    "core.consensus": ("Consensus", "consensus"),
     "core.evidence": ("Evidence",),
     "core.field": ("SemanticField",),
     "core.gaussians": ("Camera", "GaussianScene"),
@@ -58,6 +64,9 @@ _HOMES = {
     "errors": ("InputError",),
     "evaluation.coverage.study": ("Coverage", "coverage"),
     "front_door": ("lift_run", "open_run", "open_scene"),
+    "insight.floaters": ("Floaters",),
+    "insight.histogram": ("Histogram",),
+    "insight.why": ("Why",),
     "lifted_run": ("LiftedRun",),
     "options": (
         "BACKGROUND_WORDS",

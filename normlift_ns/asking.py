@@ -12,9 +12,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
+from normlift_ns.insight.histogram import Histogram, histogram, suggested_threshold, top_limit
 from normlift_ns.objects import SceneObject, find_objects
 from normlift_ns.question import Question
 from normlift_ns.selection import Selection
+from normlift_ns.text_encoders import encoder_name
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,6 +142,32 @@ class Finding:
         valid = self.answer.valid
         return float(self.relevancy[valid].max()) if bool(valid.any()) else None
 
+    @cached_property
+    def histogram(self) -> Histogram | None:
+        """How the relevancies are spread, with the threshold among them; None where no Gaussian has a direction."""
+        question = self.answer.question
+        limit = top_limit(question.rule, encoder_name(self.answer.field))
+        arrays = (self.relevancy.cpu().numpy(), self.answer.valid.cpu().numpy())
+        return histogram(*arrays, threshold=question.threshold, limit=limit)
+
+    @property
+    def suggested_threshold(self) -> float | None:
+        """The threshold that the histogram suggests for this text."""
+        return None if self.histogram is None else self.histogram.suggested
+
+    @property
+    def stands_out(self) -> bool | None:
+        """False where the text is probably not in the scene; None where nobody can tell."""
+        return None if self.histogram is None else self.histogram.stands_out
+
+    @property
+    def nearest(self) -> list[float] | None:
+        """Where the scene is most like the text: weighted mean of the centres of the one Gaussian in a thousand whose
+        relevancy is largest, selected or not."""
+        if self.histogram is None:
+            return None
+        return self._numbers_of(self.answer.valid & (self.relevancy >= self.histogram.top)).centroid
+
     @property
     def mean_reliability(self) -> float | None:
         """Weighted mean of R of the selected Gaussians."""
@@ -152,13 +180,17 @@ class Finding:
 
     @cached_property
     def _selection(self) -> Selection:
-        scalars, mask = self.answer.field.scalars, self.mask
+        return self._numbers_of(self.mask)
+
+    def _numbers_of(self, mask: Bool[Tensor, " n"]) -> Selection:
+        scalars = self.answer.field.scalars
         arrays = (self.answer.means, scalars.reliability, scalars.weight)
         return Selection(len(mask), *(x[mask].cpu().numpy() for x in arrays))
 
 
 def answer(field: SemanticField, means: Float[Tensor, "n 3"], question: Question) -> Answer:
-    """Relevancy and selection of every Gaussian for each text.
+    """Relevancy and selection of every Gaussian for each text. The question of the answer has the threshold that is
+    suggested, if the given one asks for that.
 
     Args:
         means: centres of the Gaussians.
@@ -170,8 +202,17 @@ def answer(field: SemanticField, means: Float[Tensor, "n 3"], question: Question
     vectors = torch.from_numpy(question.vectors)
     relevancy = field.relevancy(vectors, negatives, rule=question.rule, refined=question.refined)
     valid = field.valid(refined=question.refined)
+    question = settled(question, relevancy, valid)
     found = Answer(question, field, means.detach(), relevancy, valid, relevancy.new_empty(0, 0).bool())
     return reselect(found, question.threshold, question.min_reliability)
+
+
+def settled(question: Question, relevancy: Float[Tensor, "n q"], valid: Bool[Tensor, " n"]) -> Question:
+    """The question with a threshold, which is the suggested one if it asks for that."""
+    if not question.suggest:
+        return question
+    suggested = suggested_threshold(relevancy.cpu().numpy(), valid.cpu().numpy())
+    return replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
 
 
 def reselect(found: Answer, threshold: float, min_reliability: float) -> Answer:
@@ -183,8 +224,13 @@ def reselect(found: Answer, threshold: float, min_reliability: float) -> Answer:
 
 def summarize(found: Answer) -> list[dict[str, Any]]:
     """The numbers of every `Finding`, ready for JSON."""
-    names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability")
-    return [{name: getattr(finding, name) for name in names} for finding in found]
+    names = (
+        "text", "fraction", "centroid", "extent", "peak", "mean_reliability", "stands_out", "nearest",
+        "suggested_threshold",
+    )  # fmt: skip
+    rows = [{name: getattr(finding, name) for name in names} for finding in found]
+    drawn = [finding.histogram for finding in found]
+    return [row | {"histogram": None if of is None else of.to_json()} for row, of in zip(rows, drawn)]
 
 
 def pixel_relevancy(values: Float[Tensor, "h w q"], alpha: Float[Tensor, "h w"]) -> Float[Tensor, "h w q"]:

@@ -12,6 +12,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from normlift_ns.asking import answer
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
 from normlift_ns.core.gpu import choose_device, wake
@@ -250,7 +251,7 @@ def lift_run(
         field = replace(field, manifest={**field.manifest, "source": source_settings(options, device)})
     seconds = {**stages.seconds, **seconds}
     with stages("write") as step:
-        question = _question(field, made, queries)
+        question = _question(field, scene.gaussians.means, made, queries)
         run_dir = write_run(
             scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
         )
@@ -271,7 +272,9 @@ def _refuse_equal_stems(names: Sequence[str]) -> None:
             )
 
 
-def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str]) -> Question | None:
+def _question(
+    field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
+) -> Question | None:
     if len(queries) == 0:
         return None
     length = source.text(queries).shape[1]
@@ -283,4 +286,4 @@ def _question(field: SemanticField, source: FeatureSource, queries: Sequence[str
     negatives = None
     if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
         negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
-    return make_question(field, source.text, queries, negatives=negatives)
+    return answer(field, means, make_question(field, source.text, queries, negatives=negatives)).question

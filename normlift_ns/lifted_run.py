@@ -21,14 +21,17 @@ from normlift_ns.core.files import refuse_run_files
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
-from normlift_ns.options import Rule
+from normlift_ns.insight.floaters import Floaters, find_floaters
+from normlift_ns.insight.why import Why
+from normlift_ns.options import FLOATER_LIMIT, Rule
 from normlift_ns.question import Question, make_question
 from normlift_ns.ranges import check_bool, check_path
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.raster.settings import RasterSettings
-from normlift_ns.runs.files import FIELD_FOLDER, texts_cache
+from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, texts_cache
 from normlift_ns.runs.question import load_question, save_question
 from normlift_ns.runs.splats import export_files, write_splats
+from normlift_ns.runs.votes import Votes
 from normlift_ns.text_encoders import Texts, encoder_of
 from normlift_ns.viewer.display import draw, make_display
 
@@ -77,7 +80,7 @@ class LiftedRun:
         *texts: str,
         negatives: Sequence[str] | None = None,
         rule: Rule | Literal["auto"] = "auto",
-        threshold: float | None = None,
+        threshold: float | Literal["auto"] | None = None,
         min_reliability: float = 0.0,
         refined: bool = True,
     ) -> Answer:
@@ -86,7 +89,8 @@ class LiftedRun:
         Args:
             negatives: texts to compare with; None: LERF's, where the encoder knows them.
             rule: how relevancy follows from cosines, see `relevancy`. "auto": lerf with negatives, else cosine.
-            threshold: relevancy above which a Gaussian is selected; None: 0.5, for rule margin 0.02.
+            threshold: relevancy above which a Gaussian is selected. "auto": what the histogram of the relevancies
+                suggests. None: 0.5, for rule margin 0.02, for bare cosines of other encoders than colour "auto".
             min_reliability: minimum R of a selected Gaussian, in 0..1.
             refined: use refined features.
         Raises:
@@ -158,17 +162,9 @@ class LiftedRun:
         for file in export_files(path)[: 2 if objects is None else 3]:
             if file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        if isinstance(part, Answer | Finding):
-            keep, asked = part.mask, part if isinstance(part, Answer) else part.answer
-            answer = asked if answer is None else answer
-        else:
-            keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else _tensor(part)
-        if keep is None or keep.dtype != torch.bool or keep.shape != (len(self.field),):
-            found = type(part).__name__ if keep is None else f"{keep.dtype} {tuple(keep.shape)}"
-            raise InputError(
-                f"part must be an answer of this run, what it says of one text, or a mask of {len(self.field)} "
-                f"booleans; got {found}"
-            )
+        asked = _asked(part)
+        answer = asked if answer is None else answer
+        keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         return write_splats(
             path,
             self.scene.parameters,
@@ -180,6 +176,63 @@ class LiftedRun:
             objects=objects,
             overwrite=overwrite,
         )
+
+    @cached_property
+    def votes(self) -> Votes:
+        """What photographs said in the lift; `votes.pictures(why.views[:3])` draws what the heaviest three did."""
+        return Votes(self.scene, self.field, cache_folder(self.folder))
+
+    def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
+        """Which photographs and regions voted for a selection, and how far they agree.
+
+        Args:
+            part: what an answer, or one of its findings, selects; or a mask of Gaussians, taken with refined features.
+        Raises:
+            ValueError: nothing is selected; a mask of another type or length; the run stores directions only, and its
+                cache no longer holds the evidence or the features.
+            FileNotFoundError: the run stores directions only, and a photograph is gone.
+
+        >>> from normlift_ns import open_run
+        >>> run = open_run(config)
+        >>> why = run.why(run.ask("red")["red"])
+        >>> why.words.startswith("The photographs agree"), 0.9 < sum(vote.share for vote in why.views) < 1.1
+        (True, True)
+        >>> [picture.image.shape for picture in run.votes.pictures(why.views[:1])]
+        [torch.Size([120, 160, 3])]
+        """
+        asked = _asked(part)
+        return self.votes.explain(self._mask(part), refined=asked is None or asked.question.refined)
+
+    def floaters(self, limit: float = FLOATER_LIMIT) -> Floaters:
+        """Gaussians that likely belong to no surface, see `insight.floaters`. `run.export(path, ~found.mask)` writes
+        the scene without them.
+
+        Args:
+            limit: score above which a Gaussian is a likely floater.
+        Raises:
+            ValueError: a limit that is not finite.
+
+        >>> from normlift_ns import open_run
+        >>> found = open_run(config).floaters()
+        >>> 0 < int(found.mask.sum()) < 0.1 * len(found.mask)
+        True
+        """
+        return find_floaters(self.scene.gaussians, self.field.scalars, limit=limit)
+
+    def _mask(self, part: Any) -> Bool[Tensor, " n"]:
+        """The Gaussians of a part.
+
+        Raises:
+            ValueError: it is none.
+        """
+        mask = part.mask if isinstance(part, Answer | Finding) else _tensor(part)
+        if mask is None or mask.dtype != torch.bool or mask.shape != (len(self.field),):
+            found = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
+            raise InputError(
+                f"part must be an answer of this run, what it says of one text, or a mask of {len(self.field)} "
+                f"booleans; got {found}"
+            )
+        return mask
 
     def camera(self, view: str | Path | int) -> Camera:
         """The camera of a training image, by its number or its name; folder and suffix may be left out.
@@ -223,6 +276,11 @@ class LiftedRun:
         values, alpha = render(self.scene.gaussians, camera, display.values, **how)
         overlay = draw(display, picture.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _asked(part: Any) -> Answer | None:
+    """The answer that a part is of."""
+    return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
 def _tensor(values: Any) -> Tensor | None:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.consensus import SEED, consensus
+from normlift_ns.core.consensus import SEED, consensus, seen_reliability
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
@@ -103,13 +103,19 @@ def lift_scene(
         refuse_equal_stems([views.names[index] for index in used])
     ready = _get_ready(scene, gaussians, options, drawing)
     evidence, features, level = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages, ready)
-    features, agreed = _agree(evidence, features, level, options, stages) if options.consensus else (features, {})
+    table, agreed = _agree(evidence, features, level, options, stages) if options.consensus else (features, {})
     with stages("lift") as step:
-        lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
+        how = {"beta": options.beta, "unlabeled": options.unlabeled}
+        lifted = lift(evidence, table, **how)
         _check_seen(evidence, lifted.scalars, source)
+        own = lifted.scalars.own_evidence
+        if options.consensus:
+            seen = lift(evidence, features, **how).scalars
+            own = torch.where(lifted.scalars.norm > 0, seen.own_evidence, 0.0)
+            lifted = replace(lifted, scalars=seen_reliability(lifted.scalars, seen))
         step()
     counts = {"views": len(used), "left_out": len(views) - len(usable), "excluded": evidence.num_excluded}
-    copied, shares = _vote(gaussians, lifted, options.vote, stages) if options.refine else (None, {})
+    copied, shares = _vote(gaussians, lifted, own, options.vote, stages) if options.refine else (None, {})
     with stages("store") as step:
         provenance = {
             **scene.identity,
@@ -256,7 +262,7 @@ def _agree(
 
 
 def _vote(
-    gaussians: GaussianScene, lifted: Lifted, config: RefineConfig, stages: Stages
+    gaussians: GaussianScene, lifted: Lifted, own: Float[Tensor, " n"], config: RefineConfig, stages: Stages
 ) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
     """Whose direction every Gaussian takes, and the shares of Gaussians that change theirs and that nobody supports."""
     means, reliability, n = gaussians.means, lifted.scalars.reliability, len(gaussians)
@@ -264,7 +270,6 @@ def _vote(
         neighbors = nearest_neighbors(means, config.k, progress=partial(stages.tell, "neighbors"))
     with stages("vote", n):
         told = partial(stages.tell, "vote")
-        own = lifted.scalars.own_evidence
         copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=told)
     changed = copied != torch.arange(len(copied), device=copied.device)
     lost = unsupported(neighbors, reliability)

@@ -159,11 +159,8 @@ def block_evidence(
     That of its cells, from which it is made, is taken from the folder if it was rasterized before with the same scene,
     cameras and labels, whatever the regions and features were.
     """
-    counts = [regions.shape[1] for regions in block.regions]
-    facts = [_KEY, rasterize_mode, weight_power, str(dtype), asdict(settings), backend, counts]
-    tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, *block.labels]
-    tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
-    path = folder / f"{_digest(facts, tensors)}.safetensors"
+    facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
+    path = _place(gaussians, block, folder, facts)
     evidence = _kept(path) if reuse else None
     if evidence is not None:
         for _ in block.cameras:
@@ -173,7 +170,7 @@ def block_evidence(
         gaussians,
         block.cameras,
         block.labels,
-        num_regions=counts,
+        num_regions=[regions.shape[1] for regions in block.regions],
         backend=backend,
         rasterize_mode=rasterize_mode,
         weight_power=weight_power,
@@ -183,6 +180,31 @@ def block_evidence(
     )
     evidence.save(path, key=path.stem)
     return of_regions(evidence, block)
+
+
+def kept_evidence(
+    gaussians: GaussianScene,
+    block: Block,
+    folder: Path,
+    *,
+    rasterize_mode: RasterizeMode,
+    settings: RasterSettings,
+    backend: BackendName,
+    weight_power: int,
+    dtype: torch.dtype,
+) -> Evidence | None:
+    """What `block_evidence` has kept of a block; None where it is not there, and would have to be rasterized again."""
+    facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
+    evidence = _kept(_place(gaussians, block, folder, facts))
+    return None if evidence is None else of_regions(evidence, block)
+
+
+def _place(gaussians: GaussianScene, block: Block, folder: Path, facts: Sequence[Any]) -> Path:
+    """Where the evidence of the cells of a block is kept, whether it is there or not."""
+    counts = [regions.shape[1] for regions in block.regions]
+    tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, *block.labels]
+    tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
+    return folder / f"{_digest([_KEY, *facts, counts], tensors)}.safetensors"
 
 
 def _kept(path: Path) -> Evidence | None:

@@ -43,13 +43,16 @@ CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 THRESHOLDS: dict[Rule, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
-"""Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder."""
+"""Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder, and
+where nothing is known yet: see `question.make_question`."""
 VoteKind = Literal["paper", "posterior"]
 """How a vote weighs what a Gaussian has seen itself against its neighbours; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class of a Gaussian without a direction, where one is scored: none, or the first."""
 REACH, MIN_SIZE = 4.0, 20
 """How far apart Gaussians of one object may be, in units of the selection's median spacing, and how many it needs."""
+FLOATER_LIMIT = 1.9
+"""Score above which a Gaussian is a likely floater, see `insight.floaters`."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +174,8 @@ class VoteNumbers(NamedTuple):
 
 
 VOTES: dict[VoteKind, VoteNumbers] = {
+    "posterior": VoteNumbers(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
     "paper": VoteNumbers(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
-    "posterior": VoteNumbers(sigma_d=2.0, tau=0.95, gamma=0.4, delta=0.0),
 }
 """The defaults of each kind of vote; the help of the fields of `RefineConfig` repeats them."""
 
@@ -181,7 +184,7 @@ VOTES: dict[VoteKind, VoteNumbers] = {
 class RefineConfig:
     """Parameters of the vote among neighbours.
 
-    The paper publishes no values. The defaults were fitted where the truth is known: see docs/accuracy.md. What suits
+    The paper publishes no values. The defaults were chosen where the truth is known: see docs/accuracy.md. What suits
     one kind of vote does not suit the other, so that a parameter that is None takes the default of its kind.
 
     Raises:
@@ -192,18 +195,19 @@ class RefineConfig:
     (1.0, 2.0)
     """
 
-    vote: VoteKind = "paper"
-    """How the vote weighs what a Gaussian has seen itself. paper: as one voter among its neighbours (equations 9 and 10
-    of the paper). posterior: by the views that saw it, against --prior views of the neighbourhood."""
+    vote: VoteKind = "posterior"
+    """How the vote weighs what a Gaussian has seen itself. posterior: by the views that saw it, against --prior views
+    of the neighbourhood. paper: as one voter among its neighbours (equations 9 and 10 of the paper)."""
     k: int = 36
     """Number of neighbours K in the vote, at least 1."""
     sigma_d: float | None = None
     """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest
-    one at another place, because scenes are rescaled. By default 1 for paper, 2 for posterior."""
+    one at another place, because scenes are rescaled. By default 2 for posterior, 1 for paper."""
     tau: float | None = None
-    """Cosine at which two directions half agree in the vote, in -1..1. By default 0.95."""
+    """Cosine at which two directions half agree in the vote, in -1..1. By default 0.9 for posterior, 0.95 for
+    paper."""
     gamma: float | None = None
-    """Softness of that agreement, > 0. By default 0.4."""
+    """Softness of that agreement, > 0. By default 0.05 for posterior, 0.4 for paper."""
     delta: float | None = None
     """Margin Delta by which the best neighbour must win the vote, >= 0. By default 0."""
     prior: float = 4.0
@@ -247,7 +251,7 @@ class LiftOptions:
     """Pixels without a region: ignore them, or let them dilute as observations of nothing."""
     weight_power: Literal[1, 2] = 1
     """1: weights A_ij as in the paper. 2: their squares."""
-    consensus: bool = False
+    consensus: bool = True
     """Before the lift, give every region the feature that the regions of other views agree on which hold the same
     Gaussians."""
     consensus_power: float = 1.0
@@ -279,8 +283,9 @@ class LiftOptions:
         check_options(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Configs of version 0.1 call `storage` `form`."""
-        vars(self).update({"storage" if name == "form" else name: value for name, value in state.items()})
+        """Configs of version 0.1 call `storage` `form`, and know no consensus."""
+        known = {"storage" if name == "form" else name: value for name, value in state.items()}
+        vars(self).update({"consensus": False, **known})
 
 
 @dataclass(frozen=True)
@@ -296,8 +301,9 @@ class AskOptions:
     rule: Rule | Literal["auto"] = "auto"
     """How relevancy is computed. cosine: the cosine itself. lerf: against each negative. margin: above the best
     negative. auto: lerf with negatives, else cosine."""
-    threshold: float | None = None
-    """Relevancy above which a Gaussian is selected. By default 0.5 (cosine and lerf) or 0.02 (margin)."""
+    threshold: float | Literal["auto"] | None = None
+    """Relevancy above which a Gaussian is selected. auto: what the histogram of the relevancies suggests. By default
+    0.5 for lerf, 0.02 for margin, 0.5 for cosines of the colour encoder, and auto for cosines of all others."""
     min_reliability: float = 0.0
     """Minimum reliability of a selected Gaussian, in 0..1."""
     refined: bool = True

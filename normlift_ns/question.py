@@ -12,7 +12,7 @@ from jaxtyping import Float
 from normlift_ns.errors import InputError
 from normlift_ns.options import THRESHOLDS, Rule
 from normlift_ns.ranges import check_bool, check_number, shown
-from normlift_ns.text_encoders import Field, default_negatives, encoder_digest
+from normlift_ns.text_encoders import Field, default_negatives, encoder_digest, encoder_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,9 @@ class Question:
     """Use refined features."""
     encoder: str | None = None
     """Digest of the encoder that made the vectors, see `encoder_digest`; None: nobody knows."""
+    suggest: bool = False
+    """Take the threshold that the histogram of all relevancies suggests, in place of this one, as soon as the question
+    is answered; the question of an answer has its threshold."""
 
     def __post_init__(self) -> None:
         for name in ("vectors", "negative_vectors"):
@@ -49,7 +52,7 @@ def make_question(
     *,
     negatives: Sequence[str] | None = None,
     rule: Rule | Literal["auto"] = "auto",
-    threshold: float | None = None,
+    threshold: float | Literal["auto"] | None = None,
     min_reliability: float = 0.0,
     refined: bool = True,
 ) -> Question:
@@ -59,7 +62,8 @@ def make_question(
         read: makes one vector per text, of an encoder that fits the field.
         negatives: what the texts are compared with; None: `default_negatives`.
         rule: "auto": lerf with negatives, cosine without.
-        threshold: None: that of `THRESHOLDS`.
+        threshold: "auto": what the histogram suggests. None: that of `THRESHOLDS`; but "auto" for bare cosines of
+            any encoder but colour, of which no number is known that selects something.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         refined: use refined features.
     Raises:
@@ -72,18 +76,25 @@ def make_question(
     if rule not in ("auto", *get_args(Rule)):
         raise InputError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
     min_reliability = check_number("min_reliability", min_reliability)
-    threshold = None if threshold is None else check_number("threshold", threshold)
+    if isinstance(threshold, str):
+        if threshold != "auto":
+            raise InputError(f'threshold must be a number or "auto", got {shown(threshold)}')
+    elif threshold is not None:
+        threshold = check_number("threshold", threshold)
     check_bool("refined", refined)
     negatives = tuple(default_negatives(field) if negatives is None else negatives)
     if rule == "auto":
         rule = "cosine" if len(negatives) == 0 else "lerf"
+    if threshold is None and rule == "cosine" and encoder_name(field) != "colour":
+        threshold = "auto"
     return Question(
         texts=tuple(texts),
         vectors=read(texts),
         negatives=negatives,
         negative_vectors=read(negatives) if len(negatives) > 0 else None,
         rule=rule,
-        threshold=THRESHOLDS[rule] if threshold is None else threshold,
+        threshold=THRESHOLDS[rule] if threshold is None or threshold == "auto" else threshold,
+        suggest=threshold == "auto",
         min_reliability=min_reliability,
         refined=refined,
         encoder=encoder_digest(field.manifest),

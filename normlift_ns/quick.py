@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,12 @@ from scipy.sparse import csr_array
 
 from normlift_ns.core.disk.field_file import FieldArrays, read_field
 from normlift_ns.errors import InputError
+from normlift_ns.insight.histogram import Histogram, histogram, suggested_threshold, top_limit
 from normlift_ns.options import Rule
 from normlift_ns.question import Question, make_question
 from normlift_ns.runs.files import check_run, field_folder, stored_paths, texts_cache
 from normlift_ns.selection import Selection
-from normlift_ns.text_encoders import Texts, encoder_of, with_texts
+from normlift_ns.text_encoders import Texts, encoder_name, encoder_of, with_texts
 
 _BLOCK = 2**21
 """Elements converted to float32 at once; few stay in a processor's cache."""
@@ -67,16 +68,33 @@ class QuickAnswer:
         """The numbers of every text, ready for JSON, as `asking.summarize` gives them."""
         return [self._row(i) for i in range(len(self.question.texts))]
 
+    @cached_property
+    def histograms(self) -> list[Histogram | None]:
+        """Of every text, as `Finding.histogram`."""
+        limit = top_limit(self.question.rule, encoder_name(self.field))
+        threshold = self.question.threshold
+        return [histogram(column, self.valid, threshold=threshold, limit=limit) for column in self.relevancy.T]
+
+    def _selection(self, mask: Bool[np.ndarray, " n"]) -> Selection:
+        arrays = (self.field.arrays[name] for name in ("means", "reliability", "weight"))
+        return Selection(len(mask), *(array[mask] for array in arrays))
+
     def _row(self, index: int) -> dict[str, Any]:
-        mask, arrays = self.selected[:, index], (self.field.arrays[name] for name in ("means", "reliability", "weight"))
-        found = Selection(len(mask), *(array[mask] for array in arrays))
-        peak = float(self.relevancy[self.valid, index].max()) if self.valid.any() else None
+        found, relevancy, spread = (
+            self._selection(self.selected[:, index]), self.relevancy[:, index], self.histograms[index]
+        )  # fmt: skip
+        peak = float(relevancy[self.valid].max()) if self.valid.any() else None
+        nearest = None if spread is None else self._selection(self.valid & (relevancy >= spread.top)).centroid
         numbers = {name: getattr(found, name) for name in ("fraction", "centroid", "extent")}
         return {
             "text": self.question.texts[index],
             **numbers,
             "peak": peak,
             "mean_reliability": found.mean_reliability,
+            "stands_out": None if spread is None else spread.stands_out,
+            "nearest": nearest,
+            "suggested_threshold": None if spread is None else spread.suggested,
+            "histogram": None if spread is None else spread.to_json(),
         }
 
 
@@ -124,6 +142,9 @@ def answer(field: FieldArrays, question: Question) -> QuickAnswer:
     valid = (arrays["norm"] > 0)[source]
     relevancy = _relevancy(cosine[:, :count], cosine[:, count:], question.rule)
     relevancy = np.where(valid[:, None], relevancy, np.float32(-2 if question.rule == "margin" else 0))
+    if question.suggest:
+        suggested = suggested_threshold(relevancy, valid)
+        question = replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
     sure = valid & (arrays["reliability"] >= np.float32(question.min_reliability))
     return QuickAnswer(question, field, relevancy, valid, (relevancy > question.threshold) & sure[:, None])
 

@@ -74,11 +74,15 @@ RANGES: dict[str, Range] = {
     # objects
     "reach": _POSITIVE,
     "min_size": _at_least(1),
+    "floater_limit": _ANY,
     # evaluation
     "min_opacity": _SHARE,
     "margin": _ANY,
     "purity": _SHARE,
     "min_weight": _NOT_NEGATIVE,
+    # the viewer
+    "port": Range(1, 65535, "a number of a port, 1..65535"),
+    "most_drawn": _at_least(1, 10**7),
     # the demo
     "num_gaussians": _at_least(1, 10**8),
     "views": _at_least(3, 10**5),
@@ -216,9 +220,11 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         if value is None and type(None) in choices:
             return None
         kinds = [choice for choice in choices if choice is not type(None)]
-        if all(get_origin(kind) is Literal for kind in kinds):  # Rule | Literal["auto"]
-            return _one_of(name, value, [word for kind in kinds for word in get_args(kind)])
-        return _checked(name, value, kinds[0])
+        words = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
+        others = [kind for kind in kinds if get_origin(kind) is not Literal]
+        if len(others) == 0:  # Rule | Literal["auto"]
+            return _one_of(name, value, words)
+        return value if isinstance(value, str) and value in words else _checked(name, value, others[0])
     if origin is Literal:
         return _one_of(name, value, choices)
     if origin is tuple:

@@ -171,6 +171,13 @@ def _options(field: Field) -> SourceOptions:
     return SourceOptions(**{**stored, "encoder": encoder})
 
 
+def encoder_name(field: Field) -> str | None:
+    """The name of the encoder that made a field; None where the manifest does not name it."""
+    stored = field.manifest.get("encoder")
+    name = stored.get("encoder") if isinstance(stored, Mapping) else None
+    return name if isinstance(name, str) else None
+
+
 def default_negatives(field: Field) -> tuple[str, ...]:
     """LERF's negatives where the encoder knows them: the colour encoder does not, a file of text vectors may."""
     stored = field.manifest.get("encoder")

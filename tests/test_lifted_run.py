@@ -129,7 +129,7 @@ def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> No
     run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
     assert run.field.manifest["statistics"]["views"] == 4
     assert run.field.manifest["statistics"]["left_out"] == 8
-    assert list(run.seconds) == ["check", "features", "evidence", "lift", "store", "write"]
+    assert list(run.seconds) == ["check", "features", "evidence", "consensus", "lift", "store", "write"]
     assert min(run.seconds.values()) > 0
     with pytest.raises(ValueError, match=r"features of your own, without texts; name a file of texts"):
         run.ask("left")

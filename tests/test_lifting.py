@@ -18,7 +18,17 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RasterSettings, RefineConfig, View, observing
+from normlift_ns import (
+    Camera,
+    GaussianScene,
+    InputError,
+    LiftOptions,
+    RasterSettings,
+    RefineConfig,
+    View,
+    lifting,
+    observing,
+)
 from normlift_ns.core.consensus import consensus
 from normlift_ns.encoders import LangSplat, RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
@@ -26,10 +36,11 @@ from normlift_ns.encoders.regions import LabelFiles
 from normlift_ns.encoders.source import FeatureSource, ViewFeatures
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
+from normlift_ns.evaluation.votes import voting_scalars
 from normlift_ns.lifting import Export, lift_scene
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from normlift_ns.scenes.photographs import PhotographViews
-from normlift_ns.viewer.pictures import picture_names, save_overlay, save_overlays, training_cameras
+from normlift_ns.viewer.pictures import picture_names, training_cameras
 from tests.scenes import generator
 
 WIDTH, HEIGHT, N = 24, 18, 30
@@ -256,22 +267,6 @@ def test_no_camera_is_lost_and_none_is_guessed() -> None:
         training_cameras(made, ["c"])
 
 
-def test_pictures_that_would_replace_each_other_are_refused(tmp_path: Path) -> None:
-    made = scene("a.png", "a_0_x.png")
-    answer: Any = SimpleNamespace(texts=("x 1 y", "y"))
-    with pytest.raises(InputError, match=r"two pictures would be called .*a_0_x_1_y\.png"):
-        save_overlays(made, answer, training_cameras(made), tmp_path)
-
-
-@pytest.mark.parametrize("text", [r"$\frac{$", "$", "a\nb", "[/red]", "\ud800", "x\0y", "", "x" * 3000])
-@pytest.mark.filterwarnings("ignore:Glyph")
-def test_a_text_is_drawn_as_it_is(text: str, tmp_path: Path) -> None:
-    answer: Any = SimpleNamespace(question=SimpleNamespace(rule="cosine", threshold=0.5))
-    image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
-    save_overlay(tmp_path / "a.png", image, torch.zeros(HEIGHT, WIDTH), text, answer)
-    assert (tmp_path / "a.png").stat().st_size > 1000
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems count memory otherwise")
 def test_memory_is_that_of_the_process_and_not_of_its_parent():
     child = "from normlift_ns.stages import cost; print(cost({}, 'cpu')['memory_gib'])"
@@ -348,6 +343,37 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
     expected = consensus(before.evidence, before.features, sample=7).features
     assert torch.allclose(after.features, expected, atol=1e-6)
     assert not torch.allclose(after.features, before.features, atol=1e-3)
+    seen, agreed = (x.field.scalars for x in (off, on))
+    has = agreed.norm > 0
+    assert torch.equal(agreed.reliability[has], seen.reliability[has])
+    assert bool((agreed.reliability[~has] == 0).all())
+    assert bool((agreed.norm[has] > seen.norm[has] + 1e-3).any())  # that of what the views agree on
+
+
+def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """R and own evidence are those of the lift without consensus, directions those with it; voting again on the stored
+    run takes the same numbers."""
+    halves = np.ones((HEIGHT, WIDTH), int)
+    halves[:, WIDTH // 2 :] = 2
+    source, given = files(tmp_path / "maps", halves, "a", "b", "c"), {}
+    original = lifting.refine
+
+    def watched(means: Any, directions: Any, reliability: Any, config: Any, **how: Any) -> Any:
+        given[len(given)] = reliability, how["own"]
+        return original(means, directions, reliability, config, **how)
+
+    monkeypatch.setattr(lifting, "refine", watched)
+    fields = []
+    for on in (False, True):
+        options = LiftOptions(consensus=on, beta=0.7, vote=RefineConfig(vote="posterior", k=3))
+        names = ("a.png", "b.png", "c.png")
+        fields.append(lift_scene(scene(*names), source, options, tmp_path / "cache", encoder={}).field)
+    for before, after in zip(given[0], given[1]):
+        assert torch.equal(after, before)
+    plain, agreed = (voting_scalars(field) for field in fields)
+    assert torch.allclose(agreed.norm, plain.norm, atol=1e-6)
+    assert torch.allclose(agreed.own_evidence, given[1][1], atol=1e-5)
+    assert torch.equal(plain.norm, fields[0].scalars.norm)
 
 
 def test_levels_agree_each_for_itself(tmp_path: Path) -> None:

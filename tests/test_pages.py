@@ -83,7 +83,7 @@ def test_wrong_markers_are_refused(text, message):
 def test_check_names_the_page_and_the_table(folder, capsys):
     pages.main(check=True, folder=folder)
     page = folder / "accuracy.md"
-    stale = page.read_text().replace("| fitted, the defaults | 36 |", "| fitted, the defaults | 48 |")
+    stale = page.read_text().replace("| fitted, for `--vote paper` | 36 |", "| fitted, for `--vote paper` | 48 |")
     page.write_text(stale)
     with pytest.raises(SystemExit) as stopped:
         pages.main(check=True, folder=folder)

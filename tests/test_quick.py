@@ -58,6 +58,10 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
     if not near.any():
         for ours, theirs in zip(found.summarize(), asking.summarize(expected), strict=True):
             assert set(ours) == set(theirs)
+            bins, same = ours.pop("histogram"), theirs["histogram"]
+            assert (bins is None) == (same is None)
+            assert bins is None or sum(bins.pop("counts")) == sum(same.pop("counts")) == found.valid.sum()
+            assert bins == (None if same is None else pytest.approx(same, abs=1e-5))
             for name, value in ours.items():
                 assert value == (pytest.approx(theirs[name], abs=1e-5) if value is not None else None), name
 
@@ -98,6 +102,9 @@ def test_colours_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
     run = open_run(lifted)
     expected = run.ask("red", "sky blue")
     for row, other in zip(rows, asking.summarize(expected), strict=True):
+        bins, same = row.pop("histogram"), other.pop("histogram")
+        assert sum(bins.pop("counts")) == sum(same.pop("counts"))
+        assert bins == pytest.approx(same, abs=1e-5)
         assert row == {key: pytest.approx(value, abs=1e-5) for key, value in other.items()}
     stored = run.ask_stored()
     assert stored is not None and stored.texts == ("red", "sky blue")

@@ -27,12 +27,14 @@ from normlift_ns.scripts.evaluate import NormLiftEval
 from normlift_ns.scripts.export import NormLiftExport
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
+from normlift_ns.scripts.view import NormLiftView
 
 OPTIONS: dict[type, dict[str, Any]] = {
     **{cls: {} for cls in (LiftOptions, RefineConfig, SourceOptions, SplatOptions, AskOptions, NormLift, Demo)},
     **{cls: {} for cls in (ScannetOptions, LerfOptions, MaskOptions)},
     NormLiftQuery: {"load_config": Path("config.yml"), "text": ("red",)},
     NormLiftExport: {"load_config": Path("config.yml"), "output_dir": Path("out")},
+    NormLiftView: {"load_config": Path("config.yml")},
     NormLiftEval: {"protocol": "masks", "load_config": (Path("config.yml"),), "labels": (Path("labels"),)},
 }
 """With the options that have no default."""
@@ -155,8 +157,8 @@ def test_more_neighbours_than_there_are():
     means = torch.rand(6, 3, generator=torch.Generator().manual_seed(0))
     u, r = torch.nn.functional.normalize(means, dim=1), means[:, 0]
     with pytest.warns(UserWarning, match="k is 100,000, but a Gaussian has only 5 others; the vote is among 5"):
-        many = refine(means, u, r, RefineConfig(k=100_000, delta=0.0))
-    assert torch.equal(many, refine(means, u, r, RefineConfig(k=5, delta=0.0)))
+        many = refine(means, u, r, RefineConfig(vote="paper", k=100_000, delta=0.0))
+    assert torch.equal(many, refine(means, u, r, RefineConfig(vote="paper", k=5, delta=0.0)))
     with pytest.warns(UserWarning, match=f"k is 100,000, but at most {MOST_VOTERS} can vote"):
         assert possible(RefineConfig(k=100_000), 6000).k == MOST_VOTERS
     with warnings.catch_warnings():

@@ -12,7 +12,7 @@ from benchmarks.rule import CHOICE, CONFIRMATION, LIMITS, Cell, cells_of, damage
 
 NAMES = ("none", "one", "two")
 CELLS = [cell for scene in CHOICE for cell in cells_of(scene)]
-ROOM = cells_of(CONFIRMATION)
+ROOM = cells_of("third")
 
 
 def table(cells=CELLS, **given: float | Callable[[Cell], float]):
@@ -33,6 +33,7 @@ def some(count, loss, gain=3.0, cells=CELLS, chosen=lambda cell: True):
 
 
 def test_the_grid_is_the_one_that_was_written_down():
+    assert CHOICE == ("tabletop", "demo") and CONFIRMATION == ("second", "third")
     assert len(CELLS) == 2 * 299 and len(ROOM) == 299 and len(set(CELLS)) == len(CELLS)
     assert Counter(cell.kind for cell in ROOM) == {"masks": 212, "superpixels": 29, "grid": 29, "patches": 29}
     assert Counter(cell.views for cell in ROOM) == {"all": 96, "6": 96, "3": 96, "4": 11}
@@ -107,7 +108,7 @@ def test_clause_4_share_of_a_column():
         assert (found.worst, found.worst_cell in few) == (2.0, True)
 
 
-def test_the_second_room_confirms_or_refutes_and_is_never_chosen_on():
+def test_rooms_confirm_or_refute_and_are_never_chosen_on():
     choice = table(one=1.0, two=2.0)
     best_in_the_room = decide(choice | table(ROOM, one=9.0, two=1.0), NAMES)
     assert (best_in_the_room.default, best_in_the_room.confirmed) == ("two", True)
@@ -115,6 +116,9 @@ def test_the_second_room_confirms_or_refutes_and_is_never_chosen_on():
     for gain in (0.0, -0.5, lambda cell: -0.3 if cell.undamaged else 3.0, some(15, 2.0, cells=ROOM)):
         refuted = decide(choice | table(ROOM, one=9.0, two=gain), NAMES)
         assert (refuted.default, refuted.choice, refuted.confirmed) == ("none", "two", False)
+    second = table(cells_of("second"), one=9.0, two=1.0)
+    assert decide(choice | second | table(ROOM, one=9.0, two=1.0), NAMES).default == "two"
+    assert decide(choice | second | table(ROOM, one=9.0, two=0.0), NAMES).default == "none"  # one room is enough
     none = decide(table(one=-1.0, two=-1.0) | table(ROOM, one=5.0, two=5.0), NAMES)
     assert (none.default, none.confirmed) == ("none", True)
 

@@ -2,22 +2,29 @@
 
 A mistake of a 2D feature is shared by its whole region in one view, so that neighbours in space repeat it. Regions of
 other views that hold the same Gaussians do not. With E the evidence, W_jv(s) the weight of Gaussian j in the view of
-region s, and sums over the Gaussians that both views see::
+region s, in pixels without a region too, and sums over the Gaussians that both views see::
 
     p_js = E_js / W_jv(s)                                        share of j that lies in s, 0 where below 0.02
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
     J_st = 1 / (1 / c_st + 1 / c_ts - 1)                         soft intersection over union, symmetric, in 0..1
-    B    = sum_sv a_sv max_{t in v} J_st / sum_sv a_sv           what best overlaps come to, a_sv = sum_j p_js
+    B    = sum_sv a_sv max_{t in v} J_st / sum_sv a_sv           what best overlaps come to
     F'_s = normalise(F_s + b(B) sum_t J_st c_ts ** q F_t)        b: 0 up to B = 0.4, 1 from B = 0.5
+
+Pixels without a region count because a thing that a view has no mask of would else seem to lie in the masks of its
+neighbours, whose frayed borders reach it. a_sv = sum_j p_js sum_{t in v} p_jt is what of s lies in regions of v.
 
 The factor c_ts keeps a region that covers several things from speaking for each of them. B tells regions of things
 from cells of an arbitrary partition, whose overlaps average neighbours: two squares of the same size that lie at
 random have 9/16 in common at best, which is J = 0.39.
+
+Directions are those of the lift of F'. R stays that of the lift of F (`seen_reliability`): it knows where regions
+disagreed before they were made to agree, and so ranks the answers of F' better than R of F' does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -26,6 +33,7 @@ from torch import Tensor
 
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.core.lift import Scalars
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 
@@ -57,7 +65,16 @@ class Overlaps(NamedTuple):
 
 
 class Consensus(NamedTuple):
-    """A feature table on which the views agree, and how it came about."""
+    """A feature table on which the views agree, and how it came about.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, consensus
+    >>> from normlift_ns.core.evidence import Entries
+    >>> seen = Entries(torch.tensor([0, 0]), torch.tensor([1, 3]), torch.ones(2), num_regions=(1, 1))
+    >>> found = consensus(Evidence.from_entries([seen], num_gaussians=1), torch.eye(2))  # two views of one Gaussian
+    >>> found.features[0], found.agreement, found.gaussians
+    (tensor([0.7071, 0.7071]), [1.0], 1)
+    """
 
     features: Float[Tensor, "s d"]
     """F': unit rows, 0 where F is."""
@@ -86,8 +103,7 @@ def consensus(
         ValueError: a table or levels of another length, a power or a sample outside its range.
 
     >>> import torch
-    >>> from normlift_ns import Evidence
-    >>> from normlift_ns.core.consensus import consensus
+    >>> from normlift_ns import Evidence, consensus
     >>> from normlift_ns.core.evidence import Entries
     >>> seen = Entries(torch.tensor([0, 0, 0]), torch.tensor([1, 3, 5]), torch.ones(3), num_regions=(1, 1, 1))
     >>> evidence = Evidence.from_entries([seen], num_gaussians=1)  # three views, each with one region
@@ -105,13 +121,20 @@ def consensus(
     rows = evidence.rows.select_rows(chosen)
     level = torch.zeros(size, dtype=torch.int64) if level is None else level
     out, agreement = features.to(device, copy=True), []
-    for number in level.unique().tolist():
+    levels = level.unique().tolist()
+    total = seen_weights(evidence, chosen, max(1, len(levels)))
+    for number in levels:
         columns = (level == number).nonzero().squeeze(1).to(device)
         part = rows if len(columns) == size else rows.select_columns(columns, size)
-        overlaps = region_overlaps(part, evidence.region_view[columns], chance)
+        overlaps = region_overlaps(part, evidence.region_view[columns], chance, total)
         out[columns] = agreed(out[columns], overlaps, power)
         agreement.append(overlaps.agreement)
     return Consensus(out, agreement, len(chosen))
+
+
+def seen_reliability(agreed: Scalars, seen: Scalars) -> Scalars:
+    """The numbers of the lift of F', with R of the lift of F; 0 where F' gives no direction."""
+    return replace(agreed, reliability=torch.where(agreed.norm > 0, seen.reliability, 0.0))
 
 
 def agreed(features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0) -> Float[Tensor, "s d"]:
@@ -149,8 +172,20 @@ def sampled_gaussians(
         share = torch.where(lacking, (2 * share).clamp(max=1), share)
 
 
+def seen_weights(evidence: Evidence, gaussians: Int64[Tensor, " m"], levels: int = 1) -> SparseRows:
+    """W_jv of some Gaussians, pixels without a region included, [M, views]: in each of so many levels, because the
+    evidence counts a pixel once per level.
+    """
+    rows, blank = evidence.rows.select_rows(gaussians), evidence.unlabeled.select_rows(gaussians)
+    found = SparseRows.add(replace(evidence, rows=rows, unlabeled=blank).view_weights(), blank)
+    return replace(found, weight=found.weight / levels)
+
+
 def region_overlaps(
-    rows: SparseRows, region_view: Int[Tensor, " s"], chance: Float64[Tensor, " m"] | None = None
+    rows: SparseRows,
+    region_view: Int[Tensor, " s"],
+    chance: Float64[Tensor, " m"] | None = None,
+    total: SparseRows | None = None,
 ) -> Overlaps:
     """J of all regions of one level, from the evidence of some Gaussians.
 
@@ -158,16 +193,20 @@ def region_overlaps(
         rows: E, [M, S].
         region_view: view of every column, non-decreasing.
         chance: with which each of the Gaussians was taken; None: they are all.
+        total: W_jv, [M, views], pixels without a region included; None: there are none.
     """
     size, view = len(region_view), region_view.long()
-    views = int(view[-1]) + 1 if size > 0 else 0
-    shares, visible = _shares(rows, view, views, chance)
-    area = torch.zeros(size, views, dtype=rows.weight.dtype, device=view.device)  # a_sv
+    last = [x.max() for x in (view, *(() if total is None else (total.column,))) if len(x) > 0]
+    views = int(max(last)) + 1 if size > 0 else 0
+    shares, visible, labeled = _shares(rows, view, views, chance, total)
+    area = torch.zeros(size, views, dtype=rows.weight.dtype, device=view.device)  # sum_j p_js over what a view sees
+    in_regions = torch.zeros_like(area)  # a_sv
     parts, first = [(view[:0], view[:0], area.new_zeros(0, dtype=torch.float64))], 0
-    for of_block, *pairs in _inner_products(shares, visible, view, views):
-        area[first : first + len(of_block)] = of_block
+    for of_seen, of_regions, *pairs in _inner_products(shares, visible, labeled, view, views):
+        last = first + len(of_seen)
+        area[first:last], in_regions[first:last] = of_seen, of_regions
         parts.append((pairs[0], pairs[1], pairs[2]))
-        first += len(of_block)
+        first = last
     row, column, inner = (torch.cat(x) for x in zip(*parts))
     c, inside = inner / area[row, view[column]], inner / area[column, view[row]]
     iou = (1 / (1 / c + 1 / inside - 1)).clamp(max=1)
@@ -176,8 +215,8 @@ def region_overlaps(
     row, column, iou, inside = row[kept], column[kept], iou[kept], inside[kept].clamp(max=1)
     starts = _starts(row * views + view[column])
     best = torch.segment_reduce(iou, "max", offsets=torch.cat([starts, starts.new_tensor([len(row)])]), initial=0.0)
-    met = (best * area[row[starts], view[column[starts]]]).sum()
-    seen = area.sum(dtype=torch.float64) - area.gather(1, view[:, None]).sum(dtype=torch.float64)
+    met = (best * in_regions[row[starts], view[column[starts]]]).sum()
+    seen = in_regions.sum(dtype=torch.float64) - in_regions.gather(1, view[:, None]).sum(dtype=torch.float64)
     agreement = float(met / seen) if len(row) > 0 else 0.0
     return Overlaps(SparseRows(row_offsets(row, size), column.int(), iou), inside, agreement)
 
@@ -207,22 +246,31 @@ def _starts(key: Int64[Tensor, " m"]) -> Int64[Tensor, " g"]:
 
 
 def _shares(
-    rows: SparseRows, view: Int64[Tensor, " s"], views: int, chance: Float64[Tensor, " m"] | None
-) -> tuple[SparseRows, SparseRows]:
-    """p [M, S] of the views that see a Gaussian, and 1 for each of them [M, views], both divided by the square root of
-    its chance, so that products count as often as they would in the whole.
+    rows: SparseRows,
+    view: Int64[Tensor, " s"],
+    views: int,
+    chance: Float64[Tensor, " m"] | None,
+    total: SparseRows | None,
+) -> tuple[SparseRows, SparseRows, SparseRows]:
+    """p [M, S] of the views that see a Gaussian, 1 for each of them [M, views], and what of that lies in regions, all
+    divided by the square root of the Gaussian's chance, so that products count as often as they would in the whole.
     """
     entries, of_row, of_view, weight = _by_view(rows, view, views)
-    some = max(1, len(weight) // _MEDIAN)
-    seen = (weight > 0) & (weight >= SEEN * _medians(weight[::some], of_view[::some], views)[of_view])
-    kept = seen[entries] & (rows.weight >= FAINT * weight[entries])
+    if total is None:
+        total = SparseRows(row_offsets(of_row, len(rows)), of_view.int(), weight)
+    all_row, all_view = total.row_index(), total.column.long()
+    place = torch.searchsorted(all_row * views + all_view, of_row * views + of_view)
+    whole = total.weight.double().index_put((place,), torch.maximum(total.weight.double()[place], weight))
+    some = max(1, len(whole) // _MEDIAN)
+    seen = (whole > 0) & (whole >= SEEN * _medians(whole[::some], all_view[::some], views)[all_view])
+    share = rows.weight.double() / whole[place][entries]
+    kept = seen[place][entries] & (share >= FAINT)
     row = rows.row_index()[kept]
-    rows = SparseRows(row_offsets(row, len(rows)), rows.column[kept], rows.weight[kept])
-    entries, of_row, of_view, weight = _by_view(rows, view, views)
-    scale = weight.new_ones(len(rows)) if chance is None else chance.rsqrt()
-    share = rows.weight.double() / weight[entries] * scale[row]
-    visible = SparseRows(row_offsets(of_row, len(rows)), of_view.int(), scale[of_row])
-    return SparseRows(rows.offsets, rows.column, share), visible
+    scale = whole.new_ones(len(rows)) if chance is None else chance.rsqrt()
+    shares = SparseRows(row_offsets(row, len(rows)), rows.column[kept], share[kept] * scale[row])
+    visible = SparseRows(row_offsets(all_row[seen], len(rows)), all_view[seen].int(), scale[all_row[seen]])
+    _, of_row, of_view, weight = _by_view(shares, view, views)
+    return shares, visible, SparseRows(row_offsets(of_row, len(rows)), of_view.int(), weight)
 
 
 def _by_view(
@@ -248,11 +296,14 @@ def _medians(values: Float64[Tensor, " m"], group: Int64[Tensor, " m"], groups: 
     return out
 
 
-_Block = tuple[Tensor, Tensor, Tensor, Tensor]
-"""a_sv of some regions s, [regions, views], and (s, t, sum_j p_js p_jt) of other views, c_st >= `LEAST`."""
+_Block = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""sum_j p_js of some regions s over what a view sees and over what lies in its regions, [regions, views], and
+(s, t, sum_j p_js p_jt) of other views, c_st >= `LEAST`."""
 
 
-def _inner_products(shares: SparseRows, visible: SparseRows, view: Int64[Tensor, " s"], views: int) -> Iterator[_Block]:
+def _inner_products(
+    shares: SparseRows, visible: SparseRows, labeled: SparseRows, view: Int64[Tensor, " s"], views: int
+) -> Iterator[_Block]:
     """The products of all regions, block by block."""
     order = shares.column.argsort(stable=True)
     row, weight = shares.row_index()[order].int(), shares.weight[order]
@@ -260,30 +311,42 @@ def _inner_products(shares: SparseRows, visible: SparseRows, view: Int64[Tensor,
     if kernels_apply(view):
         step = max(1, _DENSE // max(1, len(view)))
         for first in range(0, len(view), step):
-            yield _dense_block(by_region, shares, visible, view, views, first, min(len(view), first + step))
+            last = min(len(view), first + step)
+            yield _dense_block(by_region, shares, visible, labeled, view, views, first, last)
     else:
-        for block in _sparse_blocks(by_region.to("cpu"), shares.to("cpu"), view.cpu(), views):
+        by_region, shares, visible = (x.to("cpu") for x in (by_region, shares, visible))
+        for block in _sparse_blocks(by_region, shares, visible, view.cpu(), views):
             yield tuple(x.to(view.device) for x in block)  # pyright: ignore[reportReturnType]
 
 
 def _dense_block(
-    by_region: SparseRows, shares: SparseRows, visible: SparseRows, view: Tensor, views: int, first: int, last: int
+    by_region: SparseRows,
+    shares: SparseRows,
+    visible: SparseRows,
+    labeled: SparseRows,
+    view: Tensor,
+    views: int,
+    first: int,
+    last: int,
 ) -> _Block:
     from normlift_ns.kernels.overlaps import products  # noqa: PLC0415 (needs triton)
 
-    area = products(by_region, visible, views, first, last)
+    area, met = (products(by_region, x, views, first, last) for x in (visible, labeled))
     inner = products(by_region, shares, len(view), first, last)
     row, column = ((inner >= (LEAST * area)[:, view]) & (inner > 0) & (view[first:last, None] != view)).nonzero(
         as_tuple=True
     )
-    return area, row + first, column, inner[row, column].double()
+    return area, met, row + first, column, inner[row, column].double()
 
 
-def _sparse_blocks(by_region: SparseRows, shares: SparseRows, view: Tensor, views: int) -> Iterator[_Block]:
+def _sparse_blocks(
+    by_region: SparseRows, shares: SparseRows, visible: SparseRows, view: Tensor, views: int
+) -> Iterator[_Block]:
     from scipy.sparse import csr_array  # noqa: PLC0415 (a GPU does without)
 
-    whole = csr_array(
-        tuple(x.numpy() for x in (shares.weight, shares.column, shares.offsets.int())), shape=(len(shares), len(view))
+    whole, seen = (
+        csr_array(tuple(a.numpy() for a in (x.weight, x.column, x.offsets.int())), shape=(len(x), width))
+        for x, width in ((shares, len(view)), (visible, views))
     )
     pairs = segment_sum(shares.offsets.diff()[by_region.column.long()].double(), by_region.offsets).cumsum(0)
     first = 0
@@ -293,14 +356,15 @@ def _sparse_blocks(by_region: SparseRows, shares: SparseRows, view: Tensor, view
         low, high = int(by_region.offsets[first]), int(by_region.offsets[last])
         offsets = (by_region.offsets[first : last + 1] - low).int()
         arrays = (by_region.weight[low:high].numpy(), by_region.column[low:high].numpy(), offsets.numpy())
-        inner = csr_array(csr_array(arrays, shape=(last - first, len(shares))) @ whole)
+        block = csr_array(arrays, shape=(last - first, len(shares)))
+        inner, area = csr_array(block @ whole), torch.from_numpy(csr_array(block @ seen).toarray())
         row = torch.repeat_interleave(torch.arange(last - first), torch.from_numpy(inner.indptr).long().diff())
         column, value = torch.from_numpy(inner.indices), torch.from_numpy(inner.data)
         key = row * views + view[column]  # what is seen of s in a view lies in the regions of that view
-        area = torch.bincount(key, weights=value, minlength=(last - first) * views)
+        met = torch.bincount(key, weights=value, minlength=(last - first) * views)
         own = torch.arange(last - first) * views + view[first:last]
-        least = LEAST * area
+        least = LEAST * area.flatten()
         least[own] = torch.inf
         kept = (value >= least[key]).nonzero().squeeze(1)
-        yield area.view(-1, views), row[kept] + first, column[kept].long(), value[kept]
+        yield area, met.view(-1, views), row[kept] + first, column[kept].long(), value[kept]
         first = last

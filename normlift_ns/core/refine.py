@@ -52,6 +52,7 @@ def refine(
     changes; see `unsupported`. Where R_i = 0, S_ii = 0: whoever clears Delta wins.
 
     Args:
+        config: by default the posterior vote where `own` is given, else the paper's.
         directions: u, unit rows or 0, of any floating-point type, read in float32 (float64 if given); or a function
             that gives those of some Gaussians, `Lifted.directions`: then only a block of them is held at a time.
         reliability: R in 0..1.
@@ -66,14 +67,14 @@ def refine(
     >>> from normlift_ns import RefineConfig, refine
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     >>> directions = torch.tensor([[1.0, 0], [0, 1], [1, 0]])
-    >>> source = refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2))
+    >>> source = refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(vote="paper", k=2))
     >>> source.tolist(), directions[source.long()].tolist()
     ([0, 0, 2], [[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
-    >>> vote, seen = RefineConfig(vote="posterior", k=2), torch.tensor([9.0, 1.0, 9.0])
-    >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), vote, own=seen).tolist()
+    >>> seen = torch.tensor([9.0, 1.0, 9.0])
+    >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2), own=seen).tolist()
     [0, 0, 2]
     """
-    n, config = means.shape[0], config or RefineConfig()
+    n, config = means.shape[0], config or RefineConfig(vote="paper" if own is None else "posterior")
     config = config if neighbors is not None else possible(config, n)
     given = directions if isinstance(directions, Tensor) else None
     shape = (n, 0) if given is None else tuple(given.shape)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from normlift_ns.core.consensus import consensus, seen_reliability
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -24,7 +25,8 @@ from normlift_ns.core.storage import StoredDirections, StoredEvidence
 from normlift_ns.encoders.build import recorded_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.observing import BLOCK, Block, observe_views, of_regions, spread
+from normlift_ns.observing import BLOCK, Block, observe_views, of_regions, region_levels, spread
+from normlift_ns.options import LiftOptions
 from normlift_ns.raster.rasterize import rasterize_evidence
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
@@ -71,6 +73,42 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     valid = (rows != 0).any(dim=1)
     scalars = replace(scalars, norm=valid.to(scalars.norm))
     return SemanticField(scalars, own, StoredDirections(rows[valid], None), facts)
+
+
+def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
+    """The run as it is with consensus or without it, unrefined: itself where it was lifted so, else lifted again from
+    its regions and features.
+
+    Raises:
+        ValueError, FileNotFoundError: as `seen_blocks`.
+    """
+    manifest, defaults = lifted.field.manifest, LiftOptions()
+    options = manifest.get("options", {})
+    if options.get("consensus", False) == on:
+        return lifted
+    power = options.get("weight_power", 1)
+    gaussians = lifted.scene.gaussians.to(device)
+    rasterize = partial(
+        rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
+    )
+    parts, tables, levels = [], [], []
+    for block in seen_blocks(lifted, device):
+        parts.append(of_regions(_plain(rasterize, gaussians, block, power=power), block))
+        tables += block.features
+        levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
+    evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
+    how = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
+    found = lift(evidence, features, **how)
+    if on:
+        given = {"power": options.get("consensus_power"), "sample": options.get("consensus_sample")}
+        given = {key: value for key, value in given.items() if value is not None}
+        agreed = consensus(evidence, features, level=torch.cat(levels), **given)
+        of_agreed = lift(evidence, agreed.features, **how)
+        found = replace(of_agreed, scalars=seen_reliability(of_agreed.scalars, found.scalars))
+    own = torch.arange(len(gaussians), dtype=torch.int32)
+    store = StoredEvidence(evidence.to("cpu"), found.features.cpu())
+    changed = {**manifest, "options": {**options, "consensus": on}}
+    return replace(lifted, field=SemanticField(found.scalars.map(Tensor.cpu), own, store, changed), refined=False)
 
 
 def seen_blocks(lifted: EvaluatedRun, device: str, *, most: int | None = None) -> Iterator[Block]:

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from normlift_ns.core.metrics import classify
-from normlift_ns.evaluation.baselines import BASELINES, baseline_field
+from normlift_ns.evaluation.baselines import BASELINES, baseline_field, with_consensus
 from normlift_ns.evaluation.dense import time_sfs_way, why_not_timed
 from normlift_ns.evaluation.options import ScannetOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, label_scene, scene_names
 from normlift_ns.evaluation.results import Evaluation, mean
 from normlift_ns.evaluation.scannet import answers, read_labels
 from normlift_ns.evaluation.signals import SceneSignals, signals
-from normlift_ns.evaluation.votes import Vote, own_vote, voter
+from normlift_ns.evaluation.votes import Vote, ablation, agreed_ablation, own_vote, voter
 
 Evaluate = Callable[[Iterable[EvaluatedRun]], Evaluation]
 Row = Mapping[str, Any]
@@ -41,6 +41,25 @@ def study_votes(
             )
             known[key] = evaluate(voted).results
         rows.append({**each[0].label, **known[key]})
+    return rows
+
+
+def study_ablation(
+    runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, tell: Callable[[str], None] = lambda text: None
+) -> list[Row]:
+    """Results of the protocol with every variant, without consensus and with it, whichever way the runs were lifted.
+
+    Args:
+        tell: told why variants are left out: the features of a run cannot be made again.
+    """
+    rows: list[Row] = []
+    for on, votes in ((False, ablation), (True, agreed_ablation)):
+        try:
+            some = [with_consensus(lifted, on, device) for lifted in runs]
+        except (ValueError, FileNotFoundError) as error:
+            tell(f"The ablation leaves out all variants {'with' if on else 'without'} consensus: {error}")
+            continue
+        rows += study_votes(some, evaluate, votes, device)
     return rows
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from normlift_ns.core.ablations import Variant, linear_average, variant_config, variant_reliability, variant_source
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.storage import StoredDirections
 from normlift_ns.options import LiftOptions, RefineConfig, VoteKind
@@ -27,6 +28,8 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 """Values tried besides the default and those of the runs, the others as the run was lifted; beta, K and Delta as in the
 paper's appendix."""
+AGREED: dict[str, Variant] = {"consensus": "none", "consensus_paper": "paper", "consensus_posterior": "posterior"}
+"""What follows the consensus, by name."""
 BETA = LiftOptions().beta
 """The default."""
 
@@ -50,10 +53,28 @@ def own_vote(manifest: Mapping[str, Any]) -> Vote:
     return Vote(config.vote, config, options.get("beta", BETA), {})
 
 
+def voting_scalars(field: SemanticField) -> Scalars:
+    """The numbers that a run votes with: with consensus, ||f|| is that of which its R is made, the one before it."""
+    found, options = field.scalars, field.manifest.get("options", {})
+    if not options.get("consensus", False):
+        return found
+    support = found.n_eff / (found.n_eff + options.get("beta", BETA))
+    return replace(found, norm=torch.where(support > 0, found.reliability / support, 0.0).clamp(max=1))
+
+
 def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
     """The variants of the paper's table 2 and the posterior vote, one vote per run."""
-    for variant in get_args(Variant):
-        yield [replace(own, variant=variant, label={"variant": variant}) for own in owns]
+    return _variants(owns, {variant: variant for variant in get_args(Variant)})
+
+
+def agreed_ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """`AGREED`, for runs with consensus, one vote per run."""
+    return _variants(owns, AGREED)
+
+
+def _variants(owns: Sequence[Vote], variants: Mapping[str, Variant]) -> Iterator[list[Vote]]:
+    for name, variant in variants.items():
+        yield [replace(own, variant=variant, label={"variant": name}) for own in owns]
 
 
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
@@ -89,6 +110,7 @@ def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) 
 def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:
     """Votes again, on the device; neighbours are searched once per K. Only linear averaging holds all directions."""
     there, places = field.to(device), means.to(device)
+    scalars = voting_scalars(there)
 
     @cache
     def neighbors(k: int) -> Neighbors:
@@ -103,14 +125,14 @@ def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Cal
         if vote.variant == "none":
             return replace(field, source=own)
         if vote.variant == "linear":
-            r = variant_reliability(vote.variant, there.scalars, vote.beta)
+            r = variant_reliability(vote.variant, scalars, vote.beta)
             config = variant_config(vote.variant, vote.config)
             found = linear_average(unrefined(own.long().to(device)), r, near, config)
             has = (found != 0).any(dim=1)
             norm = torch.where(has & (there.scalars.norm <= 0), 1.0, there.scalars.norm)
-            scalars = replace(field.scalars, norm=norm.to(field.scalars.norm))
-            return replace(field, scalars=scalars, source=own, store=StoredDirections(found[has].half().cpu(), None))
-        scalars, how = there.scalars, {"beta": vote.beta, "neighbors": near}
+            changed = replace(field.scalars, norm=norm.to(field.scalars.norm))
+            return replace(field, scalars=changed, source=own, store=StoredDirections(found[has].half().cpu(), None))
+        how = {"beta": vote.beta, "neighbors": near}
         return replace(field, source=variant_source(vote.variant, places, unrefined, scalars, vote.config, **how).cpu())
 
     return voted

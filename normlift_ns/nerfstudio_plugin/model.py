@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
@@ -25,7 +27,7 @@ from normlift_ns.question import Question
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.raster.rasterize import render
 from normlift_ns.raster.settings import RasterSettings
-from normlift_ns.runs.files import check_run, with_paths
+from normlift_ns.runs.files import FIELD_FOLDER, check_run, with_paths
 from normlift_ns.runs.question import load_question
 from normlift_ns.scenes.nerfstudio.appearance import shading_degree
 from normlift_ns.scenes.photographs import to_camera
@@ -38,7 +40,7 @@ class NormLiftModelConfig(SplatfactoModelConfig):
 
     _target: type = field(default_factory=lambda: NormLiftModel)
     semantics: Path | None = None
-    """Folder of the semantic field (the normlift/ folder of a lifted run); none: plain splatfacto."""
+    """Folder of the semantic field (normlift/ of a lifted run), relative to config.yml; none: plain splatfacto."""
 
     @staticmethod
     def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
@@ -83,7 +85,7 @@ class NormLiftModel(SplatfactoModel):
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
-            folder = self.config.semantics
+            folder = self.config.semantics = own_semantics(self.config.semantics)
             check_run(folder.parent)
             self.attach(with_paths(SemanticField.load(folder, self.means), folder), load_question(folder))
         if self.on_cpu:
@@ -116,7 +118,8 @@ class NormLiftModel(SplatfactoModel):
         view = _opencv(camera.to(self.device))
         values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
         if self.on_cpu:
-            outputs, scalars = self._render_on_cpu(view, values, rows)
+            with untraced():
+                outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
             outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
             # where all is cropped away, splatfacto's outputs are on the CPU and its background is [3]
@@ -126,7 +129,9 @@ class NormLiftModel(SplatfactoModel):
         self.set_crop(obb_box)
         if display is None:
             return outputs
-        return {**outputs, **draw(display, outputs["rgb"], scalars, outputs["accumulation"][:, :, 0])}
+        alpha = outputs["accumulation"][:, :, 0]
+        with untraced():
+            return {**outputs, **draw(display, outputs["rgb"], scalars, alpha, by_text=self.normlift.viewed)}
 
     def rows_in(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are drawn: inside the box, and not hidden; None: all."""
@@ -141,6 +146,10 @@ class NormLiftModel(SplatfactoModel):
         rows = self.rows_in(self.crop_box, self._display)
         weights = ray_weights(self._scene(rows), origin, direction)
         return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
+
+    def scene(self) -> GaussianScene:
+        """All Gaussians."""
+        return self._scene(None)
 
     def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
         """For `write_splats`: parameters, whether colours are spherical harmonics, and how they were rasterized."""
@@ -191,6 +200,20 @@ class NormLiftModel(SplatfactoModel):
         return metrics, images
 
 
+def own_semantics(semantics: Path) -> Path:
+    """The semantic field beside the config.yml that nerfstudio's `eval_setup` reads, or where the config says.
+
+    A run that was copied says what the original said. nerfstudio does not tell a model where its config is.
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_code.co_name == "eval_setup" and "config_path" in frame.f_locals:
+            beside = Path(frame.f_locals["config_path"]).absolute().parent / FIELD_FOLDER
+            return beside if beside.is_dir() else semantics
+        frame = frame.f_back
+    return semantics
+
+
 class _Rows(NamedTuple):
     """Some Gaussians, where splatfacto expects a box that tells which points are within."""
 
@@ -212,6 +235,20 @@ def compile_renderer() -> None:
 def _opencv(camera: Cameras) -> Camera:
     pose, intrinsics = camera.camera_to_worlds.reshape(3, 4), camera.get_intrinsics_matrices().reshape(3, 3)
     return to_camera(pose, intrinsics, int(camera.width.item()), int(camera.height.item()))
+
+
+@contextmanager
+def untraced() -> Iterator[None]:
+    """Without the tracer by which nerfstudio's viewer interrupts a picture at any line of Python.
+
+    An exception from it inside Numba's dispatcher, or in the middle of an import, ends the thread that draws.
+    """
+    tracer = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(tracer)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from normlift_ns.asking import answer
 from normlift_ns.core.crash import explain
 from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source, source_settings
@@ -179,10 +180,13 @@ def lift_trained(trainer: Trainer) -> Path:
     field.save(folder, overwrite=True, beside=digests_beside(folder, files))
     question = None
     if len(options.queries) > 0:
-        question = make_question(field, source.text, options.queries)
+        asked = make_question(field, source.text, options.queries)
+        question = answer(field, scene.gaussians.means, asked).question
         save_question(folder, question)
-    trainer.config.pipeline.model.semantics = folder  # type: ignore[attr-defined]
+    model: Any = trainer.config.pipeline.model
+    model.semantics = Path(FIELD_FOLDER)
     write_text(path, sealed(yaml.dump(trainer.config)), overwrite=True)
+    model.semantics = folder
     with trainer.train_lock:
         pipeline.model.attach(field, question)
     viewer: Any = trainer.viewer_state

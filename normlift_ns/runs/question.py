@@ -48,6 +48,10 @@ def save_question(folder: Path, question: Question) -> Path:
         ValueError: what `load_question` would refuse.
         OSError: the file cannot be written.
     """
+    if question.suggest:
+        raise InputError(
+            "the question cannot be stored: its threshold is to be suggested; ask it, and store the answer's"
+        )
     facts = _Facts(
         question.texts, question.negatives, question.refined, question.rule, question.threshold,
         question.min_reliability, question.encoder,

@@ -19,7 +19,7 @@ from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, TRANSFORMS_FILE
 def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
     """A config by which stock nerfstudio finds the cameras in the directory of the run, and leaves them as they are.
 
-    All paths are absolute: there is no directory of a training that they could be relative to.
+    Paths but that of the field are absolute: there is no directory of a training that they could be relative to.
     """
     cameras = run_dir / TRANSFORMS_FILE
     dataparser = NerfstudioDataParserConfig(
@@ -35,7 +35,7 @@ def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
         sh_degree=max(1, scene.splat.degree),
         background_color=scene.background_name,
         rasterize_mode=scene.rasterize_mode,
-        semantics=run_dir / FIELD_FOLDER,
+        semantics=Path(FIELD_FOLDER),
     )
     datamanager = FullImageDatamanagerConfig(
         data=cameras,

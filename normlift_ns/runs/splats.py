@@ -19,7 +19,7 @@ from normlift_ns.core.query import strongest
 from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 
-_LEAST_OPACITY = -5.5373
+LEAST_OPACITY = -5.5373
 """logit(1 / 255): what is fainter is never drawn, and ns-export leaves it out."""
 _COMMENT_LENGTH = 60
 _CONSTANT_HARMONIC = 0.28209479177387814
@@ -64,7 +64,7 @@ def semantic_columns(field: SemanticField, answer: Answer | None) -> dict[str, n
 def exported_rows(columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"]) -> Int64[np.ndarray, " m"]:
     """Indices of the kept Gaussians that ns-export would write: all parameters finite, opacity at least 1/255."""
     finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
-    return np.flatnonzero(finite & (columns["opacity"] >= _LEAST_OPACITY) & keep.cpu().numpy())
+    return np.flatnonzero(finite & (columns["opacity"] >= LEAST_OPACITY) & keep.cpu().numpy())
 
 
 def write_splats(

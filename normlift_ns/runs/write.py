@@ -89,9 +89,7 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     config.timestamp = run_dir.name
     config.relative_model_dir = Path(CHECKPOINT_FOLDER)
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-    config.pipeline.model = NormLiftModelConfig.upgrade(
-        source.model_config, semantics=location.portable(run_dir / FIELD_FOLDER)
-    )
+    config.pipeline.model = NormLiftModelConfig.upgrade(source.model_config, semantics=Path(FIELD_FOLDER))
     if location.moved_data or config.output_dir.is_absolute():
         set_data(config, location.data)  # a relative one would not be found
     skip_seed_points(config)

@@ -209,9 +209,9 @@ def check_effect(lift: LiftOptions) -> None:
     usual = LiftOptions()
     for name in ("consensus_power", "consensus_sample"):
         if not lift.consensus and getattr(lift, name) != getattr(usual, name):
-            raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Add that, or leave it out.")
+            raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Set that, or leave it out.")
     if lift.vote.vote != "posterior" and lift.vote.prior != usual.vote.prior:
-        raise InputError("--prior is for --vote posterior. Add that, or leave it out.")
+        raise InputError("--prior is for --vote posterior. Set that, or leave it out.")
 
 
 def check_source(source: SourceOptions, queries: Iterable[str], data: Path | None = None) -> None:

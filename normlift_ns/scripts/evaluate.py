@@ -47,12 +47,12 @@ class NormLiftEval:
     refined: bool = True
     """Evaluate the refined directions."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
-    """What to measure besides. ablation: the variants of the refinement. sweeps: every parameter of the vote around
-    the run's own, with the default. signals: Gaussians without evidence, accuracy by R and by norm, R against opacity.
-    timing: what lifting took and, on a GPU, what SFS's way takes, 512 channels through gsplat. baselines: the ideas of
-    SFS, Occam's LGS, VALA and Dr.Splat on the features of the run, in our implementation. coverage: regions without
-    reliable evidence, photographs left out of the lift that would help, and new poses, drawn and as a camera path.
-    Holds all runs in memory."""
+    """What to measure besides. ablation: the variants of the refinement, with and without consensus. sweeps: every
+    parameter of the vote around the run's own, with the default. signals: Gaussians without evidence, accuracy by R and
+    by norm, R against opacity. timing: what lifting took and, on a GPU, what SFS's way takes, 512 channels through
+    gsplat. baselines: the ideas of SFS, Occam's LGS, VALA and Dr.Splat on the features of the run, in our
+    implementation. coverage: regions without reliable evidence, photographs left out of the lift that would help, and
+    new poses, drawn and as a camera path. Holds all runs in memory."""
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look names up in instead of the encoder that the runs were lifted with."""
     data: Path | None = None
@@ -75,8 +75,8 @@ class NormLiftEval:
         from normlift_ns.evaluation.coverage.study import coverage_of  # noqa: PLC0415
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.evaluation.results import write_evaluation  # noqa: PLC0415
-        from normlift_ns.evaluation.studies import baselines, study_votes, timing  # noqa: PLC0415
-        from normlift_ns.evaluation.votes import ablation, sweeps  # noqa: PLC0415
+        from normlift_ns.evaluation.studies import baselines, study_ablation, study_votes, timing  # noqa: PLC0415
+        from normlift_ns.evaluation.votes import sweeps  # noqa: PLC0415
         from normlift_ns.front_door import open_run  # noqa: PLC0415
         from normlift_ns.runs.files import cache_folder  # noqa: PLC0415
 
@@ -107,8 +107,10 @@ class NormLiftEval:
                 seen = coverage_of(held[0].scene, held[0].field, device=device)
                 studies[name] = [seen.to_json()]
                 posed = seen.poses, seen.pictures
+            elif name == "ablation":
+                studies[name] = study_ablation(held, evaluate, device, say)
             else:
-                studies[name] = study_votes(held, evaluate, {"ablation": ablation, "sweeps": sweeps}[name], device)
+                studies[name] = study_votes(held, evaluate, sweeps, device)
         experiments, checkpoints = (", ".join(values) for values in zip(*names))
         write_evaluation(
             self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from normlift_ns.core.files import refuse_existing
 from normlift_ns.errors import InputError
-from normlift_ns.options import MIN_SIZE, REACH, AskOptions
+from normlift_ns.options import FLOATER_LIMIT, MIN_SIZE, REACH, AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
 from normlift_ns.scripts.early import check_lifted, has_question, writable_file
 from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say, say_opening
@@ -26,8 +26,9 @@ class NormLiftExport:
     """Folder to write to; made if missing."""
     text: tuple[str, ...] = ()
     """What to look for. By default the queries stored in the run, with the options stored with them."""
-    part: Literal["scene", "selection", "rest"] = "scene"
-    """scene: all Gaussians. selection: what any of the texts selects. rest: the scene without that."""
+    part: Literal["scene", "selection", "rest", "clean"] = "scene"
+    """scene: all Gaussians. selection: what any of the texts selects. rest: the scene without that. clean: the scene
+    without likely floaters, Gaussians that hang free before the cameras."""
     ask: AskOptions = field(default_factory=AskOptions)
     output_filename: str = "splat.ply"
     """Name of the PLY file. The number of each Gaussian in the run goes to <name>_rows.npy, the objects to
@@ -36,6 +37,8 @@ class NormLiftExport:
     """Gaussians of one object are at most this far apart, in units of the selection's median spacing."""
     min_size: int = MIN_SIZE
     """Least number of Gaussians of an object."""
+    floater_limit: float = FLOATER_LIMIT
+    """Score above which a Gaussian is a likely floater, for --part clean. Higher: fewer are left out."""
     overwrite: bool = False
     """Replace files of these names."""
     data: Path | None = None
@@ -51,7 +54,7 @@ class NormLiftExport:
         check_device(self.device)
         check_texts("text", self.text)
         check_lifted(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
-        if self.part != "scene" and len(self.text) == 0 and not has_question(self.load_config):
+        if self.part in ("selection", "rest") and len(self.text) == 0 and not has_question(self.load_config):
             raise InputError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
         name = Path(self.output_filename).name
         if name == "":
@@ -75,6 +78,10 @@ class NormLiftExport:
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
         part = None if answer is None or self.part == "scene" else answer.mask
         part = ~part if part is not None and self.part == "rest" else part
+        if self.part == "clean":
+            floaters = run.floaters(self.floater_limit).mask
+            part = ~floaters
+            say(f"{int(floaters.sum()):,} likely floaters are left out")
         objects: dict[str, Any] | None = None
         if answer is not None:
             limits, question = {"reach": self.reach, "min_size": self.min_size}, answer.question

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from normlift_ns.core.crash import state_folder
 from normlift_ns.errors import InputError
+from normlift_ns.insight.histogram import bars
 from normlift_ns.question import Question
 from normlift_ns.quick import QuickRun
 from normlift_ns.scripts.shared import CONSOLE, plain, say, say_error
@@ -95,17 +96,35 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
 
 
 def show(rows: list[dict[str, Any]], question: Question) -> None:
-    """Prints the table of an answer."""
-    CONSOLE.print(table(rows, f"{question.rule} > {question.threshold:g}"))
+    """Prints the table of an answer, and what to know of texts that do not stand out."""
+    CONSOLE.print(table(rows, f"{question.rule} > {question.threshold:.4g}", question.threshold))
+    for row in rows:
+        if row["stands_out"] is False:
+            say(f"{row['text']}: probably not in this scene. {_nearest(row)}")
 
 
-def table(rows: list[dict[str, Any]], rule: str) -> Table:
-    """The numbers of every text."""
+def _nearest(row: Mapping[str, Any]) -> str:
+    """Where the scene is most like a text."""
+    top, limit = row["histogram"]["top"], row["histogram"]["limit"]
+    place = "" if row["nearest"] is None else f" at {' '.join(f'{x:.2f}' for x in row['nearest'])}"
+    return f"The nearest match{place} has relevancy {top:.3f}; what is there has {limit:.3g} or more."
+
+
+def _bars(spread: Mapping[str, Any] | None, threshold: float) -> str:
+    return "-" if spread is None else bars(spread["counts"], spread["low"], spread["high"], threshold)
+
+
+def table(rows: list[dict[str, Any]], rule: str, threshold: float) -> Table:
+    """The numbers of every text; its histogram has a bar | at the threshold."""
     made = Table(title=f"Selected: {rule}")
-    for name in ("text", "Gaussians", "centroid", "extent", "peak relevancy", "mean reliability"):
+    for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
         made.add_column(name, justify="left" if name == "text" else "right")
+    made.add_column("histogram", no_wrap=True)
+    made.add_column("suggested", justify="right")
     for row in rows:
         vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
         numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
-        made.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers)
+        suggested = "-" if row["suggested_threshold"] is None else f"{row['suggested_threshold']:.3f}"
+        line = plain(_bars(row["histogram"], threshold))
+        made.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers, line, suggested)
     return made

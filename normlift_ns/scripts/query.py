@@ -49,6 +49,10 @@ class NormLiftQuery:
     """Write pictures of the relevancy into this folder."""
     render_views: tuple[str, ...] = ()
     """Training images from whose cameras to render, such as 0001 0042. By default three of them, evenly spread."""
+    why: bool = False
+    """Say which photographs and regions voted for what is selected, and how far they agree."""
+    why_dir: Path | None = None
+    """With --why: write those photographs, with the outlines of the regions that voted, into this folder."""
     overwrite: bool = False
     """Replace files of these names."""
     data: Path | None = None
@@ -76,6 +80,7 @@ class NormLiftQuery:
         found = run.ask(self.text, **self.ask.rules())
         pictured = self._pictured(found.question) if self.render_dir is not None else None
         rows = found.summarize()
+        tell = self._explain(found, rows) if self.why else None
         if self.json is not None:
             _write_json(self.json, rows, found.question, self.overwrite)
         if self.output_path is not None:
@@ -83,8 +88,11 @@ class NormLiftQuery:
         if pictured is not None:
             pictured()
         stored = save_question(run.folder / FIELD_FOLDER, found.question) if self.save else None
-        written = [path for path in (self.json, self.output_path, self.render_dir, stored) if path is not None]
+        folders = (self.render_dir, self.why_dir)
+        written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
         show(rows, found.question)
+        if tell is not None:
+            tell()
         if len(written) > 0:
             say("Written: " + ", ".join(map(str, written)))
         return rows
@@ -121,6 +129,17 @@ class NormLiftQuery:
         settings = RasterSettings.recorded(run.field.manifest)
         return lambda: save_overlays(run.scene, found, cameras, folder, settings=settings, overwrite=self.overwrite)
 
+    def _explain(self, found: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
+        """Adds to every row why it is selected, and writes the pictures; returns what prints it."""
+        from normlift_ns.scripts.reasons import find_reasons, save_pictures, show_reasons, to_json  # noqa: PLC0415
+
+        run, reasons = find_reasons(self.load_config, self.data, found)
+        for row, reason in zip(rows, reasons):
+            row["why"] = to_json(run, reason)
+        if self.why_dir is not None:
+            save_pictures(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
+        return lambda: show_reasons(run, self.text, reasons)
+
     def _check(self) -> None:
         """Raises what can be told before anything is loaded."""
         check_device(self.device)
@@ -132,6 +151,7 @@ class NormLiftQuery:
                 refuse_existing(path, overwrite=self.overwrite, instead=flag)
                 writable_file(path, flag)
         writable_folder(self.render_dir, "--render-dir")
+        writable_folder(self.why_dir, "--why-dir")
         refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
 
     def _check_texts(self) -> None:
@@ -143,11 +163,13 @@ class NormLiftQuery:
             )
         if len(ways) > 1:
             raise InputError(f"{ways[0]} and {ways[1]} are two ways to give texts; leave one of them out")
-        for name in ("json", "output_path", "render_dir", "save"):
+        for name in ("json", "output_path", "render_dir", "save", "why", "why_dir"):
             if ways != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} stores the answer to --text; leave it out with {ways[0]}")
         if len(self.render_views) > 0 and self.render_dir is None:
             raise InputError("--render-views has no effect without --render-dir; give the folder for the pictures")
+        if self.why_dir is not None and not self.why:
+            raise InputError("--why-dir has no effect without --why True; add that flag")
         if self.interactive and not sys.stdin.isatty():
             raise InputError(
                 "--interactive needs a terminal to read from; to ask the lines of a file, use --stdin True"
@@ -157,6 +179,7 @@ class NormLiftQuery:
     def _pictures(self) -> list[Path]:
         """Pictures that new ones would replace: of the same texts, and of the same views where some are named."""
         views = [glob.escape(Path(name).stem) for name in self.render_views] or ["*"]
+        views += ["contact_sheet"] if len(views) > 1 else []
         names = [f"{view}_{i}_{file_name(text)}.png" for view in views for i, text in enumerate(self.text)]
         return [] if self.render_dir is None else [path for name in names for path in self.render_dir.glob(name)]
 

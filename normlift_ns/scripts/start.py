@@ -34,3 +34,8 @@ def export() -> None:
 def evaluate() -> None:
     """ns-normlift-eval"""
     _start("evaluate")
+
+
+def view() -> None:
+    """ns-normlift-view"""
+    _start("view")

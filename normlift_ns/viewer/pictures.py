@@ -1,4 +1,4 @@
-"""Pictures of answers: the relevancy of a text as a heat map over the rendered scene."""
+"""Pictures of answers: the photograph, and beside it what a text finds, in the colours of the viewers."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from normlift_ns.asking import Answer, pixel_relevancy
+from normlift_ns.colors import COLORMAPS
 from normlift_ns.core.files import file_name, new_file, numbered
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
@@ -19,8 +19,11 @@ from normlift_ns.errors import InputError
 from normlift_ns.observing import spread
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.viewer.display import make_display, whole_map
+from normlift_ns.viewer.sheets import Found, Sheet, contact_sheet, picture_of
 
-_INCHES, _DPI = 6.0, 120
+SHEET = "contact_sheet"
+"""What contact sheets are called, where other pictures have the name of their view."""
 
 
 def save_overlays(
@@ -32,10 +35,13 @@ def save_overlays(
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes one PNG per camera and text: the rendered scene, and where the text is found on it.
+    """Writes one PNG per camera and text, and, of several cameras, one contact sheet per text.
+
+    Each shows the photograph, and the rendered scene with the relevancy and the outline of what is selected. Colours
+    mean the same in all of them.
 
     Args:
-        cameras: by the name that the files get.
+        cameras: training cameras by the name that the files get, as `training_cameras` has them.
         settings: constants of the rasterizer; those of gsplat 1.4 by default.
         overwrite: replace files of these names.
     Raises:
@@ -43,46 +49,49 @@ def save_overlays(
         OSError: it cannot be written.
         ValueError: two pictures would have the same name.
     """
-    names = [[f"{name}_{q}_{file_name(text)}.png" for q, text in enumerate(answer.texts)] for name in cameras]
-    twice = [name for name, count in Counter(x for some in names for x in some).items() if count > 1]
+    files = {view: [f"{view}_{q}_{file_name(text)}.png" for q, text in enumerate(answer.texts)] for view in cameras}
+    sheets = [f"{SHEET}_{q}_{file_name(text)}.png" for q, text in enumerate(answer.texts)] if len(cameras) > 1 else []
+    counts = Counter([*sheets, *(name for names in files.values() for name in names)])
+    twice = [name for name, count in counts.items() if count > 1]
     if len(twice) > 0:
         raise InputError(f"two pictures would be called {folder / twice[0]}; render one of their views at a time")
-    paths = []
-    for camera, files in zip(cameras.values(), names):
-        mode = scene.rasterize_mode
-        values, alpha = render(scene.gaussians, camera, answer.relevancy, rasterize_mode=mode, settings=settings)
-        relevancy = pixel_relevancy(values, alpha)
-        image = render_picture(scene, camera, settings=settings)
-        for q, text in enumerate(answer.texts):
-            paths.append(folder / files[q])
+    found = [Found.of(finding) for finding in answer]
+    sheet = Sheet(COLORMAPS[0], make_display(answer.field, answer).whole, answer.question.threshold)
+    paths, overlays = [], [[] for _ in answer.texts]
+    for view, camera in cameras.items():
+        photograph = _photograph(scene, view)
+        for q, overlay in enumerate(_overlays(scene, answer, camera, settings)):
+            overlays[q].append((view, *overlay))
+            paths.append(folder / files[view][q])
             with new_file(paths[-1], overwrite=overwrite) as draft:
-                save_overlay(draft, image, relevancy[:, :, q], text, answer)
+                picture_of(sheet, found[q], view, photograph, *overlay).save(draft, "PNG")
+    for q, name in enumerate(sheets):
+        paths.append(folder / name)
+        with new_file(paths[-1], overwrite=overwrite) as draft:
+            contact_sheet(sheet, found[q], overlays[q]).save(draft, "PNG")
     return paths
 
 
-def save_overlay(
-    path: Path, image: UInt8[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], text: str, answer: Answer
-) -> None:
-    """A heat map over the image in grey, the more opaque the more relevant, with the text and a colour scale."""
-    height, width = relevancy.shape
-    question = answer.question
-    low = {"cosine": 0.0, "lerf": 0.0, "margin": -0.1}[question.rule]
-    high = max(float(relevancy.max()), question.threshold + 0.05)
-    figure = Figure(figsize=(_INCHES * 1.15, _INCHES * height / width + 0.5), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    grey = image.float().mean(dim=2) / 255
-    axes.imshow(grey.numpy(), cmap="gray", vmin=0, vmax=1)
-    opacity = 0.85 * ((relevancy - low) / (high - low)).clamp(0, 1) ** 0.5
-    heat = axes.imshow(relevancy.numpy(), cmap="inferno", vmin=low, vmax=high, alpha=opacity.numpy())
-    scale = figure.colorbar(heat, ax=axes, fraction=0.05)
-    scale.solids.set_alpha(1.0)  # pyright: ignore[reportOptionalMemberAccess]
-    scale.ax.axhline(question.threshold, color="white", linewidth=1.5)
-    scale.set_label(f"relevancy ({question.rule}); selected above {question.threshold:g}")
-    line = " ".join(text.encode("utf8", "replace").decode().split())
-    axes.set_title(line if len(line) < 60 else line[:57] + "…", parse_math=False)  # TeX in a text is text
-    axes.set_axis_off()
-    figure.savefig(path)
+def _overlays(
+    scene: Scene, answer: Answer, camera: Camera, settings: RasterSettings | None
+) -> list[tuple[UInt8[Tensor, "h w 3"], Tensor]]:
+    """For each text, the scene in grey under its relevancy, and which pixels [H, W] are selected."""
+    count, display = len(answer.texts), make_display(answer.field, answer)
+    values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1)
+    image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
+    pixel = pixel_relevancy(image, alpha)
+    rgb = render_picture(scene, camera, settings=settings).float() / 255
+    maps = [whole_map(display, rgb, pixel[:, :, q], alpha) for q in range(count)]
+    return [((map_ * 255).round().to(torch.uint8), pixel[:, :, count + q] > 0.5) for q, map_ in enumerate(maps)]
+
+
+def _photograph(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
+    """The training photograph that pictures of this name are of; None: it is not there any more."""
+    names = picture_names(list(scene.train.names))
+    try:
+        return scene.train[names.index(view)].image
+    except (FileNotFoundError, InputError):
+        return None
 
 
 def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camera]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from normlift_ns.asking import Answer
+from normlift_ns.colors import prompt_colors
 from normlift_ns.errors import visible
-from normlift_ns.viewer.display import color_scale, palette, selection
-
-
-def clipped(text: str, most: int) -> str:
-    """The text on one line, cut where it is longer than `most` characters, with escapes for what is not printed."""
-    line = visible(" ".join(text.split()))
-    return line if len(line) <= most else line[: most - 1] + "…"
+from normlift_ns.viewer.display import color_scale, selection
+from normlift_ns.viewer.legend import clipped
 
 
 def as_text(text: str) -> str:
@@ -23,6 +21,12 @@ def as_text(text: str) -> str:
     return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in visible(text, keep="\n"))
 
 
+def swatch(colour: Sequence[float]) -> str:
+    """A square of a colour, RGB in 0..1, as MDX."""
+    red, green, blue = (round(255 * x) for x in colour)
+    return f'<span style={{{{color: "rgb({red},{green},{blue})"}}}}>■</span>'
+
+
 def report(answer: Answer | None, shown: int | None) -> str:
     """How many Gaussians are selected, by each prompt with its colour in the segmentation, and the overlay's scale."""
     chosen = selection(answer, shown)
@@ -31,7 +35,7 @@ def report(answer: Answer | None, shown: int | None) -> str:
     question, valid = answer.question, answer.valid
     relevancy = answer.relevancy.amax(dim=1) if shown is None else answer.relevancy[:, shown]
     low, high = color_scale(relevancy[valid], question.threshold)
-    counts, colors = answer.selected.sum(dim=0).tolist(), (palette(len(answer.texts)) * 255).round().int().tolist()
+    counts, colors = answer.selected.sum(dim=0).tolist(), prompt_colors(answer.texts).tolist()
     peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
     total = len(chosen)
     lines = [
@@ -43,6 +47,5 @@ def report(answer: Answer | None, shown: int | None) -> str:
         "|---|---|---|---|",
     ]
     for text, count, peak, color in zip(answer.texts, counts, peaks, colors):
-        swatch = f'<span style={{{{color: "rgb({color[0]},{color[1]},{color[2]})"}}}}>■</span>'
-        lines.append(f"| {swatch} | {as_text(clipped(text, 40))} | {count:,} | {peak:.2f} |")
+        lines.append(f"| {swatch(color)} | {as_text(clipped(text, 40))} | {count:,} | {peak:.2f} |")
     return "\n".join(lines)

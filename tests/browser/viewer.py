@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -19,22 +18,21 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
+from tests.browser.own_viewer import PANEL, free_port
+
 CHROMIUM = shutil.which("chromium")
-_FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+_FLAGS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WITHOUT_WEBGL = ("--disable-gpu", "--disable-3d-apis")
 _SIZE = (1300, 1000)
-PANEL = 320
-"""Width of viser's control panel in pixels."""
 TITLE = 52
 """Height of the title bar in pixels."""
 _PROGRAM = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
 
 
 @contextmanager
-def ns_viewer(config: Path, log: Path, *, cwd: Path) -> Iterator[str]:
+def ns_viewer(config: Path, log: Path, *, cwd: Path, port: int | None = None) -> Iterator[str]:
     """Address of an ns-viewer that shows a run; its output goes to `log`."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port() if port is None else port
     flags = ["--load-config", config, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port]
     with log.open("w") as file:
         process = subprocess.Popen(
@@ -57,10 +55,10 @@ def ns_viewer(config: Path, log: Path, *, cwd: Path) -> Iterator[str]:
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
-    """A headless Chromium that draws in software."""
+def chromium(*flags: str) -> Iterator[Browser]:
+    """A headless Chromium, by default one that draws in software."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=_FLAGS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *(flags or _FLAGS)])
         yield browser
         browser.close()
 
@@ -72,8 +70,11 @@ class Tab:
         sharpness: pixels of the picture per pixel of the page, at least; more is slower.
     """
 
-    def __init__(self, browser: Browser, address: str, *, sharpness: float = 0.4) -> None:
-        self.page: Page = browser.new_page(viewport={"width": _SIZE[0], "height": _SIZE[1]})
+    def __init__(
+        self, browser: Browser, address: str, *, sharpness: float = 0.4, size: tuple[int, int] = _SIZE
+    ) -> None:
+        self.page: Page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        self._size = size
         ratio = sharpness / 0.2  # the client goes down to a fifth of the device's ratio where drawing is slow
         self.page.add_init_script(f"Object.defineProperty(window, 'devicePixelRatio', {{get: () => {ratio}}})")
         self.problems: list[str] = []
@@ -99,6 +100,23 @@ class Tab:
     def press(self, button: str) -> None:
         self.page.get_by_role("button", name=button, exact=True).click()
 
+    def tab(self, name: str) -> None:
+        """Opens one of the viewer's tabs."""
+        self.page.get_by_role("tab", name=name, exact=True).click()
+
+    def output(self) -> str:
+        """The output that is shown; the tab Search is open afterwards."""
+        self.tab("Control")
+        found = self.field("Output type").input_value()
+        self.tab("Search")
+        return found
+
+    def show(self, output: str) -> None:
+        """Chooses the output; the tab Search is open afterwards."""
+        self.tab("Control")
+        self.choose("Output type", output)
+        self.tab("Search")
+
     def status(self) -> str:
         """What the panel says."""
         return self.page.locator("body").inner_text()
@@ -107,10 +125,18 @@ class Tab:
         """Waits until the page shows a text."""
         self.page.get_by_text(text).first.wait_for(timeout=timeout)
 
+    def images(self, kind: str) -> int:
+        """Number of drawings or photographs of a kind that the panel shows."""
+        return self.page.locator(f'img[src^="data:image/{kind}"]').count()
+
     def selected(self) -> int:
         """Number of selected Gaussians that the panel shows; -1 where nothing is asked."""
         found = re.findall(r"([\d,]+) of [\d,]+ Gaussians selected", self.status())
         return int(found[0].replace(",", "")) if found else -1
+
+    def answered(self) -> int:
+        """Number of prompts in the table that are answered."""
+        return sum(text.count("■") for text in self.page.locator("table:visible").all_inner_texts())
 
     def until(self, true: Callable[[], bool], what: str, timeout: float = 20) -> None:
         """Waits until something holds of the page."""
@@ -130,7 +156,7 @@ class Tab:
 
     def picture(self) -> np.ndarray:
         """RGB of the scene as the page shows it, uint8 [H, W, 3]."""
-        box = {"x": 0, "y": TITLE, "width": _SIZE[0] - PANEL, "height": _SIZE[1] - TITLE}
+        box = {"x": 0, "y": TITLE, "width": max(self._size[0] - PANEL, 70), "height": self._size[1] - TITLE}
         return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=box))).convert("RGB"))  # type: ignore[arg-type]
 
     def click(self, x: float, y: float) -> None:
@@ -139,7 +165,7 @@ class Tab:
 
     def drag(self, x: float, y: float, button: Literal["left", "right"] = "left") -> None:
         """Drags from the middle of the picture: turns the camera, with the right button moves it."""
-        middle = ((_SIZE[0] - PANEL) / 2, (TITLE + _SIZE[1]) / 2)
+        middle = ((self._size[0] - PANEL) / 2, (TITLE + self._size[1]) / 2)
         self.page.mouse.move(*middle)
         self.page.mouse.down(button=button)
         self.page.mouse.move(middle[0] + x, middle[1] + y, steps=10)

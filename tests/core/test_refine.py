@@ -111,7 +111,7 @@ def test_equals_the_loop(seed, k, sigma_d, tau, delta, prior, kind, far):
 
 def test_the_loop_test_changes_something():
     means, u, r = scene(0)
-    changed = refine(means, u, r, RefineConfig(k=12)) != torch.arange(60)
+    changed = refine(means, u, r, RefineConfig(vote="paper", k=12)) != torch.arange(60)
     assert 10 < int(changed.sum()) < 60
     assert changed[r == 0].float().mean() > 0.8
     # what many views saw alike stays, what few saw is repaired, and neighbours decide where nothing was seen
@@ -245,16 +245,16 @@ def test_a_margin_counts_where_a_support_without_shift_is_nothing():
 
 def test_chunks_do_not_change_the_vote(monkeypatch):
     means, u, r = scene(1)
-    whole = refine(means, u, r, RefineConfig(k=12))
+    whole = refine(means, u, r, RefineConfig(vote="paper", k=12))
     monkeypatch.setattr("normlift_ns.core.refine._CHUNK_ELEMENTS", 13 * 13 * 3)
-    assert torch.equal(refine(means, u, r, RefineConfig(k=12)), whole)
+    assert torch.equal(refine(means, u, r, RefineConfig(vote="paper", k=12)), whole)
 
 
 @pytest.mark.parametrize(
     "config",
     [
-        RefineConfig(k=12, delta=1e30),
-        RefineConfig(k=1, delta=5.0),
+        RefineConfig(vote="paper", k=12, delta=1e30),
+        RefineConfig(vote="paper", k=1, delta=5.0),
         RefineConfig(vote="posterior", k=12, delta=12.0),
     ],
 )
@@ -302,20 +302,21 @@ def test_a_reliable_cluster_far_away_never_changes():
     means, u, r = scene(4)
     means[:20] += 1000
     u[:20], r[:20] = u[0] if u[0].abs().sum() > 0 else unit_rows(1, 8, 0)[0], 0.9
-    assert torch.equal(refine(means, u, r, RefineConfig(k=12))[:20], torch.arange(20, dtype=torch.int32))
+    assert torch.equal(refine(means, u, r, RefineConfig(vote="paper", k=12))[:20], torch.arange(20, dtype=torch.int32))
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_more_neighbours_than_gaussians(n):
     means, u, r = scene(5, n=n)
-    assert refine(means, u, r, RefineConfig(k=36)).tolist() == vote(means, u, r, RefineConfig(k=36)) if n > 1 else [0]
+    config = RefineConfig(vote="paper", k=36)
+    assert refine(means, u, r, config).tolist() == vote(means, u, r, config) if n > 1 else [0]
 
 
 def test_coincident_gaussians_copy_the_most_reliable():
     means = torch.zeros(6, 3, dtype=torch.float64)
     u = unit_rows(1, 8, 0).repeat(6, 1)
     r = torch.tensor([0, 0, 0.2, 0.9, 0.9, 0.1], dtype=torch.float64)
-    source = refine(means, torch.where(r[:, None] > 0, u, 0.0), r, RefineConfig(k=5))
+    source = refine(means, torch.where(r[:, None] > 0, u, 0.0), r, RefineConfig(vote="paper", k=5))
     assert source.tolist() == [3, 3, 3, 3, 4, 3]
 
 
@@ -384,7 +385,7 @@ def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteNumbers(2.5, 0.9, 0.4, 0.1))
     assert own_vote({}).config == RefineConfig()
     told = asdict(possible(RefineConfig(vote="posterior", tau=0.5), 1000))  # what a manifest of today holds
-    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": 0.4, "sigma_d": 2.0, "tau": 0.5}
+    assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": 0.05, "sigma_d": 2.0, "tau": 0.5}
     assert own_vote({"options": {"vote": told}}).variant == "posterior"
     new = RefineConfig(vote="posterior", sigma_d=3.0)
     assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new
@@ -429,7 +430,7 @@ def test_ablation_variants_are_what_their_names_say():
     evidence, features = random_evidence(50, [3, 2, 4], 0), unit_rows(9, 8, 0)
     means = torch.rand(50, 3, generator=generator(0), dtype=torch.float64)
     lifted = lift(evidence, features)
-    config = RefineConfig(k=8, tau=0.5)
+    config = RefineConfig(vote="paper", k=8, tau=0.5)
     u = lifted.directions()
     got = {name: refine_variant(name, means, lifted, config) for name in get_args(Variant)}
     scalars = lifted.scalars
@@ -472,7 +473,7 @@ def test_unknown_variant():
 
 def test_directions_given_block_by_block_change_nothing(monkeypatch):
     means, directions, reliability = scene(7, n=300)
-    config = RefineConfig(k=9, delta=0.0)
+    config = RefineConfig(vote="paper", k=9, delta=0.0)
     whole = refine(means, directions, reliability, config)
     monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (40, 40))
     asked = []
@@ -489,9 +490,10 @@ def test_directions_given_block_by_block_change_nothing(monkeypatch):
 def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
     means, u, r = scene(1)
     told: list[tuple[int, int]] = []
-    whole = refine(means, u, r, RefineConfig(k=12))
+    config = RefineConfig(vote="paper", k=12)
+    whole = refine(means, u, r, config)
     monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (7, 7))
-    found = refine(means, lambda rows: u[rows], r, RefineConfig(k=12), progress=lambda *step: told.append(step))
+    found = refine(means, lambda rows: u[rows], r, config, progress=lambda *step: told.append(step))
     assert torch.equal(found, whole)
     assert len(told) == 9
     assert told[-1] == (60, 60)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,10 +14,12 @@ from torch import Tensor
 
 from normlift_ns import Camera, LiftOptions, RasterSettings, SourceOptions, View, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks
+from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks, with_consensus
 from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.evaluation.studies import timing
+from normlift_ns.evaluation.results import Evaluation
+from normlift_ns.evaluation.studies import study_ablation, timing
+from normlift_ns.evaluation.votes import voting_scalars
 from normlift_ns.lifting import lift_scene
 from normlift_ns.observing import of_regions
 from normlift_ns.raster.backend import Job
@@ -54,9 +56,17 @@ def lifted(tmp_path_factory) -> EvaluatedRun:
         gaussians=random_scene(N, dtype=torch.float32, size=0.3), train=Photographs(orbit(VIEWS)),
         held_out=Photographs([]), rasterize_mode="classic", identity={}, name="made",
     )  # fmt: skip
-    found = lift_scene(scene, make_source(OPTIONS), LiftOptions(refine=False, max_views=4), folder, encoder={}).field
+    options = LiftOptions(refine=False, max_views=4, consensus=False)
+    found = lift_scene(scene, make_source(OPTIONS), options, folder, encoder={}).field
     manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
     return EvaluatedRun(scene, replace(found, manifest=manifest), make_source(OPTIONS), False, folder)
+
+
+@pytest.fixture
+def as_things(monkeypatch):
+    """Cells of a grid count as regions of things, or a consensus would leave them alone."""
+    monkeypatch.setattr("normlift_ns.core.consensus.CHANCE", -1)
+    monkeypatch.setattr("normlift_ns.core.consensus.THINGS", 0)
 
 
 def observations(lifted: EvaluatedRun) -> list[tuple[Camera, Tensor, Tensor]]:
@@ -155,6 +165,57 @@ def test_features_that_cannot_be_made_again_are_refused(lifted, change, message)
     other = replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, **change}))
     with pytest.raises(ValueError, match=message):
         baseline_field("sfs", other, "cpu")
+
+
+@pytest.mark.usefixtures("as_things")
+@pytest.mark.parametrize("power", [0.0, 2.0])
+def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
+    """As `lift_scene` lifts them, numbers that vote included."""
+    options = LiftOptions(refine=False, max_views=4, consensus=True, consensus_power=power, consensus_sample=9)
+    found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
+    manifest = {**found.manifest, "source": lifted.field.manifest["source"]}
+    agreed = replace(lifted, field=replace(found, manifest=json.loads(json.dumps(manifest))))
+    assert with_consensus(lifted, False, "cpu") is lifted
+    assert with_consensus(agreed, True, "cpu") is agreed
+    plain = with_consensus(agreed, False, "cpu")
+    assert not plain.refined and plain.field.manifest["options"]["consensus"] is False
+    pairs = ((plain.field, lifted.field), (with_consensus(plain, True, "cpu").field, agreed.field))
+    for ours, theirs in pairs:
+        assert torch.allclose(ours.directions(refined=False), theirs.directions(refined=False), atol=2e-3)
+        for name in ("norm", "n_eff", "weight"):
+            a, b = getattr(ours.scalars, name), getattr(theirs.scalars, name)
+            assert torch.allclose(a, b, rtol=1e-4, atol=1e-5), name
+        assert torch.equal(ours.valid(refined=False), theirs.valid(refined=False))
+    assert torch.allclose(pairs[1][0].scalars.reliability, agreed.field.scalars.reliability, atol=1e-5)
+    assert torch.allclose(voting_scalars(agreed.field).norm, lifted.field.scalars.norm, atol=1e-5)
+    assert (agreed.field.scalars.norm - lifted.field.scalars.norm).mean() > 0.001
+
+
+@pytest.mark.usefixtures("as_things")
+def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
+    """A run with consensus, and one without it, give the same rows; what cannot be made again is left out, and said."""
+
+    def evaluate(runs: Iterable[EvaluatedRun]) -> Evaluation:
+        (run,) = runs
+        cosine = (run.field.directions(refined=run.refined) * run.field.directions(refined=False)).sum(1)
+        return Evaluation({"cosine": float(cosine.mean()), "norm": float(run.field.scalars.norm.mean())}, [], {})
+
+    told = []
+    rows = study_ablation([lifted], evaluate, "cpu", told.append)
+    names = ["none", "plain_knn", "linear", "norm_only", "support_only", "paper", "posterior"]
+    agreed = ["consensus", "consensus_paper", "consensus_posterior"]
+    assert [row["variant"] for row in rows] == [*names, *agreed]
+    assert told == []
+    other = with_consensus(lifted, True, "cpu")
+    again = study_ablation([other], evaluate, "cpu", told.append)
+    assert [row["variant"] for row in again] == [row["variant"] for row in rows]
+    for ours, theirs in zip(again, rows):
+        assert ours["cosine"] == pytest.approx(theirs["cosine"], abs=0.02)
+        assert ours["norm"] == pytest.approx(theirs["norm"], abs=1e-5)
+    manifest = {**lifted.field.manifest, "source": None}
+    own = replace(lifted, field=replace(lifted.field, manifest=manifest))
+    assert [row["variant"] for row in study_ablation([own], evaluate, "cpu", told.append)] == names
+    assert len(told) == 1 and told[0].startswith("The ablation leaves out all variants with consensus: ")
 
 
 def test_lengths_of_pixels_are_those_of_composited_features(lifted):

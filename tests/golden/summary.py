@@ -31,18 +31,21 @@ from safetensors.numpy import load_file
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
 VOTE = ("--vote", "paper", "--k", 36, "--sigma-d", 1, "--tau", 0.95, "--gamma", 0.4, "--delta", 0)
-"""Of version 0.1."""
+"""Of version 0.1, which knew no consensus."""
+SINCE = {"stands_out", "nearest", "suggested_threshold", "histogram"}
+"""What an answer tells since."""
 SAMPLES = 64
 SAME_SOURCES, LOOSE, FEW = 0.9, 0.01, 5
 """On another machine: the share of equal sources, how far floats may be apart, and whole numbers at least."""
 
 
 def run_commands(scene: str, config: Path, folder: Path) -> None:
-    """Lifts a run (8 views, half resolution, colour encoder, the vote of version 0.1), asks it and exports what is
+    """Lifts a run (8 views, half resolution, colour encoder, the method of version 0.1), asks it and exports what is
     found.
     """
-    lift = ("--encoder", "colour", "--max-views", 8, "--lift-downscale", 2, *VOTE, "--queries", *TEXTS[scene])
-    _command("ns-normlift", "--load-config", config, *lift, "--timestamp", "golden", "--output-dir", folder)
+    lift = ("--encoder", "colour", "--max-views", 8, "--lift-downscale", 2, "--consensus", False, *VOTE)
+    place = ("--queries", *TEXTS[scene], "--timestamp", "golden", "--output-dir", folder)
+    _command("ns-normlift", "--load-config", config, *lift, *place)
     (lifted,) = folder.glob("*/normlift/golden/config.yml")
     files = ("--json", folder / "answers.json", "--output-path", folder / "answers.npz")
     _command("ns-normlift-query", "--load-config", lifted, "--text", *TEXTS[scene], "brown", *files)
@@ -68,7 +71,7 @@ def summarize(folder: Path) -> dict[str, Any]:
             name: {k: v for k, v in way.items() if k != "bound_quantiles"} for name, way in manifest["forms"].items()
         },
         "statistics": manifest["statistics"],
-        "answers": json.loads((folder / "answers.json").read_text()),
+        "answers": without_news(json.loads((folder / "answers.json").read_text())),
         "objects": json.loads((folder / "export" / "splat_objects.json").read_text()),
     }
     for file in sorted((run / "normlift").glob("*.safetensors")):
@@ -79,6 +82,13 @@ def summarize(folder: Path) -> dict[str, Any]:
     found["ply"] = {p.name: _array(np.asarray(vertices[p.name])) for p in vertices.properties}
     found["rows"] = _array(np.load(folder / "export" / "splat_rows.npy"))
     return found
+
+
+def without_news(answers: dict[str, Any]) -> dict[str, Any]:
+    """Answers as version 0.1 told them."""
+    assert all(set(one) >= SINCE for one in answers["queries"])
+    told = [{key: value for key, value in one.items() if key not in SINCE} for one in answers["queries"]]
+    return {**answers, "queries": told}
 
 
 def machine() -> dict[str, str]:

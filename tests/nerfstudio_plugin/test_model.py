@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 import urllib.error
 from dataclasses import fields, replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from tests.nerfstudio_plugin.stock_run import SmallLpips, StockRun, rasterizatio
 
 QUESTION = Question(("left", "right"), torch.eye(8)[:2])
 STOCK = ["rgb", "depth", "accumulation", "background"]
-SEMANTIC = ["reliability", "n_eff", "selection", "segmentation", "overlay"]
+SEMANTIC = ["reliability", "reliability_value", "n_eff", "selection", "segmentation", "overlay"]
 
 
 def _setup(config: Path):
@@ -107,17 +108,37 @@ def test_scalars_are_composited(pipeline, stock: StockRun) -> None:
     answer = asking.answer(field, run.gaussians.means, QUESTION)
     chosen = answer.selected.any(dim=1).float()
     columns = {"relevancy_0": answer.relevancy[:, 0], "relevancy_1": answer.relevancy[:, 1], "selection": chosen}
-    columns |= {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
+    columns |= {"reliability_value": field.scalars.reliability, "n_eff": field.scalars.n_eff}
     expected, _ = render(run.gaussians, run.train.cameras[3], torch.stack(list(columns.values()), dim=1))
     for i, name in enumerate(columns):
         assert outputs[name].shape == (35, 47, 1)
         torch.testing.assert_close(outputs[name][..., 0], expected[..., i], atol=1e-6, rtol=1e-5)
-    for name in ("overlay", "segmentation"):
+    for name in ("overlay", "segmentation", "reliability"):
         assert outputs[name].shape == (35, 47, 3)
         assert 0 <= float(outputs[name].min()) <= float(outputs[name].max()) <= 1
-    assert 0 < outputs["reliability"].max() <= 1
+    assert 0 < outputs["reliability_value"].max() <= 1
     left, right = outputs["relevancy_0"][:, :20].mean(), outputs["relevancy_0"][:, 27:].mean()
     assert left > right
+
+
+def test_no_tracer_reaches_the_renderer(pipeline) -> None:
+    """nerfstudio's viewer raises from a tracer to interrupt a picture; in Numba's dispatcher that ends its thread."""
+    files = set()
+
+    def tracer(frame, event, arg):
+        files.add(frame.f_code.co_filename.replace("\\", "/"))
+        return tracer
+
+    before = sys.gettrace()
+    sys.settrace(tracer)
+    try:
+        outputs = _outputs(pipeline)
+        assert sys.gettrace() is tracer
+    finally:
+        sys.settrace(before)
+    assert outputs["overlay"].isfinite().all()
+    assert any(file.endswith("nerfstudio_plugin/model.py") for file in files)
+    assert not any(part in file for file in files for part in ("/raster/", "/numba/", "/matplotlib/", "legend.py"))
 
 
 @pytest.mark.parametrize("cropped", [False, True])
@@ -184,7 +205,7 @@ def test_hidden_gaussians_are_not_drawn_at_all(pipeline, stock: StockRun, monkey
     )
     if not on_cpu:
         _by_cuda(pipeline, monkeypatch)
-    model.show(make_display(model.field, answer, shown=0, part=part))
+    model.show(make_display(model.field, answer, shown=0, drawn=drawn))
     with splatfacto_on_cpu():
         outputs = _outputs(pipeline)
     torch.testing.assert_close(outputs["accumulation"][..., 0], alpha, atol=1e-5, rtol=1e-4)
@@ -272,7 +293,7 @@ def test_what_is_hidden_cannot_be_clicked(pipeline, stock: StockRun) -> None:
     assert float(weights[front]) > 0.01
     answer = asking.answer(model.field, model.means, QUESTION)
     answer.selected[:] = (torch.arange(60) == front)[:, None]
-    model.show(make_display(model.field, answer, part="without the selection"))
+    model.show(make_display(model.field, answer, drawn=~answer.mask))
     behind = model.in_sight(pose[:3, 3], pose[:3, 2])
     assert float(behind[front]) == 0
     others = torch.arange(60) != front

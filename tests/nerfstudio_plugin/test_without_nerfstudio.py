@@ -97,7 +97,7 @@ def test_the_config_of_a_lifted_run_is_the_edited_one(copied: Path, tmp_path: Pa
     config.output_dir = scene.location.portable(run_dir.parents[2])
     config.relative_model_dir = Path("nerfstudio_models")
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-    semantics = scene.location.portable(run_dir / FIELD_FOLDER)
+    semantics = Path(FIELD_FOLDER)
     config.pipeline.model = NormLiftModelConfig.upgrade(config.pipeline.model, semantics=semantics)
     if scene.location.moved_data or config.output_dir.is_absolute():
         set_data(config, scene.location.data)

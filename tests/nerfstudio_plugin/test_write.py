@@ -56,7 +56,7 @@ def test_the_config_is_the_sources_with_another_method_and_model(copied: Path) -
     question = load_question(run_dir / "normlift")
     assert question is not None
     assert question.texts == ("a",)
-    assert config.pipeline.model.semantics == Path("outputs/scene/normlift") / run_dir.name / "normlift"
+    assert config.pipeline.model.semantics == Path("normlift")
     assert config.timestamp == run_dir.name
     for name in ("output_dir", "data", "experiment_name", "optimizers", "relative_model_dir", "viewer", "machine"):
         assert getattr(config, name) == getattr(stored, name)
@@ -217,7 +217,7 @@ def test_default_names_of_the_same_second_are_numbered(copied: Path) -> None:
     for name in names:
         config: Any = read_config(place.with_name(name) / "config.yml")
         assert config.timestamp == name
-        assert config.pipeline.model.semantics == Path("outputs/scene/normlift") / name / "normlift"
+        assert config.pipeline.model.semantics == Path("normlift")
         assert len(field_of(load_scene(place.with_name(name) / "config.yml"))) == len(field)
 
 

@@ -72,7 +72,7 @@ def random_evidence(
 
 
 def dense(rows: SparseRows, columns: int) -> Tensor:
-    """[N, columns] float64."""
-    out = torch.zeros(len(rows), columns, dtype=torch.float64)
+    """[N, columns] float64, on the device of the rows."""
+    out = torch.zeros(len(rows), columns, dtype=torch.float64, device=rows.weight.device)
     out[rows.row_index(), rows.column.long()] = rows.weight.double()
     return out

@@ -59,7 +59,7 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = capsys.readouterr().out
     assert "sky blue" in shown
-    assert "mean reliability" in shown
+    assert "reliability" in shown
 
     document = json.loads((tmp_path / "a.json").read_text())
     red, blue = document["queries"]
@@ -80,6 +80,7 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     pictures = sorted((tmp_path / "pictures").iterdir())
     assert [path.name for path in pictures] == [
         "0003_0_red.png", "0003_1_sky_blue.png", "0007_0_red.png", "0007_1_sky_blue.png",
+        "contact_sheet_0_red.png", "contact_sheet_1_sky_blue.png",
     ]  # fmt: skip
     for path in pictures:
         pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)

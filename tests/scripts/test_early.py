@@ -294,9 +294,9 @@ def test_a_mistake_costs_little_and_imports_nothing_heavy(module, flags, config,
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"consensus_power": 2.0}, "--consensus-power is for --consensus True"),
-        ({"consensus_sample": 9}, "--consensus-sample is for --consensus True"),
-        ({"vote": RefineConfig(prior=2.0)}, "--prior is for --vote posterior"),
+        ({"consensus": False, "consensus_power": 2.0}, "--consensus-power is for --consensus True"),
+        ({"consensus": False, "consensus_sample": 9}, "--consensus-sample is for --consensus True"),
+        ({"vote": RefineConfig(vote="paper", prior=2.0)}, "--prior is for --vote posterior"),
     ],
 )
 def test_options_of_what_is_off_are_refused(options, message):

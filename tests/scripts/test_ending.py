@@ -149,7 +149,7 @@ def test_sigterm_cleans_up_and_says_so(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_warnings_of_ours_are_one_line(tmp_path):
+def test_warnings_of_ours_are_clipped(tmp_path):
     body = """
         import normlift_ns
         ours = normlift_ns.__file__
@@ -173,7 +173,7 @@ def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(bod
     assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
 
 
-@pytest.mark.parametrize("command", ["lift", "query", "export", "evaluate"])
+@pytest.mark.parametrize("command", ["lift", "query", "export", "evaluate", "view"])
 def test_ctrl_c_while_a_command_is_loaded(command):
     """Its modules raise what Python raises for Ctrl-C."""
     program = f"""

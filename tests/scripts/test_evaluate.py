@@ -149,14 +149,15 @@ def test_studies_of_masks(workspace, monkeypatch, capsys):
     studies = document["studies"]
     assert list(studies) == ["ablation", "sweeps", "signals", "timing"]
     by_variant = {row["variant"]: row for row in studies["ablation"]}
-    assert list(by_variant) == list(get_args(Variant))
-    assert by_variant["paper"]["miou_3d"] == pytest.approx(document["results"]["miou_3d"], abs=5e-3)  # from stored u
+    assert list(by_variant) == [*get_args(Variant), *votes.AGREED]
+    ours = by_variant["consensus_posterior"]["miou_3d"]  # the defaults, here from stored u
+    assert ours == pytest.approx(document["results"]["miou_3d"], abs=5e-3)
     plain = evaluated(monkeypatch, workspace, "masks", workspace / "room" / "instance", "--refined", False)
-    assert by_variant["none"]["miou_3d"] == plain["results"]["miou_3d"]
+    assert by_variant["consensus"]["miou_3d"] == plain["results"]["miou_3d"]
     assert len({row["miou_3d"] for row in by_variant.values()}) > 3
     own = [row for row in studies["sweeps"] if row["own"]]
     assert [row["parameter"] for row in own] == ["beta", "k", "delta"]
-    assert [row["miou_3d"] for row in own] == [by_variant["paper"]["miou_3d"]] * 3
+    assert [row["miou_3d"] for row in own] == [ours] * 3
     of_k = [(row["value"], row["default"], row["own"]) for row in studies["sweeps"] if row["parameter"] == "k"]
     assert of_k == sorted({(6, False, False), (12, False, True), (RefineConfig().k, True, False)})
     (signals,) = studies["signals"]
@@ -169,7 +170,7 @@ def test_studies_of_masks(workspace, monkeypatch, capsys):
     assert sum(v for k, v in signals.items() if k.startswith("histogram.")) == pytest.approx(1 - signals["zero.share"])
     (cost,) = studies["timing"]
     assert cost["vote_s"] > 0 and cost["store_s"] > 0
-    stages = ("features_s", "evidence_s", "lift_s", "neighbors_s", "vote_s", "store_s")
+    stages = ("features_s", "evidence_s", "consensus_s", "lift_s", "neighbors_s", "vote_s", "store_s")
     assert cost["total_s"] == pytest.approx(sum(cost[stage] for stage in stages))
     assert {p.name for p in workspace.glob("masks_*.svg")} == {"masks_sweeps.svg", "masks_signals.svg"}
     told = said(capsys)
@@ -224,9 +225,9 @@ def test_scannet_with_stand_in_names(workspace, room, monkeypatch):
     studies = evaluated(monkeypatch, workspace, "scannet", path, *flags)["studies"]
     assert studies["signals"][0]["scene"] == "scene0000_00"
     assert 0.5 < studies["signals"][0]["seen.accuracy_unrefined"] < 1
-    assert [row["variant"] for row in studies["ablation"]][-1] == "posterior"
-    (paper,) = (row for row in studies["ablation"] if row["variant"] == "paper")
-    assert paper["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
+    assert [row["variant"] for row in studies["ablation"]][-1] == "consensus_posterior"
+    (ours,) = (row for row in studies["ablation"] if row["variant"] == "consensus_posterior")
+    assert ours["miou_19"] == pytest.approx(results["miou_19"], abs=5e-3)
 
 
 def write_polygons(folder: Path, instance: Path, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:

@@ -14,19 +14,28 @@ from pathlib import Path
 
 import pytest
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 COMMANDS = {
     "lift": "ns-normlift",
     "query": "ns-normlift-query",
     "export": "ns-normlift-export",
     "eval": "ns-normlift-eval",
+    "view": "ns-normlift-view",
 }
+SCRIPTS = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf8"))["project"]["scripts"]
 FOLDER = Path(__file__).with_name("help")
 BOXES = re.compile("[─-╿]+")
 
 
 def shown(command: str, *flags: str, columns: int = 80) -> str:
     """What a command prints to a terminal of some width; its exit code must be 0."""
-    words = [str(Path(sys.executable).with_name(command)), *flags]
+    place, name = SCRIPTS[command].split(":")
+    program = f"import sys; sys.argv[0] = {command!r}; from {place} import {name}; {name}()"
+    words = [sys.executable, "-c", program, *flags]
     environment = os.environ | {"COLUMNS": str(columns), "TERM": "dumb", "NO_COLOR": "1"}
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

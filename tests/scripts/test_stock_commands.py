@@ -22,7 +22,8 @@ from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry
 
-NAMES = ["overlay", "segmentation", "selection", "reliability", "n_eff", "relevancy_0", "relevancy_1"]
+SCALARS = ["selection", "reliability_value", "n_eff", "relevancy_0", "relevancy_1"]
+NAMES = ["overlay", "segmentation", "reliability", *SCALARS]
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +32,7 @@ def without_encoders(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("an encoder was made")
 
     monkeypatch.setitem(all_methods, "normlift", normlift_method.config)
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.panel.encoder_of", never)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.asker.encoder_of", never)
 
 
 def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
@@ -48,7 +49,7 @@ def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
         overlay = np.asarray(Image.open(tmp_path / "test" / "overlay" / f"{Path(name).stem}.png")).astype(int)
         found = expected[..., 1].numpy() > 0.9
         assert found.sum() > 50
-        assert (np.ptp(overlay[found], axis=1) > 30).mean() > 0.95
+        assert (np.ptp(overlay[found], axis=1) > 20).mean() > 0.95  # the least relevant are faint
         assert (np.ptp(overlay[expected[..., 1].numpy() < 0.01], axis=1) < 8).mean() > 0.99
     assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
 

@@ -30,7 +30,10 @@ HOSTILE = [
     "\udc80",
     "$\\frac{$",
 ]
-NUMBERS = {"fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None}
+NUMBERS = {
+    "fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None,
+    "suggested_threshold": None, "histogram": None,
+}  # fmt: skip
 OBJECT = {"size": 3, "centroid": [0.0] * 3, "box": {"min": [0.0] * 3, "max": [1.0] * 3}, "mean_reliability": 0.5}
 
 
@@ -53,7 +56,7 @@ def summary(text: str) -> Any:
 
 
 TABLES: dict[str, Callable[[str], Any]] = {
-    "query": lambda text: prompting.table([{"text": text, **NUMBERS}], "lerf > 0.5"),
+    "query": lambda text: prompting.table([{"text": text, **NUMBERS}], "lerf > 0.5", 0.5),
     "export": lambda text: export._table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
     "export nothing": lambda text: export._table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
     "eval rows": lambda text: evaluate.rows_table([{"class": text, "iou": 0.5}], "ablation"),

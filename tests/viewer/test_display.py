@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
 import torch
 
 from normlift_ns.asking import Answer
+from normlift_ns.colors import colors_of, prompt_colors
 from normlift_ns.question import Question
-from normlift_ns.viewer.display import color_scale, colors_of, overlay, palette, segmentation
-from normlift_ns.viewer.status import as_text, clipped, report
+from normlift_ns.viewer.display import color_scale, draw, make_display, overlay, reliability_picture, segmentation
+from normlift_ns.viewer.legend import clipped
+from normlift_ns.viewer.status import as_text, report
 
 RGB = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
 GREY = RGB.mean(dim=2, keepdim=True).expand_as(RGB)
@@ -18,16 +24,10 @@ def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
     share[0] = 1
     share[1, 0], relevancy[1, 0] = 0.5, 1.0
     found = overlay(RGB, relevancy, share, colors, (0.5, 1.0))
-    for x, row in enumerate((0, 0, 128, 255, 255)):
-        torch.testing.assert_close(found[0, x], 0.2 * GREY[0, x] + 0.8 * colors[row])
-    torch.testing.assert_close(found[1, 0], 0.6 * GREY[1, 0] + 0.4 * colors[255])
+    for x, (row, opacity) in enumerate(((0, 0.35), (0, 0.35), (128, 0.625), (255, 0.9), (255, 0.9))):
+        torch.testing.assert_close(found[0, x], (1 - opacity) * GREY[0, x] + opacity * colors[row])
+    torch.testing.assert_close(found[1, 0], 0.55 * GREY[1, 0] + 0.45 * colors[255])
     torch.testing.assert_close(found[2:], GREY[2:])
-
-
-def test_colours_are_those_of_matplotlib() -> None:
-    torch.testing.assert_close(
-        colors_of("viridis")[[0, 255]], torch.tensor([[0.267, 0.005, 0.329], [0.993, 0.906, 0.144]]), atol=1e-3, rtol=0
-    )
 
 
 def test_nothing_found_is_not_stretched_to_a_find() -> None:
@@ -37,22 +37,60 @@ def test_nothing_found_is_not_stretched_to_a_find() -> None:
 
 
 def test_the_segmentation_has_the_colour_of_the_label() -> None:
-    colors = palette(3)
+    colors = prompt_colors(["a", "b", "c"])
     labels = torch.arange(20).reshape(4, 5) % 3
     found = segmentation(RGB, labels, torch.ones(4, 5, 1), colors)
     torch.testing.assert_close(found, 0.2 * GREY + 0.8 * colors[labels])
     torch.testing.assert_close(segmentation(RGB, labels, torch.zeros(4, 5, 1), colors), GREY)
 
 
-def test_colours_of_prompts_differ() -> None:
-    colors = palette(50)
-    assert colors.shape == (50, 3)
-    assert float(colors.min()) >= 0
-    assert float(colors.max()) <= 1
-    apart = torch.cdist(colors, colors) + torch.eye(50) * 9
-    assert float(apart[:10, :10].min()) > 0.2
-    assert float(apart.min()) > 0.03
-    assert palette(0).shape == (0, 3)
+def test_reliability_has_the_colours_of_a_fixed_scale() -> None:
+    colors, alpha = colors_of("cividis"), torch.full((4, 5), 0.5)
+    reliability = torch.full((4, 5, 1), 0.25)  # composited: R is 0.5
+    found = reliability_picture(RGB, reliability, alpha)
+    torch.testing.assert_close(found, 0.55 * GREY + 0.45 * colors[128].expand(4, 5, 3))
+    assert torch.equal(reliability_picture(RGB, 0 * reliability, 0 * alpha), GREY)
+
+
+def shown(texts: tuple[str, ...], relevancy: torch.Tensor) -> Answer:
+    field: Any = SimpleNamespace(
+        scalars=SimpleNamespace(reliability=torch.tensor([0.9, 0.5, 0.2]), n_eff=torch.ones(3), weight=torch.ones(3))
+    )
+    question = Question(texts, torch.eye(len(texts), 2))
+    return Answer(question, field, torch.zeros(3, 3), relevancy, torch.ones(3).bool(), relevancy > 0.5)
+
+
+def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> None:
+    display = make_display(
+        (answer := shown(("sky blue", "sky-blue"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))).field, answer
+    )
+    image, alpha = torch.rand(200, 300, 7, generator=torch.Generator().manual_seed(1)), torch.ones(200, 300)
+    rgb = torch.full((200, 300, 3), 0.5)
+    told, seen = draw(display, rgb, image, alpha), draw(display, rgb, image, alpha, by_text=True)
+    assert list(told)[:2] == ["relevancy_0", "relevancy_1"]
+    assert list(seen)[:2] == ["relevancy_sky_blue", "relevancy_sky_blue_2"]
+    others = ["reliability", "reliability_value", "n_eff", "selection", "segmentation", "overlay"]
+    assert list(told)[2:] == list(seen)[2:] == others
+    assert torch.equal(told["relevancy_1"], image[:, :, 1:2])
+    for name in ("relevancy_sky_blue", "reliability", "segmentation", "overlay"):
+        assert seen[name].shape == (200, 300, 3)
+        assert 0 <= float(seen[name].min()) <= float(seen[name].max()) <= 1
+        white = (seen[name] > 0.8).all(dim=2)  # letters
+        assert int(white[100:, 150:].sum()) >= 20
+        assert int(white[:100].sum()) == 0
+    small = draw(display, rgb[:100], image[:100], alpha[:100])
+    assert not bool((small["overlay"] > 0.8).all(dim=2).any())  # no room for a legend
+
+
+def test_the_scale_is_that_of_all_prompts_and_views() -> None:
+    assert make_display((a := shown(("a", "b"), torch.rand(3, 2) * 0.3)).field, a).whole == (0.0, pytest.approx(0.55))
+    answer = shown(("a", "b"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))
+    for one in (None, 0, 1):
+        assert make_display(answer.field, answer, shown=one).whole == (0.0, pytest.approx(0.9))
+    assert make_display(answer.field, answer, shown=1).scale == (0.5, pytest.approx(0.7))
+    assert (make_display(answer.field, answer, shown=1).title, make_display(answer.field, answer).title) == (
+        "relevancy: b", "relevancy, all prompts",
+    )  # fmt: skip
 
 
 def test_the_report_counts_and_escapes() -> None:

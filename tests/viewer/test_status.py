@@ -8,7 +8,8 @@ import re
 import pytest
 
 from normlift_ns.errors import visible
-from normlift_ns.viewer.status import as_text, clipped
+from normlift_ns.viewer.legend import clipped
+from normlift_ns.viewer.status import as_text
 
 HOSTILE = [
     "<script>x</script>",

@@ -140,13 +140,18 @@ def _words(text: str) -> list[str]:
 
 
 @cache
+def survey() -> dict[str, str]:
+    """#rrggbb of every name as the XKCD colour survey spells it."""
+    return json.loads(Path(__file__).with_name("xkcd.json").read_text(encoding="utf8"))
+
+
+@cache
 def _names() -> dict[str, np.ndarray]:
     """CIELAB colour of every name. The survey has eleven names twice, as "blue green" and "blue/green": the former
     counts."""
     from skimage.color import rgb2lab  # noqa: PLC0415 (what other encoders do without is not loaded)
 
-    table = json.loads(Path(__file__).with_name("xkcd.json").read_text(encoding="utf8"))
-    colours = sorted(table.items(), key=lambda item: "/" in item[0], reverse=True)
+    colours = sorted(survey().items(), key=lambda item: "/" in item[0], reverse=True)
     names = [" ".join(_words(name)) for name, _ in colours]
     lab = rgb2lab(np.array([list(bytes.fromhex(colour[1:])) for _, colour in colours]) / 255)
     return dict(zip(names, lab))

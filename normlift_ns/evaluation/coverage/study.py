@@ -32,7 +32,7 @@ from normlift_ns.evaluation.coverage.photographs import Photographs, Why, photog
 from normlift_ns.evaluation.coverage.poses import SEES, Pose, suggest_poses
 from normlift_ns.evaluation.coverage.regions import Evidenced, Region, weak_regions
 from normlift_ns.evaluation.options import pose_files
-from normlift_ns.evaluation.votes import own_vote
+from normlift_ns.evaluation.votes import own_vote, voting_scalars
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import REACH
 from normlift_ns.ranges import check_number, check_path
@@ -143,7 +143,7 @@ def coverage_of(
     check_number("min_reliability", min_reliability)
     photographs = photographs_of(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), own_vote(field.manifest)
-    gaussians, scalars = scene.gaussians.to(device), field.scalars.map(lambda x: x.to(device))
+    gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).map(lambda x: x.to(device))
     drawn = Drawn(gaussians, scene.rasterize_mode, RasterSettings.recorded(field.manifest), power)
     weights, count = view_weights(drawn, photographs.cameras), len(photographs.cameras)
     surface = largest(weights)

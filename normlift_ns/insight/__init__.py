@@ -1,0 +1,1 @@
+"""What an answer rests on: how relevancies are spread, which photographs voted, which Gaussians belong to nothing."""

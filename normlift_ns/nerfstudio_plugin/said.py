@@ -1,0 +1,75 @@
+"""What the panel says of a state, as text that the viewer compiles as MDX."""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from normlift_ns.colors import prompt_colors
+from normlift_ns.runs.splats import LEAST_OPACITY
+from normlift_ns.session.state import State
+from normlift_ns.viewer.legend import clipped
+from normlift_ns.viewer.status import as_text, swatch
+
+_MOST_ROWS = 8
+
+
+def drawable(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
+    """Gaussians that are ever drawn, by their logits."""
+    return opacities.detach()[:, 0] >= LEAST_OPACITY
+
+
+def said(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"]) -> str:
+    """What runs, a message, how much is selected and why counts differ, and what to know of the evidence.
+
+    Args:
+        drawn: as `drawable` has it.
+    """
+    lines = [as_text(text) for text in (busy, clipped(message, 400)) if text]
+    chosen = state.selection
+    count, hidden = int(chosen.sum()), 0 if state.hidden is None else int(state.hidden.sum())
+    if state.question is None and count == 0:
+        lines.append("No query yet.")
+    else:
+        lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected")
+    faint = int((chosen & ~drawn.to(chosen.device)).sum())
+    if faint > 0:
+        lines.append(f"{faint:,} of them are never drawn nor exported (opacity below 1/255).")
+    if state.answer is not None and state.from_answer and state.shown is None:
+        twice = int((state.answer.selected.sum(dim=1) > 1).sum())
+        if twice > 0:
+            lines.append(f"{twice:,} of them are selected by several prompts.")
+    if hidden > 0:
+        lines.append(f"{hidden:,} Gaussians are hidden.")
+    if state.remark:
+        lines.append(as_text(state.remark))
+    return "\n\n".join(lines)
+
+
+def found_table(state: State) -> str:
+    """Each prompt with its colour, its count and its best match, or with what is wrong with it."""
+    answer = state.answer
+    if len(state.prompts) == 0 or answer is None:
+        return ""
+    counts, valid = answer.selected.sum(dim=0).tolist(), answer.valid
+    peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
+    colors = prompt_colors(answer.texts).tolist()
+    rows = {text: (counts[i], peaks[i], colors[i]) for i, text in enumerate(answer.texts)}
+    lines = [
+        f"{as_text(answer.question.rule)} above {answer.question.threshold:g}",
+        "",
+        "| | prompt | selected | peak |",
+        "|---|---|---|---|",
+    ]
+    troubled = [prompt for prompt in state.prompts if prompt.problem]  # first: they want to be seen
+    listed = [*troubled, *(prompt for prompt in state.prompts if not prompt.problem)][:_MOST_ROWS]
+    for prompt in listed:
+        name = as_text(clipped(prompt.text, 40))
+        if prompt.problem or prompt.text not in rows:
+            lines.append(f"| ⚠ | {name} | {as_text(clipped(prompt.problem, 120))} | |")
+            continue
+        count, peak, color = rows[prompt.text]
+        lines.append(f"| {swatch(color)} | {name} | {count:,} | {peak:.2f} |")
+    if len(state.prompts) > len(listed):
+        lines.append(f"| | and {len(state.prompts) - len(listed)} more | | |")
+    return "\n".join(lines)

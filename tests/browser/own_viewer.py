@@ -1,0 +1,123 @@
+"""ns-normlift-view in a process of its own, and a person before it in headless Chromium."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import Browser, Locator, Page
+
+PANEL = 320
+"""Width of viser's control panel in pixels."""
+_PROGRAM = "from normlift_ns.scripts.view import main; main()"
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@contextmanager
+def own_viewer(
+    config: Path, log: Path, *flags: str, port: int | None = None, python: Path | str = sys.executable
+) -> Iterator[str]:
+    """Address of an ns-normlift-view that shows a run; its output goes to `log`."""
+    port = free_port() if port is None else port
+    words = [str(python), "-c", _PROGRAM, "--load-config", str(config), "--port", str(port), *flags]
+    root = str(Path(__file__).parents[2])
+    with log.open("w") as file:
+        process = subprocess.Popen(words, stdout=file, stderr=file, env={**os.environ, "PYTHONPATH": root})
+    try:
+        deadline = time.monotonic() + 120
+        while f":{port} " not in log.read_text():
+            assert process.poll() is None and time.monotonic() < deadline, log.read_text()[-2000:]
+            time.sleep(0.1)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+    assert "Traceback" not in log.read_text(), log.read_text()[-3000:]
+
+
+class Own:
+    """One tab with the viewer of its own in it, used as a person would."""
+
+    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (960, 480)) -> None:
+        self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
+        self.page: Page = self.context.new_page()
+        self.size, self.problems = size, []
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.goto(address, wait_until="domcontentloaded")
+        self.ready()
+
+    def ready(self) -> None:
+        self.button("Ask").wait_for(timeout=150_000)  # a server that starts has 120 s
+        self.page.wait_for_timeout(1500)
+
+    def button(self, name: str) -> Locator:
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def press(self, name: str) -> None:
+        self.button(name).first.click()
+
+    def field(self, label: str) -> Locator:
+        row = self.page.locator(f'xpath=//label[text()="{label}"]/ancestor::*[.//input][1]')
+        return row.locator("input:visible").last
+
+    def ask(self, prompts: str, *, key: bool = False) -> None:
+        """Types prompts and presses Ask, or Enter."""
+        self.field("Prompts").fill(prompts)
+        self.page.wait_for_timeout(300)  # viser sends what is typed at most every 50 ms
+        if key:
+            self.field("Prompts").press("Enter")
+        else:
+            self.press("Ask")
+
+    def text(self) -> str:
+        return self.page.locator("body").inner_text()
+
+    def selected(self) -> int:
+        """Number of selected Gaussians that the panel tells; -1 where it tells none."""
+        found = re.findall(r"([\d,]+) of [\d,]+ Gaussians selected", self.text())
+        return int(found[0].replace(",", "")) if found else -1
+
+    def images(self, kind: str) -> int:
+        """Number of drawings or photographs of a kind that the panel shows and the browser could read."""
+        some = f"[...document.querySelectorAll('img[src^=\"data:image/{kind}\"]')]"
+        return self.page.evaluate(f"{some}.filter((image) => image.complete && image.naturalWidth > 0).length")
+
+    def until(self, true: Callable[[], bool], what: str, timeout: float = 30) -> None:
+        deadline = time.monotonic() + timeout
+        while not true():
+            assert time.monotonic() < deadline, f"{what}: not within {timeout} s; the page says {self.text()[:900]}"
+            self.page.wait_for_timeout(100)
+
+    def says(self, text: str, timeout: float = 30) -> None:
+        self.until(lambda: text in self.text(), f"says {text!r}", timeout)
+
+    def picture(self) -> np.ndarray:
+        """RGB of the scene as the page shows it once it rests, uint8 [H, W, 3]."""
+        before, deadline = self._shot(), time.monotonic() + 30
+        while time.monotonic() < deadline:
+            self.page.wait_for_timeout(500)
+            now = self._shot()
+            if np.abs(now.astype(int) - before).mean() < 0.2:
+                return now
+            before = now
+        return before
+
+    def _shot(self) -> np.ndarray:
+        box = {"x": 0, "y": 0, "width": self.size[0] - PANEL, "height": self.size[1]}
+        shot = self.page.screenshot(clip=box, animations="disabled")  # type: ignore[arg-type]
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))

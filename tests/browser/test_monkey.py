@@ -1,0 +1,90 @@
+"""Both viewers before a monkey: nothing breaks, whatever is pressed, and the server's memory does not grow.
+
+NORMLIFT_SOAK: minutes per viewer (2). NORMLIFT_SEED: the seed, which is printed. `make soak` takes 30 minutes and a
+seed of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.browser.monkey import Monkey, Serving
+from tests.browser.own_viewer import free_port
+from tests.browser.viewer import CHROMIUM, chromium
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"),
+]
+MINUTES = float(os.environ.get("NORMLIFT_SOAK", "2"))
+SEED = os.environ.get("NORMLIFT_SEED", "1")
+MOST_GROWTH = 50.0
+"""Megabytes that are not freed, once it is warm; pictures of a moment are no growth."""
+KILLS = (0.2, 0.4)
+"""When the server is killed, as shares of the time; the last one lives on."""
+WARM = 0.65
+"""From when on its memory is watched."""
+ASKED = (
+    "import ctypes, faulthandler, gc, signal; faulthandler.register(signal.SIGUSR1); "
+    "signal.signal(signal.SIGUSR2, lambda *_: (gc.collect(), ctypes.CDLL(None).malloc_trim(0))); "
+)
+"""A program that tells what its threads do when it is asked, and gives back memory that it has freed."""
+OWN = ASKED + "from normlift_ns.scripts.view import main; main()"
+STOCK = ASKED + "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
+
+
+@pytest.fixture
+def run(demo_run: Path, tmp_path: Path) -> Iterator[Path]:
+    """The demo room; what the monkey stores in it is taken out again."""
+    stored = demo_run.parent / "normlift"
+    shutil.copytree(stored, tmp_path / "kept")
+    yield demo_run
+    shutil.rmtree(stored)
+    shutil.copytree(tmp_path / "kept", stored)
+
+
+@pytest.mark.parametrize("viewer", ["own", "stock"])
+def test_nothing_breaks_and_nothing_grows(viewer: str, run: Path, tmp_path: Path) -> None:
+    port = free_port()
+    flags = {
+        "own": [OWN, "--port", str(port)],
+        "stock": [STOCK, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(port)],
+    }[viewer]
+    words = ["-c", flags[0], "--load-config", str(run), *flags[1:]]
+    server = Serving(words, f"http://127.0.0.1:{port}", tmp_path / "log", run.parents[4])
+    print(f"\n{viewer} viewer: seed {SEED}, {MINUTES:g} minutes")
+    try:
+        server.start()
+        with chromium() as browser:
+            soak(Monkey(browser, server, f"{SEED}:{viewer}"), server)
+    finally:
+        server.stop()
+    assert "Traceback" not in server.said(), server.said()[-3000:]
+
+
+def soak(monkey: Monkey, server: Serving) -> None:
+    """Time that servers take to start does not count."""
+    whole, spent, kills, used = 60 * MINUTES, 0.0, list(KILLS), []
+    while spent < whole:
+        if kills and spent > kills[0] * whole:
+            kills.pop(0)
+            monkey.kill()
+            if not kills:
+                monkey.use_everything()
+        before = time.monotonic()
+        monkey.act()
+        spent += time.monotonic() - before
+        if spent > WARM * whole and len(monkey.deeds) % 3 == 0:
+            used.append(server.megabytes())
+    monkey.still_works()
+    tenth = max(1, len(used) // 5)
+    growth = statistics.median(used[-tenth:]) - statistics.median(used[:tenth])
+    print(f"{len(monkey.deeds)} deeds; memory {used[0]:.0f} MB when warm, {growth:+.1f} MB in the end")
+    assert growth < MOST_GROWTH, used[:: max(1, len(used) // 20)]

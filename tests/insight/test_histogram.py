@@ -1,0 +1,114 @@
+"""Histograms of relevancy: every Gaussian is in one bin, and the rules are those that the module says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from normlift_ns import InputError, SemanticField, asking
+from normlift_ns.insight.histogram import BINS, bars, histogram, suggested_threshold, top_limit
+from normlift_ns.question import Question, make_question
+from normlift_ns.runs.question import save_question
+from tests.core.test_field import D, example
+from tests.scenes import unit_rows
+
+VALUES = arrays(np.float32, st.integers(1, 60), elements=st.floats(-2, 2, width=32))
+
+
+@settings(max_examples=100, deadline=None)
+@given(values=VALUES, threshold=st.floats(-3, 3), seed=st.integers(0, 9))
+def test_every_valid_gaussian_is_in_one_bin(values, threshold, seed):
+    valid = np.random.default_rng(seed).random(len(values)) < 0.7
+    found = histogram(values, valid, threshold=threshold, limit=0.3)
+    if not valid.any():
+        assert found is None
+        return
+    assert found.counts.sum() == valid.sum()
+    assert len(found.counts) == BINS == len(found.edges) - 1
+    assert found.edges[0] <= min(threshold, values[valid].min())
+    assert found.edges[-1] >= max(threshold, values[valid].max())
+    assert min(found.median, found.top - 1e-6) <= found.suggested <= found.top <= values[valid].max() + 1e-6
+    assert found.stands_out == (found.top >= 0.3)
+    line = bars(found.counts, found.edges[0], found.edges[-1], threshold)
+    assert (len(line), line.count("|")) == (BINS // 2 + 1, 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(values=VALUES, scale=st.floats(0.01, 100), shift=st.floats(-5, 5))
+def test_the_suggestion_has_no_unit(values, scale, shift):
+    valid = np.ones(len(values), bool)
+    plain, moved = (suggested_threshold(x[:, None], valid) for x in (values.astype(float), scale * values + shift))
+    assert moved == pytest.approx(scale * plain + shift, abs=1e-4 * (1 + scale))
+
+
+def test_a_suggestion_selects_something_where_a_fixed_number_selects_nothing():
+    """Cosines as CLIP has them: an object of 2 % at 0.33, all else at 0.24."""
+    g = np.random.default_rng(0)
+    truth = g.random(20_000) < 0.02
+    cosine = np.where(truth, 0.33, 0.24) + 0.01 * g.standard_normal(20_000)
+    assert not (cosine > 0.5).any()
+    chosen = cosine > suggested_threshold(cosine[:, None], np.ones(20_000, bool))
+    assert (chosen & truth).sum() / (chosen | truth).sum() > 0.95
+
+
+def asked(encoder: str | None, **how) -> Question:
+    lifted, means, source = example(0)
+    field = SemanticField.build(lifted, means, source, provenance={"encoder": {"encoder": encoder}})
+    read = {"cosine": unit_rows(1, D, 3).float().numpy()}
+    return make_question(field, lambda texts: np.repeat(read["cosine"], len(texts), 0), ["a"], **how)
+
+
+@pytest.mark.parametrize(
+    ("encoder", "how", "threshold", "suggest"),
+    [
+        ("open_clip", {}, 0.5, False),  # lerf, against four negatives
+        ("open_clip", {"negatives": []}, 0.5, True),
+        ("open_clip", {"rule": "cosine"}, 0.5, True),
+        ("open_clip", {"rule": "cosine", "threshold": 0.3}, 0.3, False),
+        ("open_clip", {"rule": "margin"}, 0.02, False),
+        ("open_clip", {"threshold": "auto"}, 0.5, True),
+        ("colour", {}, 0.5, False),
+        ("colour", {"threshold": "auto"}, 0.5, True),
+        (None, {}, 0.5, True),
+    ],
+)
+def test_every_encoder_has_a_default_that_selects_something(encoder, how, threshold, suggest):
+    question = asked(encoder, **how)
+    assert (question.threshold, question.suggest) == (threshold, suggest)
+
+
+def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):
+    lifted, means, source = example(0)
+    field = SemanticField.build(lifted, means, source)
+    question = Question(("a", "b"), unit_rows(2, D, 3).float().numpy(), suggest=True)
+    found = asking.answer(field, means, question)
+    wanted = suggested_threshold(found.relevancy.numpy(), found.valid.numpy())
+    assert (found.question.threshold, found.question.suggest) == (wanted, False)
+    assert torch.equal(found.selected, (found.relevancy > wanted) & found.valid[:, None])
+    assert bool(found.mask.any())
+    with pytest.raises(InputError, match="its threshold is to be suggested"):
+        save_question(tmp_path, question)
+    save_question(tmp_path, found.question)
+
+
+def test_a_word_for_a_threshold_is_refused():
+    with pytest.raises(InputError, match="threshold must be a number or \"auto\", got 'much'"):
+        asked("colour", threshold="much")
+
+
+def test_what_leads_by_as_much_has_the_same_limit():
+    lerf, margin = top_limit("lerf", None), top_limit("margin", None)
+    assert 1 / (1 + np.exp(-10 * margin)) == pytest.approx(lerf, abs=1e-12)
+
+
+def test_a_text_that_most_of_the_scene_is_selects_it():
+    values = np.repeat([0.2, 0.9, 0.9 + 1e-9], [30, 60, 10])
+    found = histogram(values, np.ones(100, bool), threshold=0.5, limit=None)
+    assert found is not None
+    assert found.suggested == pytest.approx(0.2 + 0.6 * 0.7)
+    assert suggested_threshold(values[:, None], np.ones(100, bool)) == pytest.approx(found.suggested)
+    assert int((values > found.suggested).sum()) == 70

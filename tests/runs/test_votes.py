@@ -1,0 +1,109 @@
+"""The votes of a lifted run, opened again from the run and its cache."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+import normlift_ns as nl
+from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.demo import DemoRoom
+from normlift_ns.runs.votes import Votes
+
+LINE = torch.tensor([255, 176, 0], dtype=torch.uint8)
+
+
+@pytest.fixture(scope="module", params=["evidence", "float16"])
+def run(request, trained: Path, tmp_path_factory) -> nl.LiftedRun:
+    """A run that holds its evidence, and one that leaves it in the cache."""
+    how = {"source": nl.SourceOptions(encoder="colour"), "lift": nl.LiftOptions(storage=request.param, max_views=6)}
+    return nl.lift_run(trained, **how, output_dir=tmp_path_factory.mktemp(request.param), timestamp="one")
+
+
+def test_the_votes_are_those_of_the_lift(run: nl.LiftedRun) -> None:
+    """Every scalar of some Gaussians comes out again."""
+    seen = (run.field.scalars.norm > 0).nonzero().squeeze(1)
+    for j in seen[:: len(seen) // 20].tolist():
+        mask = torch.zeros(len(run.field), dtype=torch.bool)
+        mask[j] = True
+        why = run.votes.explain(mask, refined=False)
+        for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability"):
+            assert getattr(why, name) == pytest.approx(float(getattr(run.field.scalars, name)[j]), abs=2e-5), name
+        assert sum(vote.weight for vote in why.views) == pytest.approx(float(run.field.scalars.weight[j]), rel=1e-4)
+        assert len(why.views) == int(run.field.scalars.view_count[j])
+
+
+def test_a_finding_is_explained_with_the_evidence_that_it_copied(run: nl.LiftedRun) -> None:
+    red = run.ask("red")["red"]
+    why = run.why(red)
+    own = run.field.source.long() == torch.arange(len(run.field))
+    assert why.copied == int((red.mask & ~own).sum()) > 0
+    assert run.why(run.ask("red", refined=False)).copied == 0
+    assert why.c_inter > 0.9
+    assert "The photographs agree" in why.words
+
+
+def test_pictures_outline_what_is_red(run: nl.LiftedRun) -> None:
+    why = run.why(run.ask("red")["red"])
+    pictures = list(run.votes.pictures(why.views[:3]))
+    assert [picture.name for picture in pictures] == [run.votes.names[vote.view] for vote in why.views[:3]]
+    for picture in pictures:
+        place = list(run.scene.train.names).index(picture.name)
+        photograph = run.scene.train[place].image
+        line = (picture.image == LINE).all(dim=2)
+        kept = (picture.image == photograph).all(dim=2) & (photograph > 0).any(dim=2)
+        assert 10 < int(line.sum()) < 0.3 * line.numel()
+        inside = photograph[kept].float()
+        assert float((inside[:, 0] > inside[:, 1] + 40).float().mean()) > 0.5  # most of what is not dimmed is red
+
+
+def test_what_the_cache_no_longer_holds_is_named(run: nl.LiftedRun, tmp_path: Path) -> None:
+    mask = run.ask("red").mask
+    votes = Votes(run.scene, run.field, tmp_path / "emptied")
+    if isinstance(run.field.store, StoredEvidence):
+        assert votes.explain(mask).views == run.why(run.ask("red")).views
+        return
+    with pytest.raises(nl.InputError, match=r"no longer holds the evidence of the lift.*lift again with: ns-normlift"):
+        votes.explain(mask)
+
+
+def test_photographs_that_are_gone_or_replaced_are_named(run: nl.LiftedRun, trained: Path, tmp_path: Path) -> None:
+    if not isinstance(run.field.store, StoredEvidence):
+        pytest.skip("such a run finds its evidence by the content of the photographs")
+    moved = tmp_path / "room"
+    shutil.copytree(trained.parents[4] / "room", moved)
+    opened = nl.open_run(run.config, data=moved)
+    why = opened.why(opened.ask("red"))
+    first = why.views[0]
+    file = moved / opened.votes.names[first.view]
+    size = Image.open(file).size
+    Image.new("RGB", size, "green").save(file)
+    with pytest.raises(nl.InputError, match="no longer has the regions that were lifted"):
+        list(opened.votes.pictures([first]))
+    file.unlink()
+    with pytest.raises((nl.InputError, FileNotFoundError), match=file.name):
+        list(opened.votes.pictures([first]))
+
+
+def test_features_of_ones_own_have_votes_but_no_pictures(trained: Path, room: DemoRoom, tmp_path: Path) -> None:
+    scene = nl.open_scene(trained)
+    halves = [(torch.arange(160).expand(120, 160) // 80, torch.eye(2)) for _ in scene.train.names]
+    how = {"lift": nl.LiftOptions(storage="evidence", refine=False), "output_dir": tmp_path}
+    run = nl.lift_run(scene, features=halves, texts={"left": torch.tensor([1.0, 0.0])}, **how)
+    found = run.ask("left")
+    assert 0 < int(found.mask.sum()) < len(found.mask)  # cosines of an unknown encoder: the threshold is suggested
+    why = run.why(found)
+    assert {one.region for vote in why.views for one in vote.regions} == {0, 1}
+    with pytest.raises(nl.InputError, match="they were given from Python"):
+        list(run.votes.pictures(why.views[:1]))
+
+
+def test_masks_that_are_none(run: nl.LiftedRun) -> None:
+    with pytest.raises(nl.InputError, match="part must be an answer of this run"):
+        run.why("red")  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="nothing is selected"):
+        run.why(torch.zeros(len(run.field), dtype=torch.bool))

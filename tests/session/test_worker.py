@@ -1,0 +1,38 @@
+"""Work waits its turn, and nobody waits for it."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns.session.worker import Worker
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.sampled_from(["", "a", "b"]), max_size=30))
+def test_work_is_done_in_order_and_of_a_key_the_last_in_a_row(keys):
+    worker, gate, done, ended = Worker(), threading.Event(), [], threading.Event()
+    worker.put(lambda: done.extend([] if gate.wait(30) else ["late"]))
+    for i, key in enumerate(keys):
+        worker.put(lambda i=i: done.append(i), key)
+    worker.put(ended.set)
+    gate.set()
+    assert ended.wait(30)
+    assert done == [i for i, key in enumerate(keys) if not key or keys[i + 1 : i + 2] != [key]]
+
+
+def test_what_waits_is_forgotten_and_nothing_is_taken_in_the_end():
+    worker, gate, done = Worker(), threading.Event(), []
+    worker.put(lambda: done.append(1) if gate.wait(30) else None)
+    time.sleep(0.05)
+    worker.put(lambda: done.append(2))
+    worker.drop()
+    worker.put(lambda: done.append(3))
+    worker.end()
+    worker.put(lambda: done.append(4))
+    gate.set()
+    time.sleep(0.1)
+    assert done == [1]

@@ -1,0 +1,47 @@
+"""Small worlds whose answers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from normlift_ns import Evidence, SemanticField, lift
+from normlift_ns.core.evidence import Entries
+from normlift_ns.errors import InputError
+from normlift_ns.session.space import Space
+
+SIDE = 4
+BLOCK = SIDE**3
+"""Gaussians of one cube."""
+WORDS = {"red": (1.0, 0.0, 0.0), "blue": (0.0, 1.0, 0.0), "green": (0.0, 0.0, 1.0)}
+
+
+def cubes() -> Space:
+    """Four cubes of Gaussians in a row, 100 apart: red, blue, red, and one without a direction."""
+    axis = torch.arange(SIDE).float()
+    cube = torch.cartesian_prod(axis, axis, axis)
+    means = torch.cat([cube + torch.tensor([100.0 * i, 0, 0]) for i in range(4)])
+    column = torch.tensor([1, 2, 1]).repeat_interleave(BLOCK)
+    seen = Entries(torch.arange(3 * BLOCK), column, torch.ones(3 * BLOCK), (3,))
+    again = Entries(torch.arange(BLOCK), torch.ones(BLOCK, dtype=torch.long), torch.ones(BLOCK), (3,))
+    features = torch.cat([torch.eye(3), torch.eye(3)])
+    evidence = Evidence.from_entries([seen, again], 4 * BLOCK)
+    return Space(SemanticField.build(lift(evidence, features), means), means)
+
+
+def read(texts) -> np.ndarray:
+    """Like `rows` of an encoder that knows three words."""
+    for text in texts:
+        if text not in WORDS:
+            raise InputError(f"text {text!r} is unknown")
+    return np.array([WORDS[text] for text in texts], np.float32)
+
+
+def rows(*numbers: int) -> torch.Tensor:
+    """The Gaussians of some of the cubes."""
+    return torch.isin(torch.arange(4 * BLOCK) // BLOCK, torch.tensor(numbers))
+
+
+def ray(gaussian: int) -> torch.Tensor:
+    """Weights on a ray that meets one Gaussian."""
+    return torch.nn.functional.one_hot(torch.tensor(gaussian), 4 * BLOCK).float()

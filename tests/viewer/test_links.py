@@ -1,0 +1,66 @@
+"""Links hold question and camera, and nothing else is read as one."""
+
+import base64
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from normlift_ns.errors import InputError
+from normlift_ns.viewer.links import Link, View, read_hello, read_link, write_link
+
+PLACE = st.tuples(*[st.floats(-1e9, 1e9)] * 3)
+
+
+@given(
+    st.text(st.characters(exclude_categories=["Cs"])),
+    st.dictionaries(st.text(st.characters(exclude_categories=["Cs"]), max_size=5), st.integers(0, 2**40), max_size=3),
+    st.none() | st.floats(-1, 1),
+    st.none() | st.builds(View, PLACE, PLACE, PLACE, st.floats(0.1, 3)),
+)
+def test_a_link_is_read_as_it_was_written(prompts, clicks, threshold, view):
+    link = Link(prompts, clicks, threshold, 0.5, "prompts", view)
+    fragment = write_link(link)
+    assert read_link(fragment) == link
+    assert all(letter.isalnum() or letter in "=-_" for letter in fragment)
+
+
+def test_a_link_that_is_too_long_is_not_made():
+    with pytest.raises(InputError, match="make a link of"):
+        write_link(Link("x" * 6000))
+
+
+@given(st.text())
+def test_other_fragments_are_none_or_an_error(text):
+    for fragment in (text, f"q={text}"):
+        try:
+            found = read_link(fragment)
+        except InputError:
+            continue
+        assert found is None or isinstance(found, Link)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{}",
+        "[]",
+        '{"token": ""}',
+        '{"token": 1}',
+        '{"token": "' + "x" * 101 + '"}',
+        "[" * 100_000,
+        '{"token": null}',
+    ],
+)
+def test_other_greetings_are_refused(text):
+    with pytest.raises(InputError, match="no greeting"):
+        read_hello(text)
+
+
+@pytest.mark.parametrize(
+    "link", ['{"view": {"fov": 1e999}}', '{"clicks": {"a": -1}}', '{"what": 1}', '{"threshold": NaN}']
+)
+def test_damaged_links_are_told(link):
+    with pytest.raises(InputError, match="copy it again"):
+        read_link("q=" + base64.urlsafe_b64encode(link.encode()).decode())

@@ -1,0 +1,131 @@
+"""Why something is selected, as the panels tell it."""
+
+from __future__ import annotations
+
+import html
+from threading import Event, Thread
+from typing import Any
+
+import pytest
+import torch
+
+from normlift_ns import Evidence
+from normlift_ns.core.evidence import Entries
+from normlift_ns.errors import InputError
+from normlift_ns.insight.why import explain_selection
+from normlift_ns.runs.votes import Picture
+from normlift_ns.session import actions
+from normlift_ns.session.state import State
+from normlift_ns.viewer.reasons import Reasons, reasons_mdx
+from tests.session.worlds import BLOCK, cubes, rows
+
+SPACE = cubes()
+NAMES = ("a/[x](y).png", "b.png", "c.png", "d.png", "e.png")
+
+
+class FakeVotes:
+    """Five photographs: the first cube is red in four of them and blue in the last, the second blue in all."""
+
+    names = NAMES
+
+    def __init__(self, problem: Exception | None = None) -> None:
+        self.problem = problem
+        entries = []
+        for view in range(5):
+            column = torch.where(torch.arange(2 * BLOCK) < BLOCK, 1 + (view == 4), 2)
+            weight = torch.full((2 * BLOCK,), 5.0 - view)
+            entries.append(Entries(torch.arange(2 * BLOCK), column, weight, (2,)))
+        self.evidence = Evidence.from_entries(entries, 4 * BLOCK)
+
+    def explain(self, selected: torch.Tensor, *, refined: bool = True) -> Any:
+        return explain_selection(self.evidence, torch.eye(2).repeat(5, 1), selected)
+
+    def pictures(self, votes: Any) -> Any:
+        for vote in votes:
+            if self.problem is not None:
+                raise self.problem
+            yield Picture(NAMES[vote.view], vote, torch.full((12, 16, 3), 40 * vote.view, dtype=torch.uint8))
+
+
+def told(votes: Any, *cubes_: int) -> str:
+    return reasons_mdx(votes, rows(*cubes_))
+
+
+def test_three_that_weigh_most_and_those_that_disagree():
+    text = html.unescape(told(FakeVotes(), 0))
+    assert text.startswith("The photographs agree")
+    most, different = text.split("**These disagree most:**")
+    assert "**These weigh most:**" in most
+    assert "a/[x](y).png: 33% of the weight (320 pixels, 1 region), cosine 1.00" in most
+    assert [name in most for name in NAMES] == [True, True, True, False, False]
+    assert "e.png: 7% of the weight" in different
+    assert "of the disagreement" in different
+    assert text.count("data:image/jpeg") == 4  # e.png, and three that weigh most, each once
+    alike = told(FakeVotes(), 1)
+    assert "disagree most" not in alike
+    assert alike.count("data:image/jpeg") == 3
+
+
+def test_names_are_text():
+    lines = told(FakeVotes(), 0).splitlines()
+    found = [line for line in lines if line.startswith("a&#47;")]
+    assert len(found) == 2  # it weighs most, and disagrees a little
+    assert not any(set("[]()/") & set(line) for line in found)
+
+
+@pytest.mark.parametrize("problem", [InputError("they were given from Python"), FileNotFoundError("b.png is missing")])
+def test_pictures_that_cannot_be_had_are_no_reason_to_say_nothing(problem):
+    text = html.unescape(told(FakeVotes(problem), 0))
+    assert f"The photographs cannot be shown: {problem}" in text
+    assert "33% of the weight" in text
+    assert "data:image" not in text
+
+
+def test_a_selection_of_nothing_is_an_error():
+    reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
+    state = State(SPACE)
+    with pytest.raises(InputError, match="nothing is selected"):
+        reasons.find(reasons.start(state), state)
+    assert (reasons.content, reasons.busy) == ("", "")
+
+
+def test_reasons_belong_to_their_selection():
+    reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
+    state = actions.select(State(SPACE), rows(0))
+    reasons.find(reasons.start(state), state)
+    assert "These weigh most" in reasons.content
+    reasons.follow(actions.hide(state))  # the selection is the same
+    assert reasons.content != ""
+    reasons.follow(actions.select(state, rows(1)))
+    assert reasons.content == ""
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
+    begun, go_on = Event(), Event()
+
+    class Slow(FakeVotes):
+        def explain(self, selected: torch.Tensor, *, refined: bool = True) -> Any:
+            begun.set()
+            assert go_on.wait(20)
+            if fails:
+                raise InputError("too late to be told")
+            return super().explain(selected, refined=refined)
+
+    reasons = Reasons(Slow)  # type: ignore[arg-type]
+    state, raised = actions.select(State(SPACE), rows(0)), []
+
+    def find() -> None:
+        try:
+            reasons.find(reasons.start(state), state)
+        except InputError as error:
+            raised.append(error)
+
+    thread = Thread(target=find)
+    thread.start()
+    assert begun.wait(20)
+    assert reasons.busy.startswith("Looking")
+    reasons.follow(actions.select(state, rows(1)))
+    go_on.set()
+    thread.join(20)
+    assert (reasons.content, reasons.busy, raised) == ("", "", [])
