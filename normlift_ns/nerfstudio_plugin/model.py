@@ -110,10 +110,10 @@ class NormLiftModel(SplatfactoModel):
         """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
 
         Args:
-            camera: one camera.
+            camera: one camera; where it has no pixels, which nerfstudio's viewer can ask for, one pixel is drawn.
             obb_box: Gaussians outside are not drawn.
         """
-        display = self._display
+        display, camera = self._display, _with_a_pixel(camera)
         rows = self.rows_in(obb_box, display)
         view = _opencv(camera.to(self.device))
         values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
@@ -235,6 +235,12 @@ def compile_renderer() -> None:
 def _opencv(camera: Cameras) -> Camera:
     pose, intrinsics = camera.camera_to_worlds.reshape(3, 4), camera.get_intrinsics_matrices().reshape(3, 3)
     return to_camera(pose, intrinsics, int(camera.width.item()), int(camera.height.item()))
+
+
+def _with_a_pixel(camera: Cameras) -> Cameras:
+    if min(int(camera.width.item()), int(camera.height.item())) > 0:
+        return camera
+    return Cameras(camera.camera_to_worlds, fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=1, height=1).to(camera.device)
 
 
 @contextmanager

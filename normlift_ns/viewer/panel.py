@@ -67,7 +67,8 @@ class Panel:
             self.why = self._button("Why?", "Shows the photographs that voted for the selection.", "gray")
             self.reasons = gui.add_markdown("")
         with gui.add_folder("Box", expand_by_default=False):
-            self._group("Cut", ("Around", "Inside", "Outside", "None"))
+            self._group("Place", ("Around", "None"))
+            self._group("Keep", ("Inside", "Outside"))
             self.centre = gui.add_vector3("Centre", (0.0, 0.0, 0.0), step=0.01)
             self.size = gui.add_vector3("Size", (1.0, 1.0, 1.0), min=(0.0, 0.0, 0.0), step=0.01)
         self.rows = Rows(gui, lambda deed, row, _: act(deed, row))

@@ -19,6 +19,8 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, ConsoleMessage, Page, TimeoutError
 
+from tests.browser.viewer import faults
+
 PROMPTS = (
     "red", "purple", "red, yellow", "dark green; sky blue", "teal", "zebra", "red, zebra; purple", "", " ", ",;,", "-5",
     "like click 1", "like click 99", "red, red, red", "<b>red</b>", "[/red] {x}", "**red** | `code` | <script>alert(1)",
@@ -209,8 +211,7 @@ class Monkey:
 
     def check(self) -> None:
         said = self._server.said()
-        if "Traceback" in said:
-            self.problems.append("the server: " + said[said.index("Traceback") :][:4000])
+        self.problems += ["the server: " + fault[:4000] for fault in faults(said)]
         if not self._server.alive():
             self.problems.append("the server has ended: " + said[-2000:])
         if self.problems:

@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData
 
 from normlift_ns.runs.question import load_question
-from tests.browser.viewer import CHROMIUM, Tab, chromium, coloured, hue_mask, iou, middle, ns_viewer
+from tests.browser.viewer import CHROMIUM, Tab, chromium, coloured, faults, hue_mask, iou, middle, ns_viewer
 
 pytestmark = [
     pytest.mark.slow,
@@ -34,7 +34,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def address(run_dir: Path, log: Path) -> Iterator[str]:
     with ns_viewer(run_dir / "config.yml", log, cwd=run_dir.parents[3]) as address:
         yield address
-    assert "Traceback" not in log.read_text()
+    assert faults(log.read_text()) == []
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +298,7 @@ def test_two_tabs_and_everything_at_once(tab: Tab, address: str, log: Path) -> N
     other.until(lambda: "xxxx" not in other.status() and "No query yet." in other.status(), "cleared")
     assert other.problems == []
     other.page.close()
-    assert "Traceback" not in log.read_text()
+    assert faults(log.read_text()) == []
 
 
 def test_a_phone(tab: Tab, address: str, pictures: Path) -> None:

@@ -372,5 +372,5 @@ def test_a_box_is_drawn_and_cuts(address: str, pictures: Path) -> None:
         own.page.screenshot(path=pictures / "view_box_cut.png")
         own.press("None")
         own.until(lambda: own.selected() == whole, "whole again")
-        assert np.abs(own.picture().astype(int) - bare).mean() < 1
+        own.until(lambda: np.abs(own.picture().astype(int) - bare).mean() < 1, "the picture as before")
         assert own.problems == []

@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.utils import CameraState, get_camera
 
 from normlift_ns import asking
 from normlift_ns.front_door import open_scene as load_scene
@@ -80,6 +82,16 @@ def test_a_run_is_drawn_by_the_rules_of_its_lift(pipeline, stock: StockRun, monk
     alphas = [render(scene, camera, scene.means, settings=rules)[1] for rules in (later, RasterSettings())]
     assert (alphas[0] - alphas[1]).abs().max() > 1e-3
     torch.testing.assert_close(_outputs(pipeline, 2)["accumulation"][:, :, 0], alphas[0], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("resolution", "aspect"), [(0, 1.0), (-7, 1.0), (9, 0.05)])
+def test_a_picture_without_pixels_is_one_pixel(pipeline, resolution: int, aspect: float) -> None:
+    cameras = pipeline.datamanager.train_dataset.cameras
+    state = CameraState(fov=1.0, aspect=aspect, c2w=cameras.camera_to_worlds[0], camera_type=CameraType.PERSPECTIVE)
+    camera = get_camera(state, resolution, int(resolution * aspect))
+    outputs = pipeline.model.get_outputs_for_camera(camera)
+    assert [*STOCK, *SEMANTIC] == [name for name in outputs if not name.startswith("relevancy_")]
+    assert all(value.shape[:2] == (1, 1) and value.isfinite().all() for value in outputs.values())
 
 
 def test_colours_without_spherical_harmonics(workspace: Path, registered: None, tmp_path: Path) -> None:
