@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from threading import RLock
 from typing import Any
 
@@ -20,6 +21,7 @@ from normlift_ns.session.found import Found
 from normlift_ns.session.history import History
 from normlift_ns.session.state import State
 from normlift_ns.session.turns import Turns
+from normlift_ns.viewer.adapter import pass_over_the_gone
 from normlift_ns.viewer.display import Display, make_display, output_names
 from normlift_ns.viewer.reasons import Reasons
 
@@ -90,6 +92,7 @@ class Face(torch.nn.Module):
         self._viewer = viewer
         self._widgets = Widgets(viewer.viser_server, self.act)
         viewer.viser_server.on_client_disconnect(self.forget)
+        pass_over_the_gone(viewer.viser_server)
         self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives
         if self.state is not None:
             self._rest.follow(self.state)
@@ -123,7 +126,8 @@ class Face(torch.nn.Module):
         self._host[0].show(display)
         self._follow()
         if self._viewer is not None:
-            self._viewer._trigger_rerender()
+            with suppress(KeyError):  # of a page that comes or goes at this moment
+                self._viewer._trigger_rerender()
 
     def _keep_output(self, display: Display, *, answered: bool) -> None:
         """Where rgb, or an output that there will not be any more, is shown, the overlay takes its place."""

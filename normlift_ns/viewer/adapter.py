@@ -393,6 +393,32 @@ def button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable
     return group
 
 
+def pass_over_the_gone(server: Any) -> None:
+    """Nothing is printed about messages of a page that was closed before they were read.
+
+    viser 0.2.7 reads them in another thread, where it and nerfstudio 1.1.5 look up the page by its number, and print a
+    traceback when it is not there any more.
+    """
+    from viser.infra import _infra  # noqa: PLC0415
+
+    infra: Any = _infra
+    told = getattr(infra, "error_print_wrapper", None)
+    if told is None:  # 1.x
+        return
+
+    def quieter(inner: Callable[[], Any]) -> Callable[[], None]:
+        def read() -> None:
+            try:
+                inner()
+            except KeyError as error:
+                if any(type(key) is not int or key in server.get_clients() for key in error.args):
+                    raise
+
+        return told(read)
+
+    infra.error_print_wrapper = quieter
+
+
 def _unpacked(buffer: UInt32[np.ndarray, "k 8"]) -> dict[str, np.ndarray]:
     """Records as the arguments of viser 1.x."""
     factors = np.ascontiguousarray(buffer[:, 4:7]).view(np.float16).astype(np.float64)

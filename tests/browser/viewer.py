@@ -173,15 +173,8 @@ class Tab:
 
 
 def faults(log: str) -> list[str]:
-    """Tracebacks in what a viewer printed, but for a harmless one of nerfstudio 1.1.5.
-
-    A camera that moved just before its page was closed is looked up when the page has gone: `render_statemachines` in
-    nerfstudio/viewer/viewer.py.
-    """
-    found = re.findall(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*.*", log)
-    return [
-        text for text in found if not re.search(r"self\.render_statemachines\[.*\n(?:[ \t].*\n)*KeyError: \d+", text)
-    ]
+    """Tracebacks in what a viewer printed."""
+    return re.findall(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*.*", log)
 
 
 def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:

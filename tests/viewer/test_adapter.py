@@ -8,13 +8,14 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection
 
-from normlift_ns.viewer.adapter import Page, Server
+from normlift_ns.viewer.adapter import Page, Server, pass_over_the_gone
 from tests.viewer.wire import ONE, messages, opened
 
 pytest.importorskip("viser")
@@ -190,6 +191,25 @@ def test_clicks_come_until_nobody_listens(server, pages):
         time.sleep(0.3)
         assert len(clicks) == 1
         assert tuple(clicks[0][1]) == (0, 0, 1)
+
+
+def test_what_a_closed_page_asked_is_passed_over_and_all_else_is_told(capsys, monkeypatch):
+    infra = pytest.importorskip("viser.infra._infra")
+    if not hasattr(infra, "error_print_wrapper"):
+        pytest.skip("viser 1.x looks nobody up by number")
+    monkeypatch.setattr(infra, "error_print_wrapper", infra.error_print_wrapper)
+    pass_over_the_gone(SimpleNamespace(get_clients=lambda: {3: "here"}))
+
+    def told(error: Exception) -> str:
+        def read() -> None:
+            raise error
+
+        infra.error_print_wrapper(read)()
+        return capsys.readouterr().err
+
+    assert told(KeyError(4)) == ""
+    for other in (KeyError(3), KeyError("4"), KeyError(True), IndexError(4), ValueError("wrong")):
+        assert f"\n{type(other).__name__}: {other}" in told(other)
 
 
 def test_nobody_can_publish_the_server(server):
