@@ -36,9 +36,12 @@ SIZES = ((640, 480), (390, 700), (900, 480), (640, 300))
 PRESSED = "button, [role=tab], .mantine-ActionIcon-root, .tabler-icon-chevron-up, .tabler-icon-chevron-down"
 _NOT_PRESSED = ".tabler-icon-share"
 """Asks a server on the internet for a tunnel."""
-_FIND = """([what, not, share]) => {
+_FOREIGN_TAB = "Render"
+"""Of nerfstudio's viewer: its own tab for camera paths raises by itself, when two windows about a keyframe open."""
+_FIND = """([what, not, tab, share]) => {
   const found = [...document.querySelectorAll(what)].filter((e) =>
-    e.getClientRects().length > 0 && !e.disabled && !e.matches(not) && !e.querySelector(not));
+    e.getClientRects().length > 0 && !e.disabled && !e.matches(not) && !e.querySelector(not)
+    && !(e.matches("[role=tab]") && e.textContent.trim() === tab));
   if (found.length === 0) return null;
   const one = found[Math.floor(share * found.length)];
   one.scrollIntoView({block: "center"});
@@ -239,7 +242,7 @@ class Monkey:
         self.check()
 
     def _find(self, who: int, what: str, chance: random.Random) -> list | None:
-        return self._pages[who].evaluate(_FIND, [what, _NOT_PRESSED, chance.random()])
+        return self._pages[who].evaluate(_FIND, [what, _NOT_PRESSED, _FOREIGN_TAB, chance.random()])
 
     def _press(self, who: int, chance: random.Random) -> str:
         found = self._find(who, PRESSED, chance)
