@@ -177,6 +177,11 @@ def faults(log: str) -> list[str]:
     return re.findall(r"Traceback \(most recent call last\):\n(?:[ \t].*\n|\n)*.*", log)
 
 
+def is_ours(fault: str) -> bool:
+    """Whether a traceback has led through this package, but for what stands around all that viser reads."""
+    return re.search(r'normlift_ns/(?!viewer/adapter\.py", line \d+, in read\n)', fault) is not None
+
+
 def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
     """Pixels of a hue, strongly coloured; without the axes in the lower left corner."""
     rgb = picture.astype(float) / 255
