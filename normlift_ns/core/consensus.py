@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
+from normlift_ns.core.checks import check_tensors, check_unit_rows
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.lift import Scalars
@@ -100,7 +101,8 @@ def consensus(
         power: q, the exponent of c_ts, >= 0.
         sample: Gaussians that every region has at least, or all that it has; >= 1.
     Raises:
-        ValueError: a table or levels of another length, a power or a sample outside its range.
+        ValueError: a table or levels of another length, rows that are neither unit vectors nor 0, negative levels, a
+            power or a sample outside its range.
 
     >>> import torch
     >>> from normlift_ns import Evidence, consensus
@@ -111,11 +113,19 @@ def consensus(
     tensor([0.9138, 0.4061])
     """
     size = evidence.num_regions
+    check_tensors(features=features, **({} if level is None else {"level": level}))
     for name, length in (("features", len(features)), ("level", size if level is None else len(level))):
         if length != size:
             raise InputError(f"{name} must have one row per region of the evidence, {size:,}; got {length:,}")
-    if not (0 <= power < float("inf") and sample >= 1):
-        raise InputError(f"power must be a number >= 0 and sample >= 1, got {power} and {sample}")
+    if features.ndim != 2 or not features.dtype.is_floating_point:
+        raise InputError(f"features must be floating-point rows [S, D], got {features.dtype} {tuple(features.shape)}")
+    if level is not None and (level.ndim != 1 or level.dtype.is_floating_point or bool((level < 0).any())):
+        raise InputError(f"level must be whole numbers >= 0 of shape [S], got {level.dtype} {tuple(level.shape)}")
+    if not isinstance(power, int | float) or not 0 <= power < float("inf"):
+        raise InputError(f"power must be a number >= 0, got {power!r}")
+    if not isinstance(sample, int) or sample < 1:
+        raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
+    check_unit_rows(features, "feature rows", "normalise them, or set those without a feature to 0", zeros=True)
     device = evidence.rows.weight.device
     chosen, chance = sampled_gaussians(evidence.rows, size, sample)
     rows = evidence.rows.select_rows(chosen)

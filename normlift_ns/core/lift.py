@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
+from normlift_ns.core.checks import check_tensors, check_unit_rows
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
@@ -203,20 +204,14 @@ def lift(
 
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
+    check_tensors(features=features)
     if features.ndim != 2 or features.shape[0] != evidence.num_regions or not features.dtype.is_floating_point:
         raise InputError(
             f"features must be [{evidence.num_regions}, D]: one row per region of the evidence; got "
             f"{features.dtype} {tuple(features.shape)}"
         )
     exact = features.to(evidence.rows.weight.device, torch.float64)
-    length = torch.linalg.vector_norm(exact, dim=1)
-    bad = (~((length - 1).abs() < 1e-2)).nonzero().squeeze(1)
-    if bad.numel() > 0:
-        shown = ", ".join(f"row {i} has length {length[i]:.3g}" for i in bad[:3].tolist())
-        raise InputError(
-            f"{bad.numel()} of {len(features)} feature rows are not unit vectors ({shown}); normalise them, "
-            "and label regions without a feature -1"
-        )
+    length = check_unit_rows(exact, "feature rows", "normalise them, and label regions without a feature -1")
     double = torch.float64 in (evidence.rows.weight.dtype, features.dtype)
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.checks import check_range, check_tensors, check_unit_rows
 from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.errors import InputError
@@ -61,7 +62,8 @@ def refine(
             `possible(config, n)`.
         progress: called after every block of Gaussians with (Gaussians done, Gaussians).
     Raises:
-        ValueError: shapes that disagree, neighbours of another K, a posterior vote without `own`.
+        ValueError: shapes that disagree, directions that are neither unit vectors nor 0, R or `own` below 0
+            or not finite, neighbours of another K, a posterior vote without `own`.
 
     >>> import torch
     >>> from normlift_ns import RefineConfig, refine
@@ -74,6 +76,9 @@ def refine(
     >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2), own=seen).tolist()
     [0, 0, 2]
     """
+    named = {"means": means, "directions": directions, "reliability": reliability, "own": own}
+    optional = (None, directions) if callable(directions) else (None,)
+    check_tensors(**{name: value for name, value in named.items() if not any(value is one for one in optional)})
     n, config = means.shape[0], config or RefineConfig(vote="paper" if own is None else "posterior")
     config = config if neighbors is not None else possible(config, n)
     given = directions if isinstance(directions, Tensor) else None
@@ -87,6 +92,13 @@ def refine(
     elif own is None or tuple(own.shape) != (n,):
         got = "none" if own is None else f"shape {tuple(own.shape)}"
         raise InputError(f"a posterior vote needs own, the scalars.own_evidence of a lift, of shape {(n,)}; got {got}")
+    check_range("reliability", reliability, 0.0)
+    if own is not None:
+        check_range("own", own, 0.0)
+    if given is not None:
+        check_unit_rows(
+            given, "rows of directions", "normalise them, or set those without a direction to 0", zeros=True
+        )
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
@@ -134,6 +146,11 @@ def possible(config: RefineConfig, n: int) -> RefineConfig:
     k = min(config.k, max(1, n - 1), MOST_VOTERS)
     if k == config.k:
         return config
+    if n < 2:
+        warnings.warn(
+            f"with {n} Gaussian{'s' * (n != 1)} there are no neighbours, and nothing to vote on", stacklevel=2
+        )
+        return replace(config, k=k)
     reason = (
         f"a Gaussian has only {n - 1:,} other{'s' * (n != 2)}"
         if k < MOST_VOTERS

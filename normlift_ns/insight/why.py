@@ -107,6 +107,8 @@ class Why:
         """
         if len(self.views) == 0 and self.n_eff == 0:
             return "No photograph says anything of it."
+        if len(self.views) == 1:
+            return "Only one photograph shows it, so that nothing tells whether others would agree."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
         count = "a single photograph" if self.n_eff < 1.05 else f"{self.n_eff:.1f} photographs of equal weight"
         return f"The photographs {level} (C_inter {self.c_inter:.2f}). It rests on as much as {count} (N_eff)."

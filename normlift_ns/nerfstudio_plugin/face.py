@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from threading import RLock
+from threading import RLock, Thread
 from typing import Any
 
 import torch
@@ -91,12 +91,16 @@ class Face(torch.nn.Module):
         """Makes the tab in a viewer."""
         self._viewer = viewer
         self._widgets = Widgets(viewer.viser_server, self.act)
-        viewer.viser_server.on_client_disconnect(self.forget)
+        viewer.viser_server.on_client_disconnect(self._gone)
         pass_over_the_gone(viewer.viser_server)
         self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives
         if self.state is not None:
             self._rest.follow(self.state)
         self._follow()
+
+    def _gone(self, client: Any) -> None:
+        """viser tells it under a lock of its own, which a thread that holds ours may wait for."""
+        Thread(target=self.forget, args=(client,), daemon=True).start()
 
     def tell(self, message: str) -> None:
         """Shows a message, and below it what is selected."""

@@ -19,12 +19,12 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.core.picking import ray_weights
 from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
 from normlift_ns.nerfstudio_plugin.panel import Panel
 from normlift_ns.options import RasterizeMode
 from normlift_ns.question import Question
 from normlift_ns.raster.colors import view_colors
+from normlift_ns.raster.picking import ray_weights
 from normlift_ns.raster.rasterize import render
 from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import FIELD_FOLDER, check_run, with_paths

@@ -139,8 +139,7 @@ class Panel(Face):
         elif name in OBJECT_DEEDS:
             self._with_object(name, value, client)
         elif name == "Download selection":
-            line = join_prompts([prompt.text for prompt in now.prompts])
-            self._download(now.selection, line or "selection", client)
+            self._download(now.selection, now.name, client)
         elif name in ("Save prompts in run", "Replace the saved prompts"):
             self._save(now, replaces=name.startswith("Replace"))
 

@@ -31,7 +31,7 @@ def said(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"]) -> st
     if state.question is None and count == 0:
         lines.append("No query yet.")
     else:
-        lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected")
+        lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand}")
     faint = int((chosen & ~drawn.to(chosen.device)).sum())
     if faint > 0:
         lines.append(f"{faint:,} of them are never drawn nor exported (opacity below 1/255).")
@@ -58,7 +58,7 @@ def found_table(state: State) -> str:
     lines = [
         f"{as_text(answer.question.rule)} above {answer.question.threshold:g}",
         "",
-        "| | prompt | selected | peak |",
+        "| | prompt | found | peak |",
         "|---|---|---|---|",
     ]
     troubled = [prompt for prompt in state.prompts if prompt.problem]  # first: they want to be seen

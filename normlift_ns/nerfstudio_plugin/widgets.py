@@ -11,14 +11,13 @@ from typing import Any
 
 from normlift_ns.colors import COLORMAPS
 from normlift_ns.options import THRESHOLDS
-from normlift_ns.session.actions import MOST_STEPS
+from normlift_ns.session.actions import HIGHEST, LOWEST, MOST_STEPS
 from normlift_ns.session.state import State
 from normlift_ns.viewer.legend import clipped
 from normlift_ns.viewer.rows import Rows
 
 ALL_PROMPTS = "all prompts"
 TAB = "Search"
-_LOWEST, _HIGHEST = -0.2, 1.0
 _SCRIPT = """
 (() => {
   if (window.normlift) return;
@@ -63,7 +62,7 @@ class Widgets:
             self.poor = self._button("Leave out what is poorly evidenced")
             self.poor.visible = False
             self._group("History", ("Undo", "Redo", "Clear"))
-            self.threshold = self._slider("Threshold", _LOWEST, _HIGHEST, 0.005, 0.5, "Relevancy to select.")
+            self.threshold = self._slider("Threshold", LOWEST, HIGHEST, 0.005, 0.5, "Relevancy to select.")
             self.reliability = self._slider(
                 "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "R that what is selected must have."
             )
@@ -112,7 +111,7 @@ class Widgets:
             self.shown.options = options
         self._set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
         if state.question is not None:
-            threshold = min(_HIGHEST, max(_LOWEST, state.question.threshold))
+            threshold = min(HIGHEST, max(LOWEST, state.question.threshold))
             self._set("Threshold", self.threshold, threshold)
             self._set("Minimum reliability", self.reliability, state.question.min_reliability)
             self._set("refined", self.refined, state.question.refined)

@@ -98,6 +98,8 @@ def write_splats(
     columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
     rows = exported_rows(columns, keep)
     if len(rows) == 0:
+        if not bool(keep.any()):
+            raise InputError(f"{path} is not written: no Gaussian is selected")
         raise InputError(f"{path} is not written: none of the {int(keep.sum()):,} Gaussians wanted is ever drawn")
     columns |= semantic_columns(field, answer)
     table = np.empty(len(rows), [(name, "<i4" if name == "label" else "<f4") for name in columns])

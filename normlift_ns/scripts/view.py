@@ -53,6 +53,8 @@ class NormLiftView:
         from normlift_ns.viewer.serving.door import Door  # noqa: PLC0415 (--help should not wait for viser)
 
         door = Door(self.host, self.port)
+        if door.server.port != self.port:
+            say(f"Port {self.port} is taken.")
         host = "127.0.0.1" if self.host == "0.0.0.0" else self.host
         say(f"The viewer is at http://{host}:{door.server.port} (Ctrl-C ends it)")
         try:

@@ -24,6 +24,8 @@ from normlift_ns.session.verdicts import suggested
 Mode = Literal["select", "add", "take away"]
 """What a click does with the object that it meets."""
 MOST_STEPS = 10
+LOWEST, HIGHEST = -0.2, 1.0
+"""Thresholds that a slider offers."""
 LOOK_FIRST = "Likely floaters are selected. Look at them, then press Hide; Undo takes it back."
 _NOTHING = "Nothing is selected."
 
@@ -56,7 +58,8 @@ def clear(state: State) -> State:
 
 
 def threshold(state: State, value: float) -> State:
-    """Another relevancy above which to select."""
+    """Another relevancy above which to select; one that the slider does not have becomes its end."""
+    value = min(HIGHEST, max(LOWEST, value))
     if state.question is None or value == state.question.threshold:
         return state
     question = replace(state.question, threshold=value, suggest=False)
@@ -72,7 +75,8 @@ def suggest(state: State) -> State:
 
 
 def min_reliability(state: State, value: float) -> State:
-    """Another R that what is selected by the prompts must have."""
+    """Another R, in 0..1, that what is selected by the prompts must have."""
+    value = min(1.0, max(0.0, value))
     if state.question is None or value == state.question.min_reliability:
         return state
     return replace(state, question=replace(state.question, min_reliability=value), did=f"Reliability {value:.2g}")
@@ -115,7 +119,7 @@ def click(state: State, weights: Float[Tensor, " n"], mode: Mode = "select") -> 
     """Selects the connected object under a click, adds it, or takes it away; see `Space.object_at`.
 
     Args:
-        weights: of the Gaussians on the ray, for instance by `core.picking.ray_weights`.
+        weights: of the Gaussians on the ray, for instance by `raster.picking.ray_weights`.
     """
     gaussian = met(state, weights)
     found = state.space.object_at(gaussian, state.selection, refined=state.refined)

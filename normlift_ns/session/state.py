@@ -10,7 +10,7 @@ from torch import Tensor
 
 from normlift_ns.asking import Answer
 from normlift_ns.question import Question
-from normlift_ns.session.prompts import Prompt
+from normlift_ns.session.prompts import Prompt, join_prompts
 from normlift_ns.session.space import Box, Space
 
 POOR = 0.6
@@ -69,6 +69,19 @@ class State:
     def drawn(self) -> Bool[Tensor, " n"]:
         """Everything that is not hidden."""
         return ~self.space.none() if self.hidden is None else ~self.hidden
+
+    @property
+    def by_hand(self) -> str:
+        """What to say after the number of selected Gaussians where prompts do not select; empty: they do."""
+        return "" if self.from_answer else ", by hand"
+
+    @property
+    def name(self) -> str:
+        """What a file of the selection is called: the prompts that select, or where none does "selection"."""
+        if self.question is None or not self.from_answer:
+            return "selection"
+        texts = self.question.texts
+        return join_prompts(texts if self.shown is None else texts[self.shown : self.shown + 1])
 
     @property
     def refined(self) -> bool:

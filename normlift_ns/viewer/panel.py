@@ -7,6 +7,7 @@ from typing import Any
 
 from normlift_ns.asking import Answer
 from normlift_ns.errors import InputError
+from normlift_ns.session.actions import HIGHEST, LOWEST
 from normlift_ns.session.colours import prompt_colours
 from normlift_ns.session.space import Box
 from normlift_ns.session.state import POOR, State
@@ -43,7 +44,7 @@ class Panel:
             "shown", gui.add_dropdown("Prompt", (ALL,), initial_value=ALL, hint="Whose selection counts.")
         )
         self.threshold = self._slider(
-            "threshold", "Threshold", -0.2, 1.0, 0.005, 0.5, "Relevancy above which to select."
+            "threshold", "Threshold", LOWEST, HIGHEST, 0.005, 0.5, "Relevancy above which to select."
         )
         self._button("Suggested", "The threshold that the histogram suggests; it is the dashed line in it.", "gray")
         self.histograms = gui.add_markdown("")
@@ -117,7 +118,7 @@ class Panel:
             self.shown.options = options
         self.set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
         if state.question is not None:
-            self.set("threshold", self.threshold, min(1.0, max(-0.2, state.question.threshold)))
+            self.set("threshold", self.threshold, min(HIGHEST, max(LOWEST, state.question.threshold)))
             self.set("min_reliability", self.sure, state.question.min_reliability)
         self.set("look", self.look, state.look)
         self.set("resize", self.steps, state.steps)
@@ -181,7 +182,7 @@ def status(state: State, message: str, busy: str, drawable: int) -> str:
         return "\n\n".join(lines) or "Type what to look for, then press Ask or Enter."
     count = int(state.selection.sum())
     why = "" if drawable == count else f" ({drawable:,} of them are drawn: others are too faint, hidden or left out)"
-    lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{why}")
+    lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand}{why}")
     if state.answer is not None:
         lines.append("\n".join(_rows(state, state.answer)))
     if state.remark:
@@ -192,7 +193,7 @@ def status(state: State, message: str, busy: str, drawable: int) -> str:
 def _rows(state: State, answer: Answer) -> list[str]:
     colours: Mapping[str, Any] = dict(zip(answer.texts, prompt_colours(answer.texts)))
     counts = dict(zip(answer.texts, answer.selected.sum(dim=0).tolist()))
-    lines = ["| | prompt | selected |", "|---|---|---|"]
+    lines = ["| | prompt | found |", "|---|---|---|"]
     for prompt in state.prompts[:20]:
         name = as_text(clipped(prompt.text, 40))
         if prompt.text in counts and not prompt.problem:

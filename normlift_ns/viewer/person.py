@@ -146,7 +146,7 @@ class Person:
             self._panel.ask.disabled = False
             self._tell("")
         elif name == "Download selection":
-            self._download(now.selection, join_prompts([row.text for row in now.prompts]) or "selection")
+            self._download(now.selection, now.name)
         elif name == "Save prompts in run":
             self._tell(self._run.save(now.question))
         elif name == "Link":

@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float
 
 from normlift_ns.asking import Answer
 from normlift_ns.core.files import file_name
-from normlift_ns.core.picking import ray_weights
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
 from normlift_ns.insight.floaters import find_floaters
 from normlift_ns.question import Question
+from normlift_ns.raster.picking import ray_weights
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.runs.question import load_question, save_question
 from normlift_ns.runs.splats import write_splats

@@ -186,7 +186,12 @@ class Monkey:
                  self._reload, self._reopen, self._resize, self._wait)  # fmt: skip
         (deed,) = chance.choices(deeds, (34, 14, 7, 5, 5, 14, 6, 8, 2, 1, 1, 3))
         self.deeds.append(f"{who} {deed.__name__[1:]}")
-        self.deeds[-1] += f" {deed(who, chance)}"
+        try:
+            self.deeds[-1] += f" {deed(who, chance)}"
+        except TimeoutError as error:
+            raise AssertionError(
+                f"{self.deeds[-1]}: {error}\nthe server's threads:\n{self._server.threads()}"
+            ) from error
         self.check()
 
     def kill(self) -> None:

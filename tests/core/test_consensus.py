@@ -360,7 +360,7 @@ def test_refusals(unchecked):
         ({"level": torch.zeros(3, dtype=torch.int64)}, "level must have"),
         ({"power": -1.0}, "power must be"),
         ({"power": float("nan")}, "power must be"),
-        ({"sample": 0}, "sample >= 1"),
+        ({"sample": 0}, "sample must be a whole number >= 1"),
     ):
         with pytest.raises(InputError, match=message):
             consensus(evidence, **{"features": features, **arguments})

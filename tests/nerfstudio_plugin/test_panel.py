@@ -641,6 +641,29 @@ def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel, pip
     assert not panel._widgets.cancel.visible
 
 
+def test_a_browser_that_goes_while_another_one_presses_stops_nobody(panel, opened) -> None:
+    """viser tells that it is gone under the lock that `get_clients` takes, which every picture needs."""
+    server, browser, held = opened[1].viser_server, Browser(3), Event()
+    ask(panel, "left")
+    panel.act("More like this", client=browser)
+
+    def go() -> None:
+        with server._client_lock:
+            held.set()
+            time.sleep(0.5)  # meanwhile the other one has the panel's lock, and waits for this one
+            server._client_disconnect_cb[-1](browser)
+
+    going, pressing = Thread(target=go, daemon=True), Thread(target=lambda: panel.act("Hide"), daemon=True)
+    going.start()
+    assert held.wait(10)
+    pressing.start()
+    for thread in (going, pressing):
+        thread.join(timeout=20)
+        assert not thread.is_alive()
+    until(lambda: not panel._clicks.armed)
+    panel.act("Undo")
+
+
 def test_objects_are_selected_added_and_taken_away_by_clicks(panel, pipeline, opened) -> None:
     browser, event = Browser(), ray(pipeline, opened)
     panel.act("Select", client=browser)

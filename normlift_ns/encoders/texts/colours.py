@@ -183,5 +183,5 @@ def _unknown(prompt: str) -> str:
     shown = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
         f"text {prompt!r} contains no colour name; the colour encoder knows the names of the XKCD colour survey only, "
-        f"such as {shown}: use one of them, or --encoder open_clip for other words"
+        f"such as {shown}: use one of them, or lift with --encoder open_clip for other words"
     )
