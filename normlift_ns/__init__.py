@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from normlift_ns.options import RefineConfig as RefineConfig
     from normlift_ns.options import SourceOptions as SourceOptions
     from normlift_ns.options import SplatOptions as SplatOptions
+    from normlift_ns.raster.contributors import Contributors as Contributors
+    from normlift_ns.raster.contributors import contributors as contributors
     from normlift_ns.raster.rasterize import rasterize_evidence as rasterize_evidence
     from normlift_ns.raster.rasterize import render as render
     from normlift_ns.raster.settings import RasterSettings as RasterSettings
@@ -76,6 +78,7 @@ _HOMES = {
         "SourceOptions",
         "SplatOptions",
     ),
+    "raster.contributors": ("Contributors", "contributors"),
     "raster.rasterize": ("rasterize_evidence", "render"),
     "raster.settings": ("RasterSettings",),
     "scenes.opening": ("open_splat",),

@@ -1,0 +1,81 @@
+"""Which Gaussians make up a pixel: against the Python loops, the picture and the evidence."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Contributors, contributors, rasterize_evidence, render
+from tests.raster.oracle import compositing_matrix
+from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
+
+BACKENDS = ["torch", "numba"]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
+
+
+def some_pixels(count: int, width: int, height: int, seed: int) -> torch.Tensor:
+    return (torch.rand(count, 2, generator=generator(seed)) * torch.tensor([width, height])).long()
+
+
+def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
+    """[P, N]."""
+    pixel = torch.repeat_interleave(torch.arange(len(found.offsets) - 1), found.offsets.diff().cpu())
+    full = torch.zeros(len(found.offsets) - 1, num_gaussians, dtype=torch.float64)
+    full[pixel, found.gaussian.cpu()] = found.weight.double().cpu()
+    return full
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 2**31), count=st.integers(0, 40), backend=st.sampled_from(BACKENDS), blurred=st.booleans())
+def test_they_are_those_of_the_python_loops(seed, count, backend, blurred):
+    scene, camera = random_scene(40, seed=seed, size=0.4), orbit_camera(seed % 7, width=37, height=21)
+    pixels = some_pixels(count, 37, 21, seed)
+    mode = "antialiased" if blurred else "classic"
+    found = contributors(scene, camera, pixels, backend=backend, rasterize_mode=mode)
+    expected = torch.from_numpy(compositing_matrix(scene, camera, blurred))[pixels[:, 1], pixels[:, 0]]
+    assert torch.allclose(matrix(found, 40), expected, rtol=0, atol=1e-12)
+    assert len(found.gaussian) == int((expected > 0).sum())
+    depth = scene.means @ camera.world_to_camera[2, :3]
+    for start, stop in zip(found.offsets[:-1].tolist(), found.offsets[1:].tolist()):
+        assert (depth[found.gaussian[start:stop]].diff() >= 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_picture_and_evidence_are_made_of_them(device):
+    scene = random_scene(300, seed=3, size=0.3, dtype=torch.float32).to(device)
+    camera = orbit_camera(1.0, width=50, height=40)
+    y, x = torch.meshgrid(torch.arange(40), torch.arange(50), indexing="ij")
+    found = contributors(scene, camera, torch.stack([x, y], dim=2).view(-1, 2))
+    full = matrix(found, 300)
+    values = torch.rand(300, 3, generator=generator(1)).to(device)
+    image, alpha = render(scene, camera, values)
+    assert (full @ values.double().cpu() - image.double().cpu().view(-1, 3)).abs().max() < 2e-6
+    assert (full.sum(1) - alpha.double().cpu().flatten()).abs().max() < 2e-6
+    assert alpha.max() > 0.9
+    labels = random_labels(camera, 5, seed=2)
+    sums = dense(rasterize_evidence(scene, [camera], [labels], num_regions=[5]).rows, 5).double().cpu()
+    onehot = torch.nn.functional.one_hot(labels.long().flatten() % 6, 6)[:, :5].double()
+    assert (full.T @ onehot - sums).abs().max() < 1e-5 * sums.max()
+
+
+def test_a_pixel_named_twice_is_answered_twice():
+    scene, camera = random_scene(60, seed=5, size=0.5), orbit_camera(0.2, width=20, height=20)
+    found = contributors(scene, camera, torch.tensor([[10, 9], [3, 4], [10, 9]]))
+    parts = [x.split(found.offsets.diff().tolist()) for x in (found.gaussian, found.weight)]
+    for part in parts:
+        assert torch.equal(part[0], part[2])
+    assert len(parts[0][0]) > 0
+
+
+@pytest.mark.parametrize(
+    ("pixels", "told"),
+    [
+        (torch.tensor([[0, 0], [20, 3]]), r"pixels\[1\] is \(20, 3\), but the camera has 20 columns and 10 rows"),
+        (torch.tensor([[0, -1]]), r"pixels\[0\] is \(0, -1\)"),
+        (torch.tensor([[0.5, 1.0]]), r"whole numbers \[P, 2\], \(column, row\), got torch.float32 \(1, 2\)"),
+        (torch.tensor([1, 2]), r"got torch.int64 \(2,\)"),
+    ],
+)  # fmt: skip
+def test_other_pixels_are_refused(pixels, told, unchecked):
+    with pytest.raises(ValueError, match=told):
+        contributors(random_scene(5), orbit_camera(0.0, width=20, height=10), pixels)
