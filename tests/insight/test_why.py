@@ -143,3 +143,10 @@ def test_an_outline_lies_within_and_around_its_region():
     assert (shown[75, 200] == 100).all()
     assert (shown[10, 10] == 45).all()
     assert torch.equal(outlined(image, masks[:0]), torch.full_like(image, 45))
+
+
+def test_one_photograph_agrees_with_nobody():
+    entries = Entries(torch.tensor([0, 0]), torch.tensor([1, 2]), torch.tensor([0.3, 0.7]), (2,))
+    features = torch.tensor([[0.6, 0.8], [1.0, 0.0]])
+    why = explain_selection(Evidence.from_entries([entries], 1), features, torch.ones(1, dtype=torch.bool))
+    assert why.words == "Only one photograph shows it, so that nothing tells whether others would agree."

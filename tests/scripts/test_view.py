@@ -6,8 +6,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from normlift_ns.scripts import view
 
 _ROOT = str(Path(__file__).parents[2])
 _PROGRAM = "from normlift_ns.scripts.view import main; main()"
@@ -45,3 +48,18 @@ def test_mistakes_are_told_before_anything_is_loaded(flags, message, tmp_path):
     assert done.returncode == 1
     assert message in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
+    door = SimpleNamespace(server=SimpleNamespace(port=7010))
+    monkeypatch.setattr("normlift_ns.viewer.serving.door.Door", lambda host, port: door)
+    monkeypatch.setattr(view, "check_lifted", lambda *_: None)
+    monkeypatch.setattr(view.NormLiftView, "open", interrupted)
+    for port in (7008, 7010):
+        view.NormLiftView(Path("config.yml"), port=port).main()
+    told = ["Port 7008 is taken.", "The viewer is at http://127.0.0.1:7010 (Ctrl-C ends it)", "Stopped."]
+    assert capsys.readouterr().out.splitlines() == [*told, *told[1:]]
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt

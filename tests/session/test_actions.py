@@ -227,3 +227,19 @@ def test_late_answers_do_not_count():
     assert not turns.finish(second)
     assert not turns.cancel()
     assert turns.busy == ""
+
+
+def test_a_file_is_called_after_what_selects_and_what_is_selected_by_hand_says_so():
+    state = asked("red, zebra, blue")
+    assert (state.name, state.by_hand) == ("red, blue", "")
+    assert actions.show(state, 1).name == "blue"
+    floating = actions.select_floaters(state, rows(3))
+    assert (floating.name, floating.by_hand) == ("selection", ", by hand")
+    assert State(SPACE).name == "selection"
+
+
+@pytest.mark.parametrize(("typed", "kept"), [(99.0, 1.0), (-5.0, -0.2), (0.3, 0.3)])
+def test_numbers_beyond_a_slider_become_its_end(typed, kept):
+    state = asked("red")
+    assert actions.threshold(state, typed).question.threshold == kept
+    assert actions.min_reliability(state, typed).question.min_reliability == max(0.0, kept)
