@@ -69,7 +69,7 @@ def _of_slurm(environment: Mapping[str, str]) -> Shard:
     if rest != 0 or not 0 <= index < count:
         raise InputError(
             f"{_ARRAY} is {task}, which is none of {count} tasks without gaps from {environment.get(_LEAST, '0')} on. "
-            "Submit an array without gaps, such as sbatch --array=0-7; or give --shard none, by which workers claim "
+            "Submit an array without gaps, such as sbatch -a 0-7; or give --shard none, by which workers claim "
             "captures in a folder that they share."
         )
     return Shard(index, count)
