@@ -52,8 +52,9 @@ class NormLiftBatch:
         captures = [capture for position, capture in enumerate(listed) if part.holds(position)]
         folder = self.results or self.captures.with_name(f"{self.captures.stem}_batch")
         writable_folder(folder, "--results")
+        number = f"{len(listed)} capture{'' if len(listed) == 1 else 's'}"
         which = "" if part.count == 1 else f", {len(captures)} of them in part {part.index + 1} of {part.count}"
-        say(f"{len(listed)} captures in {self.captures}{which}; results, logs and claims in {folder}")
+        say(f"{number} in {self.captures}{which}; results, logs and claims in {folder}")
         outcomes = work(captures, folder, self.patience, say=say)
         if len(captures) > 0:
             CONSOLE.print(summary(captures, outcomes))

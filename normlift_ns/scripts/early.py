@@ -178,9 +178,7 @@ def check_new_run(
     writable_folder(run_dir.parent, "--output-dir")
 
 
-def new_run_place(
-    config: Path | None, splat: SplatOptions, output_dir: Path | None
-) -> tuple[str | None, Path | None]:
+def new_run_place(config: Path | None, splat: SplatOptions, output_dir: Path | None) -> tuple[str | None, Path | None]:
     """Name of the capture and folder above its runs, as `run_directory` takes them; None where they show only when the
     capture is opened.
 

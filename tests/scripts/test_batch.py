@@ -12,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import count
+from itertools import count, permutations
 from pathlib import Path
 
 import pytest
@@ -23,8 +23,8 @@ from normlift_ns.errors import InputError
 from normlift_ns.front_door import open_run
 from normlift_ns.scripts import batch
 from normlift_ns.scripts.captures.listed import Capture, is_lifted, read_captures
-from normlift_ns.scripts.captures.outcomes import Outcome, latest, worst
-from normlift_ns.scripts.captures.process import run_process
+from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest, worst
+from normlift_ns.scripts.captures.process import run_program
 from normlift_ns.scripts.captures.work import work
 from tests.processes import FORK, killed_at
 from tests.scripts.conftest import SMALL, run_entry, said
@@ -95,7 +95,7 @@ def test_twenty_captures_are_lifted_once_though_a_worker_is_killed(seed, tmp_pat
     time.sleep(random.Random(seed).uniform(0.2, 2.0))
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
-    other.join(60)
+    other.join(300)
     assert other.exitcode == 0
     made.check_lifted_once()
     assert sum(made.begun().values()) <= 21  # what the killed one had at hand was begun again
@@ -129,7 +129,8 @@ def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
     print(f"killed before accesses up to {step}, in the states {killed}")
     assert step > 24
     one, done = State(1, None), State(1, "done")
-    assert {(), (one,), (done,), (done, one), (done, done)} >= killed >= {(one,), (done,)}
+    states = {(), (one,), (done,), (done, one), (done, done)}
+    assert killed <= states and (killed == states or stride > 1)
 
 
 def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
@@ -146,8 +147,8 @@ def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
     wait_for(lambda: not alive(pid))
 
 
-def wait_for(done: Callable[[], bool]) -> None:
-    end = time.monotonic() + 30
+def wait_for(done: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -199,14 +200,14 @@ def test_an_interrupted_capture_is_free_at_once(tmp_path):
     worker.start()
     wait_for(lambda: made.begun() != {})
     os.kill(worker.pid, signal.SIGINT)
-    worker.join(30)
+    worker.join(120)
     assert worker.exitcode == 130
-    ((key, state),) = read_states(made.results / "claims").items()
+    (state,) = read_states(made.results / "claims").values()
     assert (state.number, state.outcome) == (1, "left")
     made.configs[0].with_name("what.txt").write_text("0")
     begun = time.monotonic()
     made.work(patience=600.0)
-    assert time.monotonic() - begun < 30 and made.states() == ["done"]
+    assert time.monotonic() - begun < 120 and made.states() == ["done"]
 
 
 def interruptible(made: Batch) -> None:
@@ -220,8 +221,8 @@ def interruptible(made: Batch) -> None:
 def test_who_was_taken_for_dead_ends_its_process_and_writes_nothing(tmp_path):
     begun, pid = time.monotonic(), tmp_path / "pid.txt"
     program = f"import os, pathlib, time; pathlib.Path({str(pid)!r}).write_text(str(os.getpid())); time.sleep(60)"
-    code = run_process([sys.executable, "-S", "-c", program], tmp_path / "log", lambda: not pid.exists(), 0.05)
-    assert code is None and time.monotonic() - begun < 30
+    code = run_program([sys.executable, "-S", "-c", program], tmp_path / "log", lambda: not pid.exists(), 0.05)
+    assert code is None and time.monotonic() - begun < 50
     assert not alive(int(pid.read_text()))
     made = Batch(tmp_path / "batch", ["60"])
     worker = made.start()
@@ -239,8 +240,9 @@ def test_who_was_taken_for_dead_ends_its_process_and_writes_nothing(tmp_path):
 
 def test_lines_of_the_list(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text = '\ufeff# a list\n\na/config.yml\n  "b c.ply" --colmap "b c" --beta 2  \n--load-gsplat x#1.pt --transforms t.json\nX.PLY\n'
-    Path("list.txt").write_text(text, "utf8")
+    lines = ["\ufeff# a list", "", "a/config.yml", '  "b c.ply" --colmap "b c" --beta 2  ']
+    lines += ["--load-gsplat x#1.pt --transforms t.json", "X.PLY"]
+    Path("list.txt").write_text("\r\n".join(lines), "utf8")
     found = read_captures(Path("list.txt"), ("--encoder", "colour"))
     own = [capture.words[2:-2] for capture in found]
     assert own == [
@@ -327,7 +329,7 @@ def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsy
 
 
 def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("normlift_ns.scripts.captures.work.run_process", lambda *_: 0)
+    monkeypatch.setattr("normlift_ns.scripts.captures.work.run_program", lambda *_: 0)
     made = Batch(tmp_path, ["0"] * 5)
     for task in range(3):
         for name, value in {"ID": task + 4, "COUNT": 3, "MIN": 4, "MAX": 6, "STEP": 1}.items():
@@ -380,7 +382,8 @@ def test_twenty_real_captures_by_two_workers_one_of_them_killed(tmp_path):
     victim, other = (
         subprocess.Popen(words, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)
     )
-    time.sleep(random.Random(1).uniform(10, 60))
+    wait_for(lambda: any(tmp_path.glob(f"list_batch/*_{victim.pid}_*.jsonl")), seconds=1200)
+    time.sleep(random.Random(1).uniform(0, 10))  # in its second capture, or at the end of it
     victim.kill()
     victim.communicate()
     printed = other.communicate()[0]
@@ -394,3 +397,16 @@ def test_twenty_real_captures_by_two_workers_one_of_them_killed(tmp_path):
     assert len(answers) == 20 and len(peaks) == 1  # copies of one capture
     done = Counter(line.key for line in read_lines(tmp_path / "list_batch", Outcome) if line.state == "done")
     assert 19 <= len(done) <= 20 and set(done.values()) == {1}
+
+
+def test_the_last_attempt_counts_whatever_the_clocks_say():
+    def outcome(attempt: int, state: OutcomeState, clock: float) -> Outcome:
+        return Outcome("fox", "a", attempt, state, 1.0, "", 0, None, "w", clock)
+
+    failed, done, found = outcome(1, "failed", 9e9), outcome(2, "done", 5.0), outcome(3, "skipped", 1.0)
+    broken = outcome(4, "failed", 0.0)
+    for order in permutations([failed, done, found]):
+        assert latest(order) == {"a": done}
+    for order in permutations([failed, found]):
+        assert latest(order) == {"a": found}
+    assert latest([broken, done, found]) == {"a": broken}

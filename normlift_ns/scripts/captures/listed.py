@@ -60,8 +60,8 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
         raise InputError(f"After --: {error}") from None
     if (given := next((name for name in _source_names() if getattr(common, name) is not None), None)) is not None:
         raise InputError(
-            f"--{given.replace('_', '-')} stands after --, where it would hold for every capture. Write it into {path}, "
-            "one line per capture."
+            f"--{given.replace('_', '-')} stands after --, where it would hold for every capture. Write it into "
+            f"{path}, one line per capture."
         )
     try:
         text = path.read_text("utf-8-sig")
@@ -126,14 +126,13 @@ def _capture(line: str, options: Sequence[str], common: NormLift, where: str) ->
         first, *rest = shlex.split(line)
     except ValueError as error:
         raise InputError(f"{where}: {visible(line)} is not quoted as in a shell ({error}). Close the quotes.") from None
-    if first.startswith("--"):
-        own = [first, *rest]
-    else:
-        source = _SOURCES.get(Path(first).suffix.lower(), "load_config")
-        own = [f"--{source.replace('_', '-')}", first, *rest]
+    source = None if first.startswith("--") else _SOURCES.get(Path(first).suffix.lower(), "load_config")
+    own = [first, *rest] if source is None else [f"--{source.replace('_', '-')}", first, *rest]
     try:
-        alone = len(own) == 2 and not first.startswith("--")  # most lists have no options, and tyro takes its time
-        command = replace(common, **{source: Path(first)}) if alone else _read([*options, *own])
+        if source is None or len(rest) > 0:
+            command = _read([*options, *own])
+        else:  # most lists have no options, and tyro takes its time
+            command = replace(common, **{source: Path(first)})
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     key = identity(command)

@@ -21,6 +21,8 @@ class Outcome:
     capture: str
     """Its line in the list."""
     key: str
+    attempt: int
+    """From 1, whichever worker made it."""
     state: OutcomeState
     """skipped: it was lifted already."""
     seconds: float
@@ -29,21 +31,22 @@ class Outcome:
     code: int
     """Exit code of its process; 128 and the number of a signal that ended it."""
     run: str | None
-    """Directory of the lifted run, where it is known."""
+    """Directory of the lifted run; None where it failed, or is not known."""
     worker: str
     time: float
-    """When it ended, in seconds since 1970."""
+    """When it ended, in seconds since 1970 by the clock of the worker."""
 
 
 def latest(outcomes: Iterable[Outcome]) -> dict[str, Outcome]:
-    """The outcome of each capture by its key: the last one, but for one that found the capture lifted already.
+    """The outcome of each capture by its key: of the last attempt, but for one that found it lifted by one of these.
 
-    >>> done, found = (Outcome("fox", "a", state, 1.0, "", 0, None, "", t) for t, state in enumerate(("done", "skipped")))
+    >>> done = Outcome("fox", "a", 1, "done", 41.0, "", code=0, run=None, worker="one", time=1.0)
+    >>> found = Outcome("fox", "a", 2, "skipped", 0.0, "", code=0, run=None, worker="two", time=2.0)
     >>> latest([found, done])["a"].state
     'done'
     """
     found: dict[str, Outcome] = {}
-    for outcome in sorted(outcomes, key=lambda outcome: outcome.time):
+    for outcome in sorted(outcomes, key=lambda outcome: (outcome.attempt, outcome.time)):
         before = found.get(outcome.key)
         if before is None or outcome.state != "skipped" or before.state != "done":
             found[outcome.key] = outcome

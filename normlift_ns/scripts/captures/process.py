@@ -20,7 +20,7 @@ _DIE_WITH_PARENT = 1
 """PR_SET_PDEATHSIG of Linux."""
 
 
-def run_process(words: Sequence[str], log: Path, beat: Callable[[], bool], every: float) -> int | None:
+def run_program(words: Sequence[str], log: Path, beat: Callable[[], bool], every: float) -> int | None:
     """Runs a program, with all that it prints in a new file; returns its exit code, or minus the signal that ended it.
 
     On Linux it ends with this process, however that ends; elsewhere only Ctrl-C and SIGTERM reach it.
@@ -31,14 +31,17 @@ def run_process(words: Sequence[str], log: Path, beat: Callable[[], bool], every
         OSError: the program cannot be started, or the file not be written.
     """
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # its last line is its last word
-    with log.open("wb") as output, subprocess.Popen(
-        words,
-        stdin=subprocess.DEVNULL,
-        stdout=output,
-        stderr=subprocess.STDOUT,
-        env=environment,
-        preexec_fn=_bound(),
-    ) as process:
+    with (
+        log.open("wb") as output,
+        subprocess.Popen(
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            preexec_fn=_bound(),  # noqa: PLW1509 (workers have no threads)
+        ) as process,
+    ):
         try:
             while True:
                 try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from normlift_ns.errors import InputError
 from normlift_ns.ranges import shown
@@ -13,7 +13,8 @@ _MOST = 10**6
 _ARRAY, _COUNT, _LEAST, _STEP = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "COUNT", "MIN", "STEP"))
 
 
-class Shard(NamedTuple):
+@dataclass(frozen=True)
+class Shard:
     """One part of a list in so many parts."""
 
     index: int

@@ -16,7 +16,7 @@ from normlift_ns.core.files import file_name
 from normlift_ns.errors import InputError
 from normlift_ns.scripts.captures.listed import Capture, is_lifted
 from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest
-from normlift_ns.scripts.captures.process import LIFT, run_process, why
+from normlift_ns.scripts.captures.process import LIFT, run_program, why
 
 CLAIMS, LOGS = "claims", "logs"
 """Folders in that of the results."""
@@ -47,8 +47,8 @@ def work(
     missing = {capture.key: capture for capture in captures if not _is_complete(capture, before)}
     for claim in claims(folder / CLAIMS, list(missing), at_start, patience):
         capture = missing[claim.key]
-        say(f"{capture.name} …")
         try:
+            say(f"{capture.name} …")
             outcome = _outcome(capture, claim, folder, patience, worker, program)
         except BaseException:
             end(claim, LEFT)
@@ -81,15 +81,15 @@ def _outcome(
     begun, log = time.monotonic(), folder / LOGS / f"{claim.path.name}.log"
 
     def told(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
-        run = None if capture.run is None else str(capture.run)
-        seconds = time.monotonic() - begun
-        return Outcome(capture.name, capture.key, state, seconds, message, code, run, worker, time.time())
+        run = None if capture.run is None or state == "failed" else str(capture.run)
+        seconds, now = time.monotonic() - begun, time.time()
+        return Outcome(capture.name, capture.key, claim.number, state, seconds, message, code, run, worker, now)
 
     try:
         if capture.run is not None and is_lifted(capture.run):
             return told("skipped")
         beats = count(1)
-        code = run_process([*program, *capture.words], log, lambda: beat(claim, next(beats)), patience / BEATS)
+        code = run_program([*program, *capture.words], log, lambda: beat(claim, next(beats)), patience / BEATS)
         if code is None:
             return None
         if code == 0:
