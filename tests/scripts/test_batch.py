@@ -65,17 +65,17 @@ class Batch:
         file = self.outputs.parent / "begun.txt"
         return Counter(line.split()[0] for line in file.read_text().splitlines()) if file.exists() else Counter()
 
-    def states(self) -> list[str]:
+    def states(self, *options: str) -> list[str]:
         """The last outcomes, in the order of the list."""
         found = latest(read_lines(self.results, Outcome))
-        return [found[capture.key].state for capture in read_captures(self.list, ())]
+        return [found[capture.key].state for capture in read_captures(self.list, options)]
 
-    def check_lifted_once(self) -> None:
+    def check_lifted_once(self, *options: str) -> None:
         runs = [sorted(config.parents[2].glob("normlift/batch_*")) for config in self.configs]
         assert [len(found) for found in runs] == [1] * len(runs)
         assert all(is_lifted(found[0]) for found in runs)
         lines = read_lines(self.results, Outcome)
-        assert set(self.states()) <= {"done", "skipped"}
+        assert set(self.states(*options)) <= {"done", "skipped"}
         done = Counter(line.key for line in lines if line.state == "done")
         assert set(done.values()) <= {1}
         known = {line.key for line in lines}  # a worker may be killed between its line and the end of its claim

@@ -39,6 +39,7 @@ def test_the_recipe_for_ray(tmp_path, monkeypatch, capsys):
         exec(compile(recipe, "docs/scale.md", "exec"), {"__name__": "recipe"})
     finally:
         ray.shutdown()
-    assert capsys.readouterr().out.splitlines()[-1] == "0"
-    made.check_lifted_once()
-    assert set(made.states()) == {"done"} and sum(made.begun().values()) == 12
+    assert "0" in capsys.readouterr().out.splitlines()  # among what the workers say
+    options = ("--regions", "sam")
+    made.check_lifted_once(*options)
+    assert set(made.states(*options)) == {"done"} and sum(made.begun().values()) == 12
