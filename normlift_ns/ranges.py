@@ -83,6 +83,8 @@ RANGES: dict[str, Range] = {
     # the viewer
     "port": Range(1, 65535, "a number of a port, 1..65535"),
     "most_drawn": _at_least(1, 10**7),
+    # many captures
+    "patience": Range(1.0, 86400.0, "in 1..86400"),
     # the demo
     "num_gaussians": _at_least(1, 10**8),
     "views": _at_least(3, 10**5),

@@ -22,6 +22,7 @@ from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOpti
 from normlift_ns.objects import connected_components
 from normlift_ns.options import AskOptions, LiftOptions, RefineConfig, SourceOptions, SplatOptions
 from normlift_ns.ranges import LONGEST_TEXT, RANGES, check_device, check_number, check_texts, named_as_flags
+from normlift_ns.scripts.batch import NormLiftBatch
 from normlift_ns.scripts.demo import Demo
 from normlift_ns.scripts.evaluate import NormLiftEval
 from normlift_ns.scripts.export import NormLiftExport
@@ -32,6 +33,7 @@ from normlift_ns.scripts.view import NormLiftView
 OPTIONS: dict[type, dict[str, Any]] = {
     **{cls: {} for cls in (LiftOptions, RefineConfig, SourceOptions, SplatOptions, AskOptions, NormLift, Demo)},
     **{cls: {} for cls in (ScannetOptions, LerfOptions, MaskOptions)},
+    NormLiftBatch: {"captures": Path("captures.txt")},
     NormLiftQuery: {"load_config": Path("config.yml"), "text": ("red",)},
     NormLiftExport: {"load_config": Path("config.yml"), "output_dir": Path("out")},
     NormLiftView: {"load_config": Path("config.yml")},

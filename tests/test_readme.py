@@ -12,6 +12,7 @@ import torch
 from normlift_ns.core.refine import RefineConfig
 from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.scripts import lift
+from normlift_ns.scripts.batch import NormLiftBatch
 from normlift_ns.scripts.query import NormLiftQuery
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -52,8 +53,11 @@ TABLE = README.split("## Options of ns-normlift")[1].split("## Limits")[0]
 SPLATS = "".join(re.findall(r"`ns-normlift [^`]*`", (ROOT / "docs" / "splats.md").read_text()))
 
 
-@pytest.mark.parametrize("text", [TABLE, COMMANDS, FRONT_ENDS, SPLATS])
+SCALE = (ROOT / "docs" / "scale.md").read_text()
+
+
+@pytest.mark.parametrize("text", [TABLE, COMMANDS, FRONT_ENDS, SPLATS, SCALE])
 def test_options_that_are_shown_exist(text):
     named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", text)} - {"help"}
-    commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, SplatOptions, NormLiftQuery)
+    commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, SplatOptions, NormLiftQuery, NormLiftBatch)
     assert named <= {f.name for cls in commands for f in fields(cls)}

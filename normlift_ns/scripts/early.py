@@ -169,21 +169,28 @@ def check_new_run(
 ) -> None:
     """The place of a new run: it can be written, and no other run is there."""
     writable_folder(output_dir, "--output-dir")
-    if config is not None:
-        seen = glance(config)
-        name, outputs = seen.experiment, output_dir or seen.output_dir
-    else:
-        cameras = (splat.colmap or splat.transforms or Path()).absolute()
-        name, outputs = (
-            (cameras.parent if cameras.suffix == ".json" else cameras).name or "splat",
-            output_dir or Path("outputs"),
-        )
+    name, outputs = new_run_place(config, splat, output_dir)
     run_dir = run_directory(outputs or Path(), name or "run", timestamp)
     if name is None or outputs is None:
         return
     if timestamp is not None:
         refuse_existing_run(run_dir, overwrite)
     writable_folder(run_dir.parent, "--output-dir")
+
+
+def new_run_place(config: Path | None, splat: SplatOptions, output_dir: Path | None) -> tuple[str | None, Path | None]:
+    """Name of the capture and folder above its runs, as `run_directory` takes them; None where they show only when the
+    capture is opened.
+
+    Raises:
+        InputError, OSError: the config cannot be read, or is none.
+    """
+    if config is not None:
+        seen = glance(config)
+        return seen.experiment, output_dir or seen.output_dir
+    cameras = (splat.colmap or splat.transforms or Path()).absolute()
+    name = (cameras.parent if cameras.suffix == ".json" else cameras).name
+    return name or "splat", output_dir or Path("outputs")
 
 
 def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:

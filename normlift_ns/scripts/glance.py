@@ -51,14 +51,19 @@ def glance(config: Path) -> Glance:
     manager = _at(root, "pipeline", "datamanager")
     data = _path(_at(manager, "data")) or _path(_at(manager, "dataparser", "data"))
     outputs = _path(_at(root, "output_dir"))
+    runs = above
+    if above is None and outputs is not None:
+        from normlift_ns.scenes.nerfstudio.config import outputs_of_moved  # noqa: PLC0415 (rarely needed)
+
+        runs = outputs_of_moved(outputs)
     if data is None or outputs is None:
-        return Glance(experiment, above, ())
+        return Glance(experiment, runs, ())
     tail = Path(os.path.normpath(outputs)).parts
     if above is not None and above.parts[-len(tail) :] == tail:  # so the directory of the training is known
         roots = [Path(*above.parts[: -len(tail)]), Path.cwd()]
     else:
         roots = [*(above or Path(os.path.abspath(outputs))).parents, Path.cwd()]
-    return Glance(experiment, above, tuple(dict.fromkeys(Path(os.path.abspath(base / data)) for base in roots)))
+    return Glance(experiment, runs, tuple(dict.fromkeys(Path(os.path.abspath(base / data)) for base in roots)))
 
 
 def _at(node: yaml.Node | None, *keys: str) -> yaml.Node | None:

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, NoReturn, Protocol, TextIO, cast, get_type_hints
+from typing import Annotated, Any, NoReturn, Protocol, TextIO, TypeVar, cast, get_type_hints
 
 import docstring_parser
 import tyro
@@ -40,6 +40,9 @@ class Command(Protocol):
     def main(self) -> object:
         """Does it."""
         ...
+
+
+_Command = TypeVar("_Command", bound=Command)
 
 
 class Terminated(BaseException):
@@ -109,9 +112,20 @@ def _run(command: type[Command]) -> None:
         say(f"normlift_ns {normlift_ns.__version__}")
         return
     tyro.extras.set_accent_color("bright_yellow")
+    read_flags(command, sys.argv[1:]).main()
+
+
+def read_flags(command: type[_Command], words: Sequence[str], name: str | None = None) -> _Command:
+    """A command from the words behind its name.
+
+    Args:
+        name: of the command; None: as this process was started.
+    Raises:
+        SystemExit: words that it does not know, which tyro has told on standard error; or its help, with code 0.
+    """
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
-    words = with_values(sys.argv[1:], switches(command))
-    tyro.cli(flags, args=words, description=summary(command)).main()
+    words = with_values(words, switches(command))
+    return tyro.cli(flags, prog=name, args=words, description=summary(command))
 
 
 def switches(options: Any) -> set[str]:

@@ -39,3 +39,8 @@ def evaluate() -> None:
 def view() -> None:
     """ns-normlift-view"""
     _start("view")
+
+
+def batch() -> None:
+    """ns-normlift-batch"""
+    _start("batch")

@@ -173,7 +173,7 @@ def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(bod
     assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
 
 
-@pytest.mark.parametrize("command", ["lift", "query", "export", "evaluate", "view"])
+@pytest.mark.parametrize("command", ["lift", "query", "export", "evaluate", "view", "batch"])
 def test_ctrl_c_while_a_command_is_loaded(command):
     """Its modules raise what Python raises for Ctrl-C."""
     program = f"""

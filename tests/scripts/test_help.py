@@ -25,6 +25,7 @@ COMMANDS = {
     "export": "ns-normlift-export",
     "eval": "ns-normlift-eval",
     "view": "ns-normlift-view",
+    "batch": "ns-normlift-batch",
 }
 SCRIPTS = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf8"))["project"]["scripts"]
 FOLDER = Path(__file__).with_name("help")
@@ -70,7 +71,7 @@ def test_help_reads_well(name):
         if all(x.startswith(" " * 20) for x in (line, after)):
             assert len(line) + 1 + len(after.split()[0]) > width, (line, after)
     flags = [line.split()[0] for line in lines if line.startswith("--")]
-    assert len(flags) == len(set(flags)) > 5
+    assert len(flags) == len(set(flags)) > (5 if name != "batch" else 2)  # which has ns-normlift's after --
 
 
 @pytest.mark.parametrize("command", COMMANDS.values())

@@ -125,7 +125,7 @@ def locate(config: Any, config_path: Path, data: Path | None = None) -> RunLocat
     """
     run_dir = _absolute(config_path).parent
     above = _without_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
-    output_dir = _here(config.output_dir) if above is None else above
+    output_dir = outputs_of_moved(config.output_dir) if above is None else above
     root = None if above is None else _without_tail(above, Path(os.path.normpath(config.output_dir)))
     if data is not None:
         if not data.exists():
@@ -159,7 +159,7 @@ def stored_data(config: Any) -> Path:
     return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
 
 
-def _here(output_dir: Path) -> Path:
+def outputs_of_moved(output_dir: Path) -> Path:
     """outputs/ of a run that was moved: below the current directory, wherever its config says that it was trained."""
     return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
 

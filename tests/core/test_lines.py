@@ -1,0 +1,47 @@
+"""Lines of JSON by several processes: what is whole is read, whatever a killed one has left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns.core.disk.lines import append_line, read_lines
+
+
+@dataclass(frozen=True)
+class Line:
+    name: str
+    number: float
+
+
+LINES = [Line('fox "\n\u2028 é 🦊', 1.5), Line("", 2.0), Line("}{", -3.0)]
+
+
+@settings(deadline=None)
+@given(st.integers(0, 200))
+def test_torn_lines_are_left_out(tmp_path_factory, cut):
+    folder = tmp_path_factory.mktemp("lines")
+    for line in LINES:
+        append_line(folder / "a.jsonl", line)
+        append_line(folder / "b.jsonl", line)
+    whole = (folder / "a.jsonl").read_bytes()
+    assert whole.count(b"\n") == len(LINES) and read_lines(folder, Line) == LINES * 2
+    (folder / "a.jsonl").write_bytes(whole[:cut])
+    ends = [i for i, byte in enumerate(whole) if byte == ord("\n")]
+    assert read_lines(folder, Line) == LINES[: sum(end <= cut for end in ends)] + LINES
+
+
+@pytest.mark.parametrize(
+    "junk", [b"", b"\n\n", b"\xff\xfe\n", b"null\n", b"[1]\n", b'{"name": 1}\n', b"[" * 100_000 + b"\n", b"\0\n"]
+)
+def test_what_is_no_line_of_that_kind_is_left_out(junk, tmp_path):
+    append_line(tmp_path / "a.jsonl", LINES[0])
+    with (tmp_path / "a.jsonl").open("ab") as file:
+        file.write(junk)
+    append_line(tmp_path / "a.jsonl", LINES[1])
+    (tmp_path / "notes.txt").write_text('{"name": "x", "number": 1}\n')
+    assert read_lines(tmp_path, Line) == LINES[:2]
+    assert read_lines(tmp_path / "nowhere", Line) == []

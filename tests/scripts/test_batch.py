@@ -1,0 +1,412 @@
+"""Many captures by several workers: each is lifted once, whoever dies, and a rerun does only what is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from itertools import count, permutations
+from pathlib import Path
+
+import pytest
+
+from normlift_ns.core.disk.claims import State, claim, read_states
+from normlift_ns.core.disk.lines import read_lines
+from normlift_ns.errors import InputError
+from normlift_ns.front_door import open_run
+from normlift_ns.scripts import batch
+from normlift_ns.scripts.captures.listed import Capture, is_lifted, read_captures
+from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest, worst
+from normlift_ns.scripts.captures.process import run_program
+from normlift_ns.scripts.captures.work import work
+from tests.processes import FORK, killed_at
+from tests.scripts.conftest import SMALL, run_entry, said
+
+STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
+PATIENCE = 1.5
+CONFIG = """experiment_name: {}
+method_name: splatfacto
+timestamp: run
+output_dir: !!python/object/apply:pathlib.PosixPath
+- outputs
+"""
+
+
+class Batch:
+    """Captures that the stand-in lifts, their list, and the folder of the results."""
+
+    def __init__(self, folder: Path, what: Sequence[str]) -> None:
+        self.outputs, self.list, self.results = folder / "outputs", folder / "captures.txt", folder / "captures_batch"
+        names = [f"c{i:02d}" for i in range(len(what))]
+        self.configs = [self.outputs / name / "splatfacto" / "run" / "config.yml" for name in names]
+        for name, config, text in zip(names, self.configs, what):
+            config.parent.mkdir(parents=True)
+            config.write_text(CONFIG.format(name))
+            config.with_name("what.txt").write_text(text)
+        self.list.write_text("# captures\n\n" + "".join(f"{config}\n" for config in self.configs))
+
+    def work(self, *options: str, patience: float = PATIENCE) -> dict[str, Outcome]:
+        return work(read_captures(self.list, options), self.results, patience, program=STAND_IN)
+
+    def start(self) -> FORK.Process:  # type: ignore[name-defined]
+        process = FORK.Process(target=self.work)
+        process.start()
+        return process
+
+    def begun(self) -> Counter[str]:
+        """How often each capture was begun."""
+        file = self.outputs.parent / "begun.txt"
+        return Counter(line.split()[0] for line in file.read_text().splitlines()) if file.exists() else Counter()
+
+    def states(self, *options: str) -> list[str]:
+        """The last outcomes, in the order of the list."""
+        found = latest(read_lines(self.results, Outcome))
+        return [found[capture.key].state for capture in read_captures(self.list, options)]
+
+    def check_lifted_once(self, *options: str) -> None:
+        runs = [sorted(config.parents[2].glob("normlift/batch_*")) for config in self.configs]
+        assert [len(found) for found in runs] == [1] * len(runs)
+        assert all(is_lifted(found[0]) for found in runs)
+        lines = read_lines(self.results, Outcome)
+        assert set(self.states(*options)) <= {"done", "skipped"}
+        done = Counter(line.key for line in lines if line.state == "done")
+        assert set(done.values()) <= {1}
+        known = {line.key for line in lines}  # a worker may be killed between its line and the end of its claim
+        ends = {(state.outcome, key in known) for key, state in read_states(self.results / "claims").items()}
+        assert ends <= {("done", True), ("skipped", True), (None, True)}
+
+
+def alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_twenty_captures_are_lifted_once_though_a_worker_is_killed(seed, tmp_path):
+    made = Batch(tmp_path, ["0.05"] * 20)
+    victim, other = made.start(), made.start()
+    time.sleep(random.Random(seed).uniform(0.2, 2.0))
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.join()
+    other.join(300)
+    assert other.exitcode == 0
+    made.check_lifted_once()
+    assert sum(made.begun().values()) <= 21  # what the killed one had at hand was begun again
+    (torn,) = [path for path in made.results.glob(f"*_{victim.pid}_*")] or [None]
+    if torn is not None:  # as if it had died while it wrote
+        torn.write_bytes(torn.read_bytes()[:-20])
+        made.work()
+        made.check_lifted_once()
+    before = made.begun()
+    made.work()
+    assert made.begun() == before
+
+
+@pytest.mark.parametrize("stride", [pytest.param(4, id="fast"), pytest.param(1, id="slow", marks=pytest.mark.slow)])
+def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
+    """Killed before every n-th of all that its work takes; the next one finishes it."""
+    killed = set()
+    for step in count(1, stride):
+        made = Batch(tmp_path / str(step), ["0"] * 2)
+        captures = read_captures(made.list, ())
+        made.results.mkdir()
+
+        def first(made: Batch = made, captures: Sequence[Capture] = captures) -> None:
+            work(captures, made.results, 0.3, program=STAND_IN)
+
+        if not killed_at(step, first, made.results):
+            break
+        killed.add(tuple(sorted(read_states(made.results / "claims").values(), key=str)))
+        work(captures, made.results, 0.3, program=STAND_IN)
+        made.check_lifted_once()
+    print(f"killed before accesses up to {step}, in the states {killed}")
+    assert step > 24
+    one, done = State(1, None), State(1, "done")
+    states = {(), (one,), (done,), (done, one), (done, done)}
+    assert killed <= states and (killed == states or stride > 1)
+
+
+def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
+    if sys.platform != "linux":
+        pytest.skip("only Linux ends processes with those that started them")
+    made = Batch(tmp_path, ["60"])
+    worker = made.start()
+    begun = tmp_path / "begun.txt"
+    wait_for(lambda: begun.exists() and begun.read_text().endswith("\n"))
+    pid = int(begun.read_text().split()[1])
+    assert alive(pid)
+    os.kill(worker.pid, signal.SIGKILL)
+    worker.join()
+    wait_for(lambda: not alive(pid))
+
+
+def wait_for(done: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
+    made = Batch(tmp_path, ["0", "fail", "crash", "bug", "0"])
+    outcomes = made.work()
+    assert made.states() == ["done", "failed", "failed", "failed", "done"]
+    found = [outcomes[capture.key] for capture in read_captures(made.list, ())]
+    assert [outcome.code for outcome in found] == [0, 1, 128 + signal.SIGSEGV, 70, 0]
+    assert [outcome.message for outcome in found[1:4:2]] == ["the photographs are [/gone]", "This is a bug"]
+    assert "ended by SIGSEGV" in found[2].message and "logs" in found[2].message
+    assert worst(found) == 128 + signal.SIGSEGV and worst(found[:2]) == 1 and worst(found[:1]) == 0
+    for config in made.configs[1:3]:
+        config.with_name("what.txt").write_text("0")
+    made.work()
+    assert made.states() == ["done", "done", "done", "failed", "done"]
+    assert made.begun() == {"c00": 1, "c01": 2, "c02": 2, "c03": 2, "c04": 1}
+    logs = [path.read_text() for path in (made.results / "logs").iterdir()]
+    assert len(logs) == 8 and sum("[/gone]" in log for log in logs) == 1
+
+
+def test_a_rerun_does_only_what_is_missing(tmp_path):
+    made = Batch(tmp_path, ["0"] * 4)
+    made.work()
+    captures = read_captures(made.list, ())
+    shutil.rmtree(captures[1].run)  # type: ignore[arg-type]
+    (captures[2].run / "normlift" / "manifest.json").write_text("{")  # type: ignore[operator]
+    checkpoint = made.configs[3].parent / "nerfstudio_models" / "step-000000009.ckpt"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"trained anew")
+    outcomes = made.work()
+    assert made.begun() == {"c00": 1, "c01": 2, "c02": 1, "c03": 2}
+    assert made.states() == ["done", "done", "failed", "done"]
+    message = outcomes[captures[2].key].message
+    assert "manifest.json" in message and f"delete {captures[2].run} and rerun the command" in message
+    made.work("--encoder", "colour")  # other options: all of them
+    assert made.begun() == {"c00": 2, "c01": 3, "c02": 2, "c03": 3}
+    shutil.rmtree(made.results)  # the runs themselves say that they are there
+    made.work("--encoder", "colour")
+    assert sum(made.begun().values()) == 10
+    assert {outcome.state for outcome in read_lines(made.results, Outcome)} == {"skipped"}
+
+
+def test_an_interrupted_capture_is_free_at_once(tmp_path):
+    made = Batch(tmp_path, ["60"])
+    worker = FORK.Process(target=interruptible, args=(made,))
+    worker.start()
+    wait_for(lambda: made.begun() != {})
+    os.kill(worker.pid, signal.SIGINT)
+    worker.join(120)
+    assert worker.exitcode == 130
+    (state,) = read_states(made.results / "claims").values()
+    assert (state.number, state.outcome) == (1, "left")
+    made.configs[0].with_name("what.txt").write_text("0")
+    begun = time.monotonic()
+    made.work(patience=600.0)
+    assert time.monotonic() - begun < 120 and made.states() == ["done"]
+
+
+def interruptible(made: Batch) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        made.work()
+    except KeyboardInterrupt:
+        os._exit(130)
+
+
+def test_who_was_taken_for_dead_ends_its_process_and_writes_nothing(tmp_path):
+    begun, pid = time.monotonic(), tmp_path / "pid.txt"
+    program = f"import os, pathlib, time; pathlib.Path({str(pid)!r}).write_text(str(os.getpid())); time.sleep(60)"
+    code = run_program([sys.executable, "-S", "-c", program], tmp_path / "log", lambda: not pid.exists(), 0.05)
+    assert code is None and time.monotonic() - begun < 50
+    assert not alive(int(pid.read_text()))
+    made = Batch(tmp_path / "batch", ["60"])
+    worker = made.start()
+    wait_for(lambda: made.begun() != {})
+    (capture,) = read_captures(made.list, ())
+    assert claim(made.results / "claims", capture.key, after=1) is not None  # another one, which dies at once
+    wait_for(lambda: made.begun() == {"c00": 2})
+    assert read_states(made.results / "claims") == {capture.key: State(3, None)}
+    assert read_lines(made.results, Outcome) == []
+    first, _ = (int(line.split()[1]) for line in (tmp_path / "batch" / "begun.txt").read_text().splitlines())
+    assert not alive(first)
+    worker.kill()
+    worker.join()
+
+
+def test_lines_of_the_list(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = ["\ufeff# a list", "", "a/config.yml", '  "b c.ply" --colmap "b c" --beta 2  ']
+    lines += ["--load-gsplat x#1.pt --transforms t.json", "X.PLY"]
+    Path("list.txt").write_text("\r\n".join(lines), "utf8")
+    found = read_captures(Path("list.txt"), ("--encoder", "colour"))
+    own = [capture.words[2:-2] for capture in found]
+    assert own == [
+        ("--load-config", "a/config.yml"),
+        ("--load-ply", "b c.ply", "--colmap", "b c", "--beta", "2"),
+        ("--load-gsplat", "x#1.pt", "--transforms", "t.json"),
+        ("--load-ply", "X.PLY"),
+    ]
+    assert all(capture.words[:2] == ("--encoder", "colour") for capture in found)
+    assert all(capture.words[-2:] == ("--timestamp", f"batch_{capture.key}") for capture in found)
+    assert [capture.run for capture in found[:2]] == [
+        None,  # the config is not there
+        tmp_path / "outputs" / "b c" / "normlift" / f"batch_{found[1].key}",
+    ]
+    assert len({capture.key for capture in found}) == 4
+
+
+def test_the_identity_of_a_capture_is_that_of_scene_and_options(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"1234")
+    line = tmp_path / "list.txt"
+
+    def key(text: str, *options: str) -> str:
+        line.write_text(text)
+        return read_captures(line, options)[0].key
+
+    path = str(tmp_path / "a.ply")
+    first = key(path)
+    assert key(f"--load-ply {path}") == key(f"{tmp_path}/./a.ply") == first
+    assert key(path, "--beta", "1") == key(f"{path} --beta 1.0", "--beta", "3") == first  # the default
+    assert key(path, "--device", "cpu", "--output-dir", "elsewhere") == first
+    others = [("--beta", "2"), ("--colmap", "x"), ("--queries", "red"), ("--encoder", "colour"), ("--refine", "False")]
+    keys = [key(path, *options) for options in others]
+    assert len({first, *keys}) == 1 + len(others)
+    assert key(f"{path} --beta 2") == keys[0]
+    (tmp_path / "a.ply").write_bytes(b"12345")
+    assert key(path) not in {first, *keys}
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        ("", (), "lists no capture"),
+        ("# none\n\n", (), "lists no capture"),
+        ("a\nb 'c\n", (), "list.txt, line 2: b 'c is not quoted as in a shell"),
+        ("a\n\nb --encodr x\n", (), "list.txt, line 3: ns-normlift does not know all of these options"),
+        ("a --k 0\n", (), "list.txt, line 1: ns-normlift does not know all"),
+        ("a\nb\n./a\n", (), "list.txt, line 3, is the same capture with the same options as line 1"),
+        ("a --timestamp x", (), "list.txt, line 1: --timestamp is for ns-normlift alone"),
+        ("a", ("--overwrite", "True"), "After --: --overwrite is for ns-normlift alone"),
+        ("a", ("--nothing",), "After --: ns-normlift does not know all of these options"),
+        ("a", ("--load-ply", "x.ply"), "--load-ply stands after --"),
+        ("a\0b", (), "list.txt, line 1: load_config is no path"),
+        ("\udcff", (), "list.txt is no text in UTF-8"),
+    ],
+)
+def test_lists_that_cannot_be(text, options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("list.txt").write_bytes(text.encode("utf8", "surrogateescape"))
+    with pytest.raises(InputError) as told:
+        read_captures(Path("list.txt"), options)
+    assert message in str(told.value)
+
+
+def command(monkeypatch, *flags: object) -> int:
+    return run_entry(monkeypatch, batch.entrypoint, *flags)
+
+
+def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("list.txt").write_text("a/config.yml\n")
+    Path("file").touch()
+    for flags, message in (
+        (("gone.txt",), "gone.txt, given with ns-normlift-batch, does not exist"),
+        ((".",), "is a folder; give a file"),
+        (("list.txt", "--shard", "2/1"), "--shard must be i/n"),
+        (("list.txt", "--patience", "0"), "--patience must be in 1..86400, got 0"),
+        (("list.txt", "--results", "file"), "file, named with --results, is no folder"),
+        (("list.txt", "--", "--k", "0"), "--k must be at least 1, got 0"),
+    ):
+        assert command(monkeypatch, *flags) == 1
+        text = said(capsys)
+        assert message in text and "Traceback" not in text
+        assert sorted(os.listdir()) == ["file", "list.txt"]
+
+
+def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("normlift_ns.scripts.captures.work.run_program", lambda *_: 0)
+    made = Batch(tmp_path, ["0"] * 5)
+    for task in range(3):
+        for name, value in {"ID": task + 4, "COUNT": 3, "MIN": 4, "MAX": 6, "STEP": 1}.items():
+            monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
+        assert command(monkeypatch, made.list) == 0
+        assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
+    lines = read_lines(made.results, Outcome)
+    assert len(lines) == len({line.key for line in lines}) == 5
+    assert len(list(made.results.glob("*.jsonl"))) == 3
+
+
+def test_real_captures_one_of_them_damaged(trained, tmp_path, monkeypatch, capsys):
+    """As a user types it: a table at the end, and the exit code of the one that failed."""
+    monkeypatch.chdir(tmp_path)
+    Path("list.txt").write_text(f"{trained}\ngone/config.yml\n")
+    flags = ("list.txt", "--results", "results", "--", *SMALL, "--output-dir", "lifted", "--queries", "red")
+    assert command(monkeypatch, *flags) == 1
+    text = said(capsys)
+    assert "1 lifted, 1 failed" in text and "No config at gone/config.yml" in text
+    (config,) = Path().glob("lifted/room/normlift/batch_*/config.yml")
+    stored = open_run(config).ask_stored()
+    assert stored is not None and stored["red"].peak > 0.8
+    lines = [json.loads(line) for path in Path("results").glob("*.jsonl") for line in path.read_text().splitlines()]
+    assert {(line["capture"], line["state"], line["code"]) for line in lines} == {
+        (str(trained), "done", 0),
+        ("gone/config.yml", "failed", 1),
+    }
+    Path("list.txt").write_text(f"{trained}\n")
+    assert command(monkeypatch, *flags) == 0
+    assert said(capsys).endswith("1 lifted")
+    assert len(list(Path("results/logs").iterdir())) == 2
+
+
+TYPED = "from normlift_ns.scripts.start import batch; batch()"
+
+
+@pytest.mark.slow
+def test_twenty_real_captures_by_two_workers_one_of_them_killed(tmp_path):
+    from tests.torture.server import make_room  # noqa: PLC0415 (nerfstudio)
+
+    make_room(tmp_path / "c00")
+    for i in range(1, 20):
+        shutil.copytree(tmp_path / "c00", tmp_path / f"c{i:02d}")
+    configs = sorted(tmp_path.glob("c*/outputs/room/splatfacto/*/config.yml"))
+    assert len(configs) == 20
+    (tmp_path / "list.txt").write_text("".join(f"{config}\n" for config in configs))
+    options = ("--encoder", "colour", "--check", "False", "--device", "cpu", "--k", "6", "--queries", "red")
+    words = [sys.executable, "-c", TYPED, "list.txt", "--patience", "20", "--", *options]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    victim, other = (
+        subprocess.Popen(words, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)
+    )
+    wait_for(lambda: any(tmp_path.glob(f"list_batch/*_{victim.pid}_*.jsonl")), seconds=1200)
+    time.sleep(random.Random(1).uniform(0, 10))  # in its second capture, or at the end of it
+    victim.kill()
+    victim.communicate()
+    printed = other.communicate()[0]
+    print(printed)
+    assert other.returncode == 0
+    runs = [list(config.parents[2].glob("normlift/*/config.yml")) for config in configs]
+    assert [len(found) for found in runs] == [1] * 20
+    assert not list(tmp_path.glob("c*/outputs/room/normlift/.normlift-*"))
+    answers = [open_run(found[0], device="cpu").ask_stored() for found in runs]
+    peaks = {answer["red"].peak for answer in answers if answer is not None}
+    assert len(answers) == 20 and len(peaks) == 1  # copies of one capture
+    done = Counter(line.key for line in read_lines(tmp_path / "list_batch", Outcome) if line.state == "done")
+    assert 19 <= len(done) <= 20 and set(done.values()) == {1}
+
+
+def test_the_last_attempt_counts_whatever_the_clocks_say():
+    def outcome(attempt: int, state: OutcomeState, clock: float) -> Outcome:
+        return Outcome("fox", "a", attempt, state, 1.0, "", 0, None, "w", clock)
+
+    failed, done, found = outcome(1, "failed", 9e9), outcome(2, "done", 5.0), outcome(3, "skipped", 1.0)
+    broken = outcome(4, "failed", 0.0)
+    for order in permutations([failed, done, found]):
+        assert latest(order) == {"a": done}
+    for order in permutations([failed, found]):
+        assert latest(order) == {"a": found}
+    assert latest([broken, done, found]) == {"a": broken}
