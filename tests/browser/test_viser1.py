@@ -1,7 +1,7 @@
 """The viewer with viser 1.x, which cannot be installed beside nerfstudio 1.1.5: in an environment of its own.
 
 NORMLIFT_VISER1: the Python of an environment that has it. Without, one is made, which takes a minute; it sees all other
-packages of this one.
+packages of this one but nerfstudio.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = folder / "bin" / "python"
     inside = "import sysconfig; print(sysconfig.get_path('purelib'))"
     packages = subprocess.run([found, "-c", inside], capture_output=True, text=True, check=True).stdout.strip()
-    (Path(packages) / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    hidden = 'import sys; sys.modules["nerfstudio"] = None'  # as where it is not installed
+    (Path(packages) / "others.pth").write_text(f"{sysconfig.get_path('purelib')}\n{hidden}\n")
     done = subprocess.run(
         [found, "-m", "pip", "install", "-q", "viser>=1,<2"], capture_output=True, text=True, check=False
     )
@@ -44,6 +45,8 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_adapter_knows_viser_1(python: Path) -> None:
+    done = subprocess.run([python, "-c", "import nerfstudio"], capture_output=True, text=True, check=False)
+    assert "ModuleNotFoundError" in done.stderr
     words = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/viewer/test_adapter.py"]
     done = subprocess.run(
         words, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
