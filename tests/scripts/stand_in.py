@@ -38,4 +38,5 @@ def main() -> None:
         sys.exit(f"{run} exists")
 
 
-main()
+if __name__ == "__main__":
+    main()
