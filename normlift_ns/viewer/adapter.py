@@ -396,27 +396,28 @@ def button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable
 def pass_over_the_gone(server: Any) -> None:
     """Nothing is printed about messages of a page that was closed before they were read.
 
-    viser 0.2.7 reads them in another thread, where it and nerfstudio 1.1.5 look up the page by its number, and print a
+    viser 0.2.7 reads them in another thread, where it and nerfstudio 1.1.5 look up the page by its number, and prints a
     traceback when it is not there any more.
+
+    Args:
+        server: viser's.
     """
-    from viser.infra import _infra  # noqa: PLC0415
 
-    infra: Any = _infra
-    told = getattr(infra, "error_print_wrapper", None)
-    if told is None:  # 1.x
-        return
+    def quiet(line: Any) -> None:
+        handle = line._handle_incoming_message
 
-    def quieter(inner: Callable[[], Any]) -> Callable[[], None]:
-        def read() -> None:
+        def read(number: int, message: Any) -> None:
             try:
-                inner()
+                handle(number, message)
             except KeyError as error:
                 if any(type(key) is not int or key in server.get_clients() for key in error.args):
                     raise
 
-        return told(read)
+        if not inspect.iscoroutinefunction(handle):  # as 1.x has it
+            line._handle_incoming_message = read
 
-    infra.error_print_wrapper = quieter
+    quiet(server._websock_server)
+    server.on_client_connect(lambda client: quiet(client._websock_connection))
 
 
 def _unpacked(buffer: UInt32[np.ndarray, "k 8"]) -> dict[str, np.ndarray]:

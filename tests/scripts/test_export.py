@@ -130,7 +130,7 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--text", "red", "--threshold", "1.5", "--part", "selection"), "none of the 0 Gaussians wanted"),
+        (("--text", "red", "--threshold", "1.5", "--part", "selection"), "no Gaussian is selected"),
         (("--text", "oragne"), "orange"),
         (("--part", "nothing"), "invalid choice"),
     ],

@@ -193,23 +193,22 @@ def test_clicks_come_until_nobody_listens(server, pages):
         assert tuple(clicks[0][1]) == (0, 0, 1)
 
 
-def test_what_a_closed_page_asked_is_passed_over_and_all_else_is_told(capsys, monkeypatch):
-    infra = pytest.importorskip("viser.infra._infra")
-    if not hasattr(infra, "error_print_wrapper"):
-        pytest.skip("viser 1.x looks nobody up by number")
-    monkeypatch.setattr(infra, "error_print_wrapper", infra.error_print_wrapper)
-    pass_over_the_gone(SimpleNamespace(get_clients=lambda: {3: "here"}))
+def test_what_a_closed_page_asked_is_passed_over_and_all_else_is_told():
+    def read(number: int, message: Exception) -> None:
+        heard.append(number)
+        raise message
 
-    def told(error: Exception) -> str:
-        def read() -> None:
-            raise error
-
-        infra.error_print_wrapper(read)()
-        return capsys.readouterr().err
-
-    assert told(KeyError(4)) == ""
-    for other in (KeyError(3), KeyError("4"), KeyError(True), IndexError(4), ValueError("wrong")):
-        assert f"\n{type(other).__name__}: {other}" in told(other)
+    heard, come = [], []
+    lines = [SimpleNamespace(_handle_incoming_message=read) for _ in range(2)]
+    told = {"get_clients": lambda: {3: "here"}, "on_client_connect": come.append}
+    pass_over_the_gone(SimpleNamespace(_websock_server=lines[0], **told))
+    come[0](SimpleNamespace(_websock_connection=lines[1]))
+    for line in lines:
+        line._handle_incoming_message(4, KeyError(4))
+        for other in (KeyError(3), KeyError("4"), KeyError(True), IndexError(4), ValueError("wrong")):
+            with pytest.raises(type(other)):
+                line._handle_incoming_message(5, other)
+    assert heard == 2 * [4, 5, 5, 5, 5, 5]
 
 
 def test_nobody_can_publish_the_server(server):
