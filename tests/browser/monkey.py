@@ -200,6 +200,16 @@ class Monkey:
         self._server.kill()
         self._server.start()
 
+    def megabytes(self) -> float:
+        """Memory of the server while nobody looks: what is drawn at a moment, and how large, is no growth."""
+        for page in self._pages:
+            page.goto("about:blank")
+        time.sleep(5)
+        used = min(self._server.megabytes() for _ in range(3))
+        for page in self._pages:
+            page.goto(self._server.address, wait_until="domcontentloaded")
+        return used
+
     def use_everything(self) -> None:
         """Presses what loads something when it is first pressed, so that later only what leaks makes memory grow."""
         page = self._opened(SIZES[0])
