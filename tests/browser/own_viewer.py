@@ -109,9 +109,7 @@ class Own:
     def picture(self) -> np.ndarray:
         """RGB of the scene as the page shows it once it rests, uint8 [H, W, 3]."""
         before, calm, deadline = self._shot(), 0, time.monotonic() + 60
-        while (
-            calm < 4 and time.monotonic() < deadline
-        ):  # the camera glides by a step per picture, and those can be slow
+        while calm < 2 and time.monotonic() < deadline:  # the camera glides by a step per picture
             self.page.wait_for_timeout(500)
             now = self._shot()
             calm = calm + 1 if np.abs(now.astype(int) - before).mean() < 0.1 else 0
