@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from normlift_ns.core.sparse import CHUNK_ELEMENTS
 from normlift_ns.errors import InputError
 
 _OFF = 1e-2
@@ -46,7 +47,8 @@ def check_unit_rows(
     >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalise them").round(decimals=6)
     tensor([1.], dtype=torch.float64)
     """
-    length = torch.linalg.vector_norm(rows, dim=1, dtype=torch.float64)
+    blocks = rows.split(max(1, CHUNK_ELEMENTS // max(1, rows.shape[1])))  # rows in float64 would double the memory
+    length = torch.cat([torch.linalg.vector_norm(block, dim=1, dtype=torch.float64) for block in blocks])
     good = (length - 1).abs() < _OFF
     bad = (~(good | (length == 0) if zeros else good)).nonzero().squeeze(1)
     if bad.numel() > 0:
@@ -55,18 +57,18 @@ def check_unit_rows(
     return length
 
 
-def check_range(name: str, values: Tensor, low: float, high: float = torch.inf) -> None:
-    """All values must lie in low..high, and be finite.
+def check_not_negative(name: str, values: Tensor) -> None:
+    """All values must be finite and at least 0.
 
     Raises:
-        ValueError: some do not; the message shows the first.
+        ValueError: some are not; the message shows the first.
 
-    >>> check_range("reliability", torch.tensor([0.0, 1.0]), 0.0, 1.0)
+    >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
     """
-    bad = (~((values >= low) & (values <= high) & values.isfinite())).nonzero()
+    bad = (~((values >= 0) & values.isfinite())).nonzero()
     if len(bad) > 0:
-        first, wanted = int(bad[0, 0]), f"{low:g}..{high:g}" if high < torch.inf else f"finite and >= {low:g}"
+        first = int(bad[0, 0])
         raise InputError(
-            f"{len(bad):,} of {values.numel():,} values of {name} are not {wanted}: {name}[{first}] is "
+            f"{len(bad):,} of {values.numel():,} values of {name} are not finite and >= 0: {name}[{first}] is "
             f"{float(values[first]):g}"
         )

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.checks import check_range, check_tensors, check_unit_rows
+from normlift_ns.core.checks import check_not_negative, check_tensors, check_unit_rows
 from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.errors import InputError
@@ -92,9 +92,9 @@ def refine(
     elif own is None or tuple(own.shape) != (n,):
         got = "none" if own is None else f"shape {tuple(own.shape)}"
         raise InputError(f"a posterior vote needs own, the scalars.own_evidence of a lift, of shape {(n,)}; got {got}")
-    check_range("reliability", reliability, 0.0)
+    check_not_negative("reliability", reliability)
     if own is not None:
-        check_range("own", own, 0.0)
+        check_not_negative("own", own)
     if given is not None:
         check_unit_rows(
             given, "rows of directions", "normalise them, or set those without a direction to 0", zeros=True
