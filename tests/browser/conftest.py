@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -25,15 +26,23 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def demo_run(lifted_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """config.yml of a lifted demo room, a copy for each file of tests: what one saves, no other finds."""
+    copy = tmp_path_factory.mktemp("copied") / "outputs"
+    shutil.copytree(lifted_room / "outputs", copy)
+    return next(copy.glob("*/normlift/*/config.yml"))
+
+
 @pytest.fixture(scope="session")
-def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of the demo room, lifted with four queries, as `make demo` leaves it but smaller."""
+def lifted_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo room, lifted with four queries into its folder outputs, as `make demo` leaves it but smaller."""
     folder = tmp_path_factory.mktemp("demo")
     room = demo_room(12_000)
     write_capture(room, folder / "room", views=12)
     config = write_splatfacto_run(room, folder / "room", folder / "outputs")
-    lifted = NormLift(config, source=SourceOptions(encoder="colour"), queries=TEXTS, timestamp="demo").main()
-    return lifted.config
+    NormLift(config, source=SourceOptions(encoder="colour"), queries=TEXTS, timestamp="demo").main()
+    return folder
 
 
 @pytest.fixture(scope="session")

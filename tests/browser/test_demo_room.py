@@ -69,7 +69,6 @@ def test_a_person_asks_and_sees_the_answer(tab: Tab, pictures: Path) -> None:
     tab.settle()
     tab.page.screenshot(path=pictures / "panel_overlay.png")
     overlay = coloured(tab.picture())
-    overlay[-160:, -260:] = False  # the legend
     print("overlay of red: IoU", iou(overlay, things["red"]))
     assert iou(overlay, things["red"]) > 0.7
     some = tab.selected()
@@ -133,7 +132,6 @@ def test_a_person_clicks_cancels_hides_and_undoes(tab: Tab, run_dir: Path, pictu
     tab.settle()
     tab.page.screenshot(path=pictures / "panel_click.png")
     overlay = coloured(tab.picture())
-    overlay[-160:, -260:] = False
     print("clicked yellow: IoU", iou(overlay, things["yellow"]))
     assert iou(overlay, things["yellow"]) > 0.55
     alike = tab.selected()
@@ -255,7 +253,6 @@ def test_a_click_selects_an_object_which_grows_and_shrinks(tab: Tab, pictures: P
     tab.settle()
     tab.page.screenshot(path=pictures / "panel_part.png")
     shown = coloured(tab.picture())
-    shown[-160:, -260:] = False  # the legend
     print("part of the yellow thing:", (shown & things["yellow"]).sum() / things["yellow"].sum())
     assert 0.02 < (shown & things["yellow"]).sum() / things["yellow"].sum() < 0.9
     assert (shown & ~things["yellow"]).sum() < 0.1 * things["yellow"].sum()

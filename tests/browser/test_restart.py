@@ -46,13 +46,8 @@ def test_a_saved_click_is_asked_again_after_a_restart(demo_run: Path, tmp_path: 
             tab.type("Prompts", "like click 1")
             tab.press("Ask")
             tab.until(lambda: tab.answered() == 1 and tab.selected() == clicked, "asked again", timeout=60)
-
-            def shown() -> float:
-                drawn = coloured(tab.picture())
-                drawn[-160:, -260:] = False
-                return iou(drawn, yellow)
-
-            tab.until(lambda: shown() > 0.55, "what was clicked is drawn again", timeout=90)
+            drawn = "what was clicked is drawn again"
+            tab.until(lambda: iou(coloured(tab.picture()), yellow) > 0.55, drawn, timeout=90)
             tab.page.screenshot(path=pictures / "panel_reconnected.png")
             assert tab.problems == []
     for log in ("first.log", "second.log"):

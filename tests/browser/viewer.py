@@ -198,8 +198,10 @@ def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:
-    """Pixels that are not grey."""
-    return without_axes(np.ptp(picture.astype(int), axis=2) > 50)
+    """Pixels that are not grey; without the axes, and without the legend in the lower right corner."""
+    mask = without_axes(np.ptp(picture.astype(int), axis=2) > 50)
+    mask[-160:, -340:] = False
+    return mask
 
 
 def without_axes(mask: np.ndarray) -> np.ndarray:
