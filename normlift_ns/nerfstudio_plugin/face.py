@@ -8,6 +8,7 @@ from threading import RLock, Thread
 from typing import Any
 
 import torch
+from nerfstudio.viewer.render_state_machine import RenderAction
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from normlift_ns.asking import Answer
@@ -26,6 +27,19 @@ from normlift_ns.viewer.display import Display, make_display, output_names
 from normlift_ns.viewer.reasons import Reasons
 
 WAITING = "No semantics yet. They are lifted at the end of the training."
+
+
+def redraw(viewer: Any) -> None:
+    """Has every browser before nerfstudio's viewer draw its picture again.
+
+    nerfstudio 1.1.5's own `Viewer._trigger_rerender` ends at the first browser that comes or goes at this moment, and
+    leaves the pictures of those after it as they were.
+    """
+    if not viewer.ready:
+        return
+    for number, client in viewer.viser_server.get_clients().items():
+        with suppress(KeyError):  # it is coming, and will draw anyway, or going
+            viewer.render_statemachines[number].action(RenderAction("move", viewer.get_camera_state(client)))
 
 
 class _Control(ViewerControl):
@@ -130,8 +144,7 @@ class Face(torch.nn.Module):
         self._host[0].show(display)
         self._follow()
         if self._viewer is not None:
-            with suppress(KeyError):  # of a page that comes or goes at this moment
-                self._viewer._trigger_rerender()
+            redraw(self._viewer)
 
     def _keep_output(self, display: Display, *, answered: bool) -> None:
         """Where rgb, or an output that there will not be any more, is shown, the overlay takes its place."""

@@ -21,6 +21,7 @@ from normlift_ns.core.files import write_text
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
+from normlift_ns.nerfstudio_plugin.face import redraw
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
 from normlift_ns.nerfstudio_plugin.views import DatasetViews, by_nerfstudio
 from normlift_ns.options import LiftOptions, SourceOptions
@@ -190,8 +191,8 @@ def lift_trained(trainer: Trainer) -> Path:
     with trainer.train_lock:
         pipeline.model.attach(field, question)
     viewer: Any = trainer.viewer_state
-    if hasattr(viewer, "_trigger_rerender"):
-        viewer._trigger_rerender()
+    if hasattr(viewer, "render_statemachines"):
+        redraw(viewer)
     again = f"ns-normlift-query --load-config {shlex.quote(str(path))} --text ..."
     CONSOLE.print(f"Lifted: {folder}. Ask it with: {again}", markup=False, soft_wrap=True)
     return folder

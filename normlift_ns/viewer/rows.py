@@ -23,24 +23,32 @@ class Rows:
     """
 
     def __init__(self, gui: Any, act: Callable[[str, FoundObject, Any], None]) -> None:
-        self._gui, self._act = gui, act
-        self._handles: list[Any] = []
-        self._folder = gui.add_folder("Found objects")
-        with self._folder:
+        self._objects: tuple[FoundObject, ...] = ()
+        with gui.add_folder("Found objects"):
             self._remark = gui.add_markdown("Nothing is selected.")
+            # made once: viser keeps what is added to a panel that all pages share, and its removal, for ever
+            self._rows = [self._row(gui, i, act) for i in range(MOST_OBJECTS)]
 
     def show(self, found: Found) -> None:
-        """Lists these objects in place of those before."""
-        for handle in self._handles:
-            handle.remove()
+        """Lists these objects, at most `MOST_OBJECTS`, in place of those before."""
+        self._objects = tuple(found.objects)
         rest = [f"{found.left_out:,} smaller objects are not listed"] * (found.left_out > 0)
         rest += [f"Gaussians in smaller parts: {found.in_smaller_parts:,}"] * (found.in_smaller_parts > 0)
         none = "" if len(found.objects) > 0 else "Nothing that is drawn is selected."
         self._remark.content = as_text("; ".join(rest) or none)
-        with self._folder:
-            self._handles = [handle for row in found.objects for handle in self._row(row)]
+        for i, (text, buttons) in enumerate(self._rows):
+            if i < len(self._objects):
+                row = self._objects[i]
+                facts = as_text(f"object {row.number}: {row.size:,} Gaussians, {row.evidence}")
+                text.content = f"{swatch(row.colour)} **{as_text(clipped(row.text, 40))}** {facts}"
+            text.visible = buttons.visible = i < len(self._objects)
 
-    def _row(self, row: FoundObject) -> list[Any]:
-        facts = as_text(f"object {row.number}: {row.size:,} Gaussians, {row.evidence}")
-        text = self._gui.add_markdown(f"{swatch(row.colour)} **{as_text(clipped(row.text, 40))}** {facts}")
-        return [text, button_group(self._gui, "", OBJECT_DEEDS, lambda deed, event: self._act(deed, row, event))]
+    def _row(self, gui: Any, i: int, act: Callable[[str, FoundObject, Any], None]) -> tuple[Any, Any]:
+        def pressed(deed: str, event: Any) -> None:
+            if i < len(self._objects):
+                act(deed, self._objects[i], event)
+
+        text = gui.add_markdown("")
+        buttons = button_group(gui, "", OBJECT_DEEDS, pressed)
+        text.visible = buttons.visible = False
+        return text, buttons

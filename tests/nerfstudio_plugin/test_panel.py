@@ -381,7 +381,7 @@ def listed(panel: Any) -> list[Any]:
     """The buttons of the found objects, once they are listed for what is selected."""
     until(lambda: panel._rest._turns.busy == "")
     with panel._lock:  # which is held from then on, until they are shown
-        return [handle for handle in panel._widgets.rows._handles if not hasattr(handle, "content")]
+        return [group for _, group in panel._widgets.rows._rows if group.visible]
 
 
 def press_row(group: Any, deed: str, browser: Browser) -> None:
@@ -405,11 +405,15 @@ def test_found_objects_have_buttons(panel: Any, pipeline: Any) -> None:
     assert 0 < PlyData.read(io.BytesIO(content))["vertex"].count <= first.size
     press_row(groups[0], "hide", browser)
     assert torch.equal(pipeline.model._display.drawn, ~first.mask)
+    assert len(listed(panel)) == len(found_objects(panel.state).objects) < len(objects)
     panel.act("Undo")
-    press_row(groups[0], "only", browser)
+    press_row(listed(panel)[0], "only", browser)
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     ask(panel, "up")
     assert listed(panel) == []
+    press_row(groups[0], "hide", browser)  # as its page still shows it
+    assert pipeline.model._display.drawn is not None
+    assert torch.equal(pipeline.model._display.drawn, first.mask)
     assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._remark.content)
 
 
@@ -661,6 +665,20 @@ def test_a_browser_that_goes_while_another_one_presses_stops_nobody(panel, opene
         thread.join(timeout=20)
         assert not thread.is_alive()
     until(lambda: not panel._clicks.armed)
+    panel.act("Undo")
+
+
+def test_a_browser_that_comes_or_goes_leaves_no_other_with_an_old_picture(panel, opened, monkeypatch) -> None:
+    viewer, drawn = opened[1], []
+    there = SimpleNamespace(action=lambda action: drawn.append(action.camera_state))
+    monkeypatch.setattr(viewer, "ready", True)
+    monkeypatch.setattr(viewer.viser_server, "get_clients", lambda: dict.fromkeys((4, 5, 6), Browser()))
+    monkeypatch.setattr(viewer, "get_camera_state", lambda client: client)
+    monkeypatch.setattr(viewer, "render_statemachines", {5: there})
+    ask(panel, "left")
+    drawn.clear()
+    panel.act("Hide")
+    assert len(drawn) == 1
     panel.act("Undo")
 
 
