@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
@@ -70,17 +70,17 @@ def _size(height: int) -> int:
     return max(11, height // 42)
 
 
-def _stamped(picture: Tensor, tile: np.ndarray, width: int) -> Tensor:
+def _stamped(picture: Tensor, tile: UInt8[np.ndarray, "rows columns 3"], width: int) -> Tensor:
     """The picture, with a tile in its lower right corner, if it leaves a third of the width free."""
     rows, columns = tile.shape[:2]
     margin = max(4, rows // 8)
     if 3 * columns > 2 * width or columns + 2 * margin > width or rows + 2 * margin > len(picture):
         return picture
     there = (slice(-rows - margin, -margin), slice(-columns - margin, -margin))
-    stamp = torch.from_numpy(tile).to(picture)
     out = picture.clone()
-    opacity = stamp[:, :, 3:]
-    out[there] = opacity * stamp[:, :, :3] + (1 - opacity) * out[there]
+    opacity = np.where((tile == _BACKDROP).all(axis=2), _BACKDROP_OPACITY, 1.0)  # the backdrop lets the picture through
+    opacity = torch.from_numpy(opacity[:, :, None]).to(picture)
+    out[there] = opacity * (torch.from_numpy(tile).to(picture) / 255) + (1 - opacity) * out[there]
     return out
 
 
@@ -96,10 +96,10 @@ def _bar(colormap: Colormap, scale: tuple[float, float], title: str, size: int) 
     tile.paste(Image.fromarray(ramp).resize((wide, size)), (pad, pad + round(1.3 * size)))
     for x, text in ((pad, ends[0]), (pad + wide - round(letters.getlength(ends[1])), ends[1])):
         draw.text((x, pad + round(2.5 * size)), text, fill=_INK, font=letters)
-    return _backed(tile)
+    return np.array(tile)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=4)
 def _list(rows: tuple[str, ...], colors: tuple[tuple[int, int, int], ...], size: int) -> np.ndarray:
     letters, pad, step = font(size), size // 2, round(1.5 * size)
     wide = round(max(letters.getlength(row) for row in rows)) + 2 * size
@@ -110,11 +110,4 @@ def _list(rows: tuple[str, ...], colors: tuple[tuple[int, int, int], ...], size:
         if i < len(colors):
             draw.rectangle((pad, top + size // 6, pad + size, top + size // 6 + size), fill=colors[i])
         draw.text((pad + 2 * size, top), row, fill=_INK, font=letters)
-    return _backed(tile)
-
-
-def _backed(tile: Image.Image) -> np.ndarray:
-    """RGB and opacity in 0..1: the backdrop lets the picture through."""
-    rgb = np.asarray(tile, np.float32) / 255
-    opacity = np.where((np.asarray(tile) == _BACKDROP).all(axis=2), _BACKDROP_OPACITY, 1.0).astype(np.float32)
-    return np.concatenate([rgb, opacity[:, :, None]], axis=2)
+    return np.array(tile)
