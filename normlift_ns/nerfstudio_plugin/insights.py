@@ -10,17 +10,21 @@ from threading import Thread
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
+from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.clicks import UNITS
 from normlift_ns.runs.files import cache_folder
 from normlift_ns.runs.votes import Votes
 from normlift_ns.scenes.nerfstudio.load import load_scene
 from normlift_ns.scenes.saved import is_saved_splat, open_saved_splat
-from normlift_ns.session.found import Found, FoundObject, found_objects, viewpoint
+from normlift_ns.session.found import Found, FoundObject, found_objects
 from normlift_ns.session.state import State
 from normlift_ns.session.turns import Turn, Turns
+from normlift_ns.session.viewpoint import clear_viewpoint
 from normlift_ns.viewer.drawing import verdicts_mdx
 from normlift_ns.viewer.reasons import Reasons
 from normlift_ns.viewer.rows import MOST_OBJECTS
@@ -87,10 +91,11 @@ class Rest:
                 self._failed(error)
 
 
-def go_to(client: Any, found: FoundObject) -> None:
-    """Moves the camera of one browser before an object, from the side where it is."""
+def go_to(client: Any, found: FoundObject, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
+    """Moves the camera of one browser before an object, from the side where it is if nothing stands in the way."""
     camera = client.camera
-    place = viewpoint(found, np.asarray(camera.position) / UNITS, float(camera.fov))
+    eye = (np.asarray(camera.position) / UNITS, camera.up_direction, float(camera.fov))
+    place = clear_viewpoint(found, scene, drawn, *eye)
     with client.atomic():
         camera.position = np.array(place) * UNITS
         camera.look_at = np.array(found.centre) * UNITS

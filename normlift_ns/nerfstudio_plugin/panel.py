@@ -152,7 +152,7 @@ class Panel(Face):
 
     def _with_object(self, deed: str, row: FoundObject, client: Any) -> None:
         if deed == "go to":
-            go_to(client, row)
+            go_to(client, row, self._host[0].scene(), cast(State, self.state).drawn)
         elif deed == "export":
             self._download(row.mask, row.name, client)
         else:

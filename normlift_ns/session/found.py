@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,15 +57,6 @@ class FoundObject:
         return f"{grade} evidenced (R {self.reliability:.2f}, {self.views:.1f} views)"
 
 
-@dataclass(frozen=True)
-class Spot:
-    """A place to go to that is no object."""
-
-    centre: tuple[float, float, float]
-    extent: float
-    """How much around it is to be seen."""
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """The objects of a selection."""
@@ -115,22 +105,3 @@ def _object(state: State, text: str, number: int, colour: Colour, mask: Tensor, 
     reliability, views = (float((weight * x[mask].double()).sum()) for x in (scalars.reliability, scalars.n_eff))
     extent = float(np.linalg.norm(high - low))
     return FoundObject(text, number + 1, colour, mask, size, reliability, views, tuple(centre), extent)
-
-
-def viewpoint(
-    found: FoundObject | Spot, from_: Sequence[float] | np.ndarray, field_of_view: float = 0.9
-) -> tuple[float, float, float]:
-    """Where a camera goes that looks at an object or a spot: from the side where it is, so far that it fills half the
-    picture.
-
-    Args:
-        from_: where the camera is now.
-        field_of_view: of the camera, in radians.
-    """
-    centre = np.asarray(found.centre)
-    away = np.asarray(from_, float) - centre
-    length = float(np.linalg.norm(away))
-    away = away / length if length > 0 else np.array([0.0, -1.0, 0.0])
-    distance = max(found.extent, 1e-6) / np.tan(field_of_view / 2)
-    place = centre + away * distance
-    return float(place[0]), float(place[1]), float(place[2])

@@ -11,12 +11,13 @@ import torch
 
 from normlift_ns.core.crash import explain
 from normlift_ns.session import actions
-from normlift_ns.session.found import FoundObject, Spot, found_objects, viewpoint
+from normlift_ns.session.found import FoundObject, found_objects
 from normlift_ns.session.history import History
 from normlift_ns.session.prompts import click_name, is_click, join_prompts, pose, read_prompts
 from normlift_ns.session.state import State
 from normlift_ns.session.turns import Turn, Turns
 from normlift_ns.session.verdicts import carried, verdicts
+from normlift_ns.session.viewpoint import Spot, clear_viewpoint
 from normlift_ns.session.worker import Worker
 from normlift_ns.viewer.adapter import Page
 from normlift_ns.viewer.blind.stills import Stills
@@ -264,7 +265,9 @@ class Person:
             self._show(self._memory.history.do(act(self.state, row.mask)))
 
     def _go_to(self, what: FoundObject | Spot) -> None:
-        self._eye.look(viewpoint(what, self._eye.position, self._eye.fov), what.centre)
+        eye, gaussians = self._eye.view, self._run.scene.gaussians
+        place = clear_viewpoint(what, gaussians, self.state.drawn, eye.position, eye.up, eye.fov)
+        self._eye.look(place, what.centre)
 
     def _download(self, mask: torch.Tensor, name: str) -> None:
         file, content, message = self._run.exported(mask, name, self.state.answer)

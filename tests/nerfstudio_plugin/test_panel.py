@@ -56,7 +56,9 @@ class Browser:
     def __init__(self, number: int = 0) -> None:
         self.client_id, self.files, self.scene = number, {}, self
         self._scene_pointer_cb: Any = None
-        self.camera = SimpleNamespace(position=np.zeros(3), look_at=np.ones(3), fov=1.0)
+        self.camera = SimpleNamespace(
+            position=np.zeros(3), look_at=np.ones(3), up_direction=np.array([0.0, 0, 1]), fov=1.0
+        )
 
     def atomic(self) -> Any:
         return nullcontext()

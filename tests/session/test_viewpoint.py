@@ -1,0 +1,71 @@
+"""Where a camera goes to look at something, among walls whose places are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from normlift_ns import GaussianScene
+from normlift_ns.session.viewpoint import Spot, clear_viewpoint, viewpoint
+
+SPOT = Spot((0.0, 0.0, 0.0), 1.0)
+FROM, UP = (0.0, -10.0, 0.0), (0.0, 0.0, 1.0)
+AWAY = 1 / np.tan(0.45)
+
+
+def walls(*sides: tuple[float, float, float], scale: float = 0.05) -> GaussianScene:
+    """Opaque patches of 0.8 x 0.8, each at 1.2 from the spot, and the spot itself."""
+    axis = torch.linspace(-0.4, 0.4, 9, dtype=torch.float64)
+    flat = torch.cartesian_prod(axis, axis)
+    parts = [torch.zeros(1, 3, dtype=torch.float64)]
+    for side in sides:
+        normal = torch.tensor(side, dtype=torch.float64)
+        one = torch.linalg.cross(normal, torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64))
+        one = one / one.norm()
+        other = torch.linalg.cross(normal, one)
+        parts.append(1.2 * normal + flat[:, :1] * one + flat[:, 1:] * other)
+    means = torch.cat(parts).float()
+    n = len(means)
+    return GaussianScene(means, torch.eye(4)[:1].expand(n, 4), torch.full((n, 3), scale), torch.full((n,), 0.99))
+
+
+def test_a_spot_fills_half_the_picture_from_the_side_where_the_camera_is():
+    place = viewpoint(SPOT, FROM)
+    assert place == pytest.approx((0, -AWAY, 0))
+    assert viewpoint(SPOT, SPOT.centre) == pytest.approx((0, -AWAY, 0))
+
+
+@pytest.mark.parametrize("scene", [walls(), walls((0, 1, 0)), walls((1, 0, 0), (-1, 0, 0), (0, 0, 1))])
+def test_nothing_in_the_way_changes_nothing(scene: GaussianScene):
+    assert clear_viewpoint(SPOT, scene, None, FROM, UP) == pytest.approx(viewpoint(SPOT, FROM))
+
+
+def test_it_goes_around_a_wall():
+    place = np.array(clear_viewpoint(SPOT, walls((0, -1, 0)), None, FROM, UP))
+    assert np.linalg.norm(place) == pytest.approx(AWAY)
+    assert np.abs(place) == pytest.approx([AWAY * np.sin(np.pi / 4), AWAY * np.cos(np.pi / 4), 0])
+    assert place[1] < 0
+
+
+def test_in_a_corner_it_takes_the_open_side():
+    around = [(np.sin(a), -np.cos(a), 0.0) for a in np.radians([0, 45, -45, 90, -90, 135, -135])]
+    place = np.array(clear_viewpoint(SPOT, walls(*around), None, FROM, UP))
+    assert place == pytest.approx([0, AWAY, 0], abs=1e-9)
+    above = np.array(clear_viewpoint(SPOT, walls(*around, (0.0, 1.0, 0.0)), None, FROM, UP))
+    assert above[2] > 0.4 * AWAY
+    assert np.linalg.norm(above) == pytest.approx(AWAY)
+
+
+def test_a_hidden_wall_is_not_in_the_way():
+    scene = walls((0, -1, 0))
+    drawn = torch.arange(len(scene)) == 0
+    assert clear_viewpoint(SPOT, scene, drawn, FROM, UP) == pytest.approx(viewpoint(SPOT, FROM))
+
+
+def test_without_any_clear_side_it_stays_on_one():
+    scene = GaussianScene(torch.zeros(1, 3), torch.eye(4)[:1], torch.full((1, 3), 30.0), torch.ones(1))
+    place = clear_viewpoint(Spot((0.0, 0.0, 0.0), 1e-3), scene, None, FROM, UP)
+    assert np.isfinite(place).all()
+    assert np.isfinite(clear_viewpoint(SPOT, walls((0, -1, 0)), None, (0, 0, 5.0), UP)).all()
+    assert np.isfinite(clear_viewpoint(SPOT, walls((0, -1, 0)), None, FROM, (0, 0, 0))).all()
