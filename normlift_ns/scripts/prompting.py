@@ -107,7 +107,7 @@ def _nearest(row: Mapping[str, Any]) -> str:
     """Where the scene is most like a text."""
     top, limit = row["histogram"]["top"], row["histogram"]["limit"]
     place = "" if row["nearest"] is None else f" at {' '.join(f'{x:.2f}' for x in row['nearest'])}"
-    return f"The nearest match{place} has relevancy {top:.3f}; what is there has {limit:.3g} or more."
+    return f"The nearest match{place} has relevancy {top:.3f}; things that are in a scene reach {limit:.3g} or more."
 
 
 def _bars(spread: Mapping[str, Any] | None, threshold: float) -> str:

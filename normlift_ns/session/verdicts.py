@@ -50,8 +50,8 @@ def _words(finding: Finding, histogram: Histogram) -> str:
         return ""
     place = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
     return (
-        f"{finding.text}: probably not in this scene. The nearest match{place} has relevancy {histogram.top:.2f}; what "
-        f"is there has {histogram.limit:.2g} or more."
+        f"{finding.text}: probably not in this scene. The nearest match{place} has relevancy {histogram.top:.2f}; "
+        f"things that are in a scene reach {histogram.limit:.2g} or more."
     )
 
 

@@ -31,7 +31,7 @@ def asked(space: Space, line: str, state: State | None = None, **how) -> State:
 def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
     (verdict,) = verdicts(asked(COLOUR, "green"))
     assert verdict.words.startswith("green: probably not in this scene. The nearest match at ")
-    assert verdict.words.endswith(" has relevancy 0.00; what is there has 0.9 or more.")
+    assert verdict.words.endswith(" has relevancy 0.00; things that are in a scene reach 0.9 or more.")
     red, blue = verdicts(asked(COLOUR, "red, blue"))
     assert (red.words, blue.words) == ("", "")
     assert red.colour != blue.colour
