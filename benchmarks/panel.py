@@ -70,7 +70,7 @@ def served(config: Path) -> Iterator[str]:
 
 
 def picture(page: Any) -> np.ndarray:
-    shot = page.screenshot(clip=_BOX, timeout=1e3 * PATIENCE)
+    shot = page.screenshot(clip=_BOX)
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
@@ -93,9 +93,10 @@ def pressed(address: str, prompts: Sequence[str]) -> tuple[list[float], str]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=_FLAGS)
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+        page.set_default_timeout(1e3 * PATIENCE)  # drawn in software a large scene takes seconds
         page.goto(address, wait_until="domcontentloaded")
         ask = page.get_by_role("button", name="Ask", exact=True)
-        ask.wait_for(timeout=1e3 * PATIENCE)
+        ask.wait_for()
         name = page.evaluate(_RENDERER)
         row = page.locator('xpath=//label[text()="Prompts"]/ancestor::*[.//input][1]').locator("input").last
         seconds = []
