@@ -219,9 +219,11 @@ class Monkey:
         page.set_default_timeout(180_000)
         page.get_by_role("button", name="Ask", exact=True).wait_for()
         page.wait_for_timeout(3000)
+        page.get_by_role("button", name="Clear", exact=True).click()  # a threshold that was saved would be kept
+        page.wait_for_timeout(2000)
         assert page.evaluate(_PROMPTS)
         page.keyboard.insert_text("red, purple")
-        page.wait_for_timeout(500)
+        page.wait_for_timeout(2000)
         for name, answer in (
             ("Ask", "purple object 1"), ("Why?", "These weigh most:"), ("Select likely floaters", "then press Hide"),
         ):  # fmt: skip
@@ -254,9 +256,11 @@ class Monkey:
         except TimeoutError as error:
             raise AssertionError(f"no panel; the server's threads:\n{self._server.threads()}") from error
         page.wait_for_timeout(3000)
+        page.get_by_role("button", name="Clear", exact=True).click()  # a threshold that was saved would be kept
+        page.wait_for_timeout(2000)
         assert page.evaluate(_PROMPTS)
         page.keyboard.insert_text("red, purple")
-        page.wait_for_timeout(500)
+        page.wait_for_timeout(2000)
         page.get_by_role("button", name="Ask", exact=True).click()
         page.get_by_text("Gaussians selected").first.wait_for()
         page.get_by_text("purple", exact=False).first.wait_for()
