@@ -93,7 +93,8 @@ class Serving:
             try:
                 return urllib.request.urlopen(self.address, timeout=5).close()
             except OSError:
-                assert self._process.poll() is None and time.monotonic() < deadline, self.said()[-3000:]
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    raise AssertionError(f"it does not answer: {(self.said() + self.threads())[-9000:]}") from None
                 time.sleep(0.3)
 
     def kill(self) -> None:
@@ -117,6 +118,8 @@ class Serving:
 
     def threads(self) -> str:
         """What every thread of the server does."""
+        if not self.alive():
+            return ""
         assert self._process is not None
         before = len(self.said())
         self._process.send_signal(signal.SIGUSR1)
