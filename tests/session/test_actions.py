@@ -14,6 +14,7 @@ from normlift_ns.session.prompts import Prompt, click_name, pose, read_prompts
 from normlift_ns.session.space import Box
 from normlift_ns.session.state import State
 from normlift_ns.session.turns import Turns
+from normlift_ns.session.viewpoint import viewpoint
 from tests.session.worlds import BLOCK, cubes, ray, read, rows
 
 SPACE = cubes()
@@ -194,6 +195,9 @@ def test_objects_are_listed_with_what_their_buttons_need():
     assert found_objects(asked("red"), min_size=65).in_smaller_parts == 128
     by_hand = found_objects(actions.click(asked("red"), ray(0)))
     assert [row.name for row in by_hand.objects] == ["selected by hand 1"]
+    place = viewpoint(first, (1.5, 1.5, 500.0))
+    assert place[:2] == pytest.approx((1.5, 1.5))
+    assert 1.5 + first.extent < place[2] < 100
 
 
 def test_poor_evidence_is_told_and_left_out():
