@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.errors import InputError
 from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
 from normlift_ns.nerfstudio_plugin.panel import Panel
 from normlift_ns.options import RasterizeMode
@@ -32,6 +33,9 @@ from normlift_ns.runs.question import load_question
 from normlift_ns.scenes.nerfstudio.appearance import shading_degree
 from normlift_ns.scenes.photographs import to_camera
 from normlift_ns.viewer.display import Display, draw
+
+_WIDEST = 1e-3
+"""Least focal length of a picture that is drawn, and its inverse the greatest, in larger sides of the picture."""
 
 
 @dataclass
@@ -110,12 +114,11 @@ class NormLiftModel(SplatfactoModel):
         """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
 
         Args:
-            camera: one camera; where it has no pixels, which nerfstudio's viewer can ask for, one pixel is drawn.
+            camera: one camera; for one that cannot be, which nerfstudio's viewer can ask for, see `_drawable`.
             obb_box: Gaussians outside are not drawn.
         """
-        display, camera = self._display, _with_a_pixel(camera)
+        display, (camera, view) = self._display, _drawable(camera.to(self.device))
         rows = self.rows_in(obb_box, display)
-        view = _opencv(camera.to(self.device))
         values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
         if self.on_cpu:
             with untraced():
@@ -237,10 +240,24 @@ def _opencv(camera: Cameras) -> Camera:
     return to_camera(pose, intrinsics, int(camera.width.item()), int(camera.height.item()))
 
 
-def _with_a_pixel(camera: Cameras) -> Cameras:
-    if min(int(camera.width.item()), int(camera.height.item())) > 0:
-        return camera
-    return Cameras(camera.camera_to_worlds, fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=1, height=1).to(camera.device)
+def _drawable(camera: Cameras) -> tuple[Cameras, Camera]:
+    """The camera, or one near it where there is none such: nerfstudio's viewer takes any number for a resolution and a
+    field of view, and what it makes of 0 or of 180 degrees and more would end the thread that draws.
+    """
+    with suppress(InputError):
+        return camera, _opencv(camera)
+    width, height = int(camera.width.item()), int(camera.height.item())
+    if min(width, height) < 1:
+        width = height = 1
+    size, pose = max(width, height), camera.camera_to_worlds.reshape(3, 4)
+    if not bool(pose.isfinite().all()):
+        pose = torch.eye(4)[:3]
+    low, high = size * _WIDEST, size / _WIDEST
+    focal = torch.stack([camera.fx, camera.fy]).nan_to_num(size, posinf=high, neginf=low).clamp(low, high)
+    fx, fy = focal.reshape(2, 1, 1)
+    near = Cameras(pose[None], fx=fx, fy=fy, cx=width / 2, cy=height / 2, width=width, height=height)
+    near = near.to(camera.device)
+    return near, _opencv(near)
 
 
 @contextmanager

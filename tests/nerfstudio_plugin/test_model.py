@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import sys
 import urllib.error
 from dataclasses import fields, replace
@@ -92,6 +93,16 @@ def test_a_picture_without_pixels_is_one_pixel(pipeline, resolution: int, aspect
     outputs = pipeline.model.get_outputs_for_camera(camera)
     assert [*STOCK, *SEMANTIC] == [name for name in outputs if not name.startswith("relevancy_")]
     assert all(value.shape[:2] == (1, 1) and value.isfinite().all() for value in outputs.values())
+
+
+@pytest.mark.parametrize("fov", [0.0, 1e-30, math.pi, 3.2, 2 * math.pi, -1.0, math.inf, math.nan])
+def test_any_field_of_view_gives_a_picture(pipeline, fov: float) -> None:
+    """nerfstudio's panel takes any number, and a camera that is refused would end its thread that draws."""
+    pose = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[0]
+    for c2w in (pose, torch.full_like(pose, math.nan)):
+        state = CameraState(fov=fov, aspect=1.5, c2w=c2w, camera_type=CameraType.PERSPECTIVE)
+        outputs = pipeline.model.get_outputs_for_camera(get_camera(state, 8, 12))
+        assert all(value.shape[:2] == (8, 12) and value.isfinite().all() for value in outputs.values())
 
 
 def test_colours_without_spherical_harmonics(workspace: Path, registered: None, tmp_path: Path) -> None:
