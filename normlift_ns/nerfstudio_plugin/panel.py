@@ -122,6 +122,8 @@ class Panel(Face):
         elif name == "Clear":
             self._cancel()
             self._write("")
+            if self._widgets is not None:
+                self._widgets.forget()
             self._show(history.do(replace(actions.show_all(actions.clear(now)), did="Clear")))
         elif name == "shown" and self._widgets is not None:
             self._show(history.do(actions.show(now, self._widgets.place(value))))

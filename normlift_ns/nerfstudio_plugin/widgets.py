@@ -102,6 +102,10 @@ class Widgets:
                 )
         self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
 
+    def forget(self) -> None:
+        """Sets back what the next question would take over."""
+        self._set("Minimum reliability", self.reliability, 0.0)
+
     def follow(self, state: State) -> None:
         """Shows a state in every widget but the boxes in which a person types."""
         texts = () if state.answer is None else state.answer.texts

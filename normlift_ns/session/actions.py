@@ -27,7 +27,6 @@ MOST_STEPS = 10
 LOWEST, HIGHEST = -0.2, 1.0
 """Thresholds that a slider offers."""
 LOOK_FIRST = "Likely floaters are selected. Look at them, then press Hide; Undo takes it back."
-_NOTHING = "Nothing is selected."
 
 
 def ask(state: State, prompts: Sequence[Prompt], question: Question) -> State:
@@ -182,7 +181,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Hides Gaussians beside those that are hidden already; None: the selection."""
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError(f"{_NOTHING} There is nothing to hide.")
+        raise InputError("Nothing is selected. There is nothing to hide.")
     hidden = chosen if state.hidden is None else state.hidden | chosen
     return replace(state, hidden=hidden, did=f"Hide {int(chosen.sum()):,}")
 
@@ -191,7 +190,7 @@ def only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Draws these Gaussians alone, hidden or not before; None: the selection."""
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError(f"{_NOTHING} The screen would be blank.")
+        raise InputError("Nothing is selected. The screen would be blank.")
     return replace(state, hidden=~chosen, did=f"Only {int(chosen.sum()):,}")
 
 

@@ -109,6 +109,10 @@ class Panel:
             self._values[name] = value
             widget.value = value
 
+    def forget(self) -> None:
+        """Sets back what the next question would take over."""
+        self.set("min_reliability", self.sure, 0.0)
+
     def follow(self, state: State) -> None:
         """Shows a state in all widgets but the prompts, which belong to the person who types."""
         texts = () if state.answer is None else state.answer.texts

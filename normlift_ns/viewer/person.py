@@ -127,6 +127,8 @@ class Person:
             self._show(history.do(_SLIDERS[name](now, value), key=name))
         elif name in _DEEDS:
             self._show(history.do(_DEEDS[name](now)))
+            if name == "Clear":
+                self._panel.forget()
         elif name in ("Undo", "Redo"):
             self._show(history.undo() if name == "Undo" else history.redo())
         elif name == "shown":
@@ -180,10 +182,9 @@ class Person:
     def _answer(self, turn: Turn, line: str, **how: Any) -> None:
         """Shows the answer to a line of prompts, unless it comes too late. Texts are read without the lock."""
         with self._lock:
-            before, clicks = self.state.question, dict(self._memory.clicks)
+            before, clicks, sure = self.state.question, dict(self._memory.clicks), self._panel.sure.value
         prompts = read_prompts(line, self._run.read, self._run.known(clicks))
-        if before is not None:
-            how = {"min_reliability": before.min_reliability, **how}
+        how = {"min_reliability": min(1.0, max(0.0, sure)) if before is None else before.min_reliability, **how}
         prompts, question = pose(self._run.space.field, prompts, self._run.read, **how)
         with self._lock:
             if not self._turns.finish(turn):

@@ -54,6 +54,9 @@ _PROMPTS = """() => {
   box.select();
   return true;
 }"""
+_SHOWN = """() => [document.body.innerText,
+  ...[...document.querySelectorAll("input, textarea")].map((e) => e.value)].join(" | ")"""
+"""What a page says, and what is typed in it."""
 _STACKS = """
 Error.stackTraceLimit = 40;
 const told = console.error;
@@ -231,7 +234,10 @@ class Monkey:
             ("Ask", "purple object 1"), ("Why?", "These weigh most:"), ("Select likely floaters", "then press Hide"),
         ):  # fmt: skip
             page.get_by_role("button", name=name, exact=True).click()
-            page.get_by_text(answer).first.wait_for()
+            try:
+                page.get_by_text(answer).first.wait_for()
+            except TimeoutError as error:
+                raise AssertionError(f"no {answer!r} after {name}, but: {page.evaluate(_SHOWN)}") from error
         page.get_by_role("button", name="Clear", exact=True).click()
         page.wait_for_timeout(1000)
         page.context.close()

@@ -319,6 +319,17 @@ def test_hides_add_up_stay_and_are_undone(panel: Any, pipeline: Any) -> None:
     assert pipeline.model._display.drawn is None
 
 
+def test_clear_leaves_no_minimum_reliability_behind(panel: Any, pipeline: Any) -> None:
+    panel._widgets.reliability.value = 1.0  # before the first question, which takes it over
+    ask(panel, "left")
+    assert panel.answer.question.min_reliability == 1.0
+    panel.act("Clear")
+    assert panel._widgets.reliability.value == 0.0
+    ask(panel, "left")
+    assert panel.answer.question.min_reliability == 0.0
+    assert chosen(pipeline).any()
+
+
 def test_clear_clears_everything(panel: Any, pipeline: Any) -> None:
     ask(panel, "left, banana")
     panel.act("Hide")

@@ -240,6 +240,17 @@ def test_the_histogram_and_the_suggested_threshold(crowd, run):
     page.says("no threshold to suggest")
 
 
+def test_clear_leaves_no_minimum_reliability_behind(crowd, run):
+    page = opened(crowd, 0, "one")
+    page.gui["Reliability"].press(1.0)  # before the first question, which takes it over
+    page.ask("blue")
+    page.says("**0** of")
+    page.gui["History"].press("Clear")
+    page.until(lambda: page.gui["Reliability"].value == 0.0)
+    page.ask("blue")
+    page.says(f"**{BLOCK}** of")
+
+
 def test_floaters_are_selected_hidden_and_brought_back(crowd, run):
     page = opened(crowd, 0, "one")
     page.ask("blue")
