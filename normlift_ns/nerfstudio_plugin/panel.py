@@ -122,8 +122,10 @@ class Panel(Face):
         elif name == "Clear":
             self._cancel()
             self._write("")
+            with suppress(ValueError, OSError):  # as in `open`
+                self._negatives = join_prompts(default_negatives(now.space.field))
             if self._widgets is not None:
-                self._widgets.forget()
+                self._widgets.forget(self._negatives)
             self._show(history.do(replace(actions.show_all(actions.clear(now)), did="Clear")))
         elif name == "shown" and self._widgets is not None:
             self._show(history.do(actions.show(now, self._widgets.place(value))))

@@ -102,9 +102,11 @@ class Widgets:
                 )
         self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
 
-    def forget(self) -> None:
+    def forget(self, negatives: str) -> None:
         """Sets back what the next question would take over."""
         self._set("Minimum reliability", self.reliability, 0.0)
+        self._set("refined", self.refined, True)
+        self.rule.value, self.negatives.value = "auto", negatives
 
     def follow(self, state: State) -> None:
         """Shows a state in every widget but the boxes in which a person types."""

@@ -271,8 +271,12 @@ class Monkey:
         page.keyboard.insert_text("red, purple")
         page.wait_for_timeout(2000)
         page.get_by_role("button", name="Ask", exact=True).click()
-        page.get_by_text("Gaussians selected").first.wait_for()
-        page.get_by_text("purple", exact=False).first.wait_for()
+        try:
+            page.get_by_text("Gaussians selected").first.wait_for()
+            page.get_by_text("purple", exact=False).first.wait_for()
+        except TimeoutError as error:
+            shown = f"no answer, but: {page.evaluate(_SHOWN)}\nthe server's threads:\n{self._server.threads()}"
+            raise AssertionError(shown) from error
         page.context.close()
         self.check()
 

@@ -319,12 +319,15 @@ def test_hides_add_up_stay_and_are_undone(panel: Any, pipeline: Any) -> None:
     assert pipeline.model._display.drawn is None
 
 
-def test_clear_leaves_no_minimum_reliability_behind(panel: Any, pipeline: Any) -> None:
+def test_clear_leaves_no_settings_behind(panel: Any, pipeline: Any) -> None:
+    before = {name: getattr(panel._widgets, name).value for name in ("reliability", "rule", "refined", "negatives")}
+    panel._widgets.rule.value, panel._widgets.negatives.value = "cosine", "0.5"
+    panel._widgets.refined.value = False
     panel._widgets.reliability.value = 1.0  # before the first question, which takes it over
     ask(panel, "left")
     assert panel.answer.question.min_reliability == 1.0
     panel.act("Clear")
-    assert panel._widgets.reliability.value == 0.0
+    assert {name: getattr(panel._widgets, name).value for name in before} == before
     ask(panel, "left")
     assert panel.answer.question.min_reliability == 0.0
     assert chosen(pipeline).any()
