@@ -114,7 +114,7 @@ class NormLiftModel(SplatfactoModel):
         """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
 
         Args:
-            camera: one camera; for one that cannot be, which nerfstudio's viewer can ask for, see `_drawable`.
+            camera: one camera; where there is none such, which nerfstudio's viewer can ask for, one near it is drawn.
             obb_box: Gaussians outside are not drawn.
         """
         display, (camera, view) = self._display, _drawable(camera.to(self.device))
@@ -251,7 +251,7 @@ def _drawable(camera: Cameras) -> tuple[Cameras, Camera]:
         width = height = 1
     size, pose = max(width, height), camera.camera_to_worlds.reshape(3, 4)
     if not bool(pose.isfinite().all()):
-        pose = torch.eye(4)[:3]
+        pose = torch.eye(4, device=pose.device)[:3]
     low, high = size * _WIDEST, size / _WIDEST
     focal = torch.stack([camera.fx, camera.fy]).nan_to_num(size, posinf=high, neginf=low).clamp(low, high)
     fx, fy = focal.reshape(2, 1, 1)
