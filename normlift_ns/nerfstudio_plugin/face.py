@@ -104,7 +104,7 @@ class Face(torch.nn.Module):
     def install(self, viewer: Any) -> None:
         """Makes the tab in a viewer."""
         self._viewer = viewer
-        self._widgets = Widgets(viewer.viser_server, self.act)
+        self._widgets = Widgets(viewer.viser_server, self.act, self._lock)
         viewer.viser_server.on_client_disconnect(self._gone)
         pass_over_the_gone(viewer.viser_server)
         self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives

@@ -7,6 +7,7 @@ render lock while they work.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 from normlift_ns.colors import COLORMAPS
@@ -48,10 +49,12 @@ class Widgets:
     Args:
         server: viser's.
         act: called with the name of what was pressed or changed, its value and the client who did it.
+        lock: held while a change is told, so that none is taken back before `act` knows it.
     """
 
-    def __init__(self, server: Any, act: Callable[[str, Any, Any], None]) -> None:
+    def __init__(self, server: Any, act: Callable[[str, Any, Any], None], lock: AbstractContextManager[Any]) -> None:
         self._gui, self._act = server.gui, act
+        self._lock = lock
         self._values: dict[str, Any] = {}
         with first_tab(server.gui, TAB, "SEARCH"):
             self.prompts = self._gui.add_text("Prompts", "", hint="What to look for, separated by commas.")
@@ -104,8 +107,8 @@ class Widgets:
 
     def forget(self, negatives: str) -> None:
         """Sets back what the next question would take over."""
-        self._set("Minimum reliability", self.reliability, 0.0)
-        self._set("refined", self.refined, True)
+        self._reset("Minimum reliability", self.reliability, 0.0)
+        self._reset("refined", self.refined, True)
         self.rule.value, self.negatives.value = "auto", negatives
 
     def follow(self, state: State) -> None:
@@ -115,6 +118,7 @@ class Widgets:
         if tuple(self.shown.options) != options:
             self._values["shown"] = ALL_PROMPTS
             self.shown.options = options
+            self._values["shown"] = self.shown.value  # viser keeps the choice where the new options have it
         self._set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
         if state.question is not None:
             threshold = min(HIGHEST, max(LOWEST, state.question.threshold))
@@ -152,15 +156,21 @@ class Widgets:
         self._values[name] = widget.value
 
         def changed(event: Any) -> None:
-            if widget.value != self._values[name]:
-                self._values[name] = widget.value
-                self._act(name, widget.value, event.client)
+            with self._lock:
+                if widget.value != self._values[name]:
+                    self._values[name] = widget.value
+                    self._act(name, widget.value, event.client)
 
         widget.on_update(changed)
         return widget
 
     def _set(self, name: str, widget: Any, value: Any) -> None:
-        """Sets a widget without telling."""
+        """Sets a widget without telling; one that a person has just changed, which is still to be told, is left."""
+        if widget.value == self._values[name]:
+            self._reset(name, widget, value)
+
+    def _reset(self, name: str, widget: Any, value: Any) -> None:
+        """Sets a widget without telling, whatever a person has just done with it."""
         if widget.value != value:
             self._values[name] = value
             widget.value = value

@@ -333,6 +333,27 @@ def test_clear_leaves_no_settings_behind(panel: Any, pipeline: Any) -> None:
     assert chosen(pipeline).any()
 
 
+def test_what_a_person_changes_meanwhile_is_kept(panel: Any) -> None:
+    widgets = panel._widgets
+    widgets.reliability._impl.value = 0.25  # a browser has changed it; viser has not told it yet
+    panel.act("Threshold", 0.7)
+    assert widgets.reliability.value == 0.25
+    ask(panel, "left")
+    assert panel.answer.question.min_reliability == 0.25
+    for told in widgets.reliability._impl.update_cb:
+        told(SimpleNamespace(client=Browser()))
+    assert widgets.reliability.value == panel.answer.question.min_reliability == 0.25
+
+
+def test_the_next_question_shows_all_its_prompts(panel: Any) -> None:
+    ask(panel, "left, right")
+    panel._widgets.shown.value = "1: left"
+    until(lambda: panel.state.shown == 0)
+    ask(panel, "left, right, up")
+    assert panel.state.shown is None
+    assert panel._widgets.shown.value == "all prompts"
+
+
 def test_clear_clears_everything(panel: Any, pipeline: Any) -> None:
     ask(panel, "left, banana")
     panel.act("Hide")
