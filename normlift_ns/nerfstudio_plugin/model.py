@@ -114,7 +114,7 @@ class NormLiftModel(SplatfactoModel):
         """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
 
         Args:
-            camera: one camera; where there is none such, which nerfstudio's viewer can ask for, one near it is drawn.
+            camera: one camera. nerfstudio's viewer can ask for impossible ones; a possible one is drawn instead.
             obb_box: Gaussians outside are not drawn.
         """
         display, (camera, view) = self._display, _drawable(camera.to(self.device))

@@ -49,7 +49,7 @@ class Widgets:
     Args:
         server: viser's.
         act: called with the name of what was pressed or changed, its value and the client who did it.
-        lock: held while a change is told, so that none is taken back before `act` knows it.
+        lock: the panel's, held while a change is passed to `act`, so that no other thread takes it back meanwhile.
     """
 
     def __init__(self, server: Any, act: Callable[[str, Any, Any], None], lock: AbstractContextManager[Any]) -> None:
@@ -165,12 +165,12 @@ class Widgets:
         return widget
 
     def _set(self, name: str, widget: Any, value: Any) -> None:
-        """Sets a widget without telling; one that a person has just changed, which is still to be told, is left."""
+        """Sets a widget without telling `act`, unless a person has changed it and `act` has not been told yet."""
         if widget.value == self._values[name]:
             self._reset(name, widget, value)
 
     def _reset(self, name: str, widget: Any, value: Any) -> None:
-        """Sets a widget without telling, whatever a person has just done with it."""
+        """Sets a widget without telling `act`, even where a person has just changed it."""
         if widget.value != value:
             self._values[name] = value
             widget.value = value
