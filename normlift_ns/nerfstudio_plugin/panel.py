@@ -248,7 +248,8 @@ class Panel(Face):
             self._offer_to_replace(now.question is not None)
             raise
         self._offer_to_replace(False)
-        self.tell(f"Saved: the run stores {count} prompts now. ns-render draws them.")
+        stored = "one prompt" if count == 1 else f"{count} prompts"
+        self.tell(f"Saved: the run stores {stored} now, for ns-render to draw.")
 
     def _offer_to_replace(self, offered: bool) -> None:
         if self._widgets is not None:

@@ -46,8 +46,14 @@ def save_question(folder: Path, question: Question) -> Path:
 
     Raises:
         ValueError: what `load_question` would refuse.
+        FileNotFoundError: the folder is gone.
         OSError: the file cannot be written.
     """
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder} is gone: the run was moved or deleted after it was opened, and nothing was stored. Open the run "
+            "where it is now"
+        )
     if question.suggest:
         raise InputError(
             "the question cannot be stored: its threshold is to be suggested; ask it, and store the answer's"
@@ -60,7 +66,9 @@ def save_question(folder: Path, question: Question) -> Path:
     arrays = {name: value.astype(np.float32) for name, value in given.items()}
     try:
         stored = _encoded(facts)
-        _question(stored, arrays)
+        checked = _question(stored, arrays)
+        if (folder / MANIFEST).exists():
+            _check_belongs(checked, read_manifest(folder)[0])
     except (ValueError, TypeError) as error:
         raise InputError(f"the question cannot be stored: {error}") from error
     save_arrays(folder / QUERIES_FILE, arrays, {_KEY: stored}, overwrite=True)
@@ -76,10 +84,10 @@ def load_question(folder: Path) -> Question | None:
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
         return None
+    if not os.path.isfile(path):
+        raise InputError(f"{path} is damaged (it is no file). {_REMEDY}")
+    arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
     try:
-        if not os.path.isfile(path):
-            raise InputError("it is no file")
-        arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
         if set(stored) != {_KEY}:
             raise InputError(f"its metadata has {sorted(stored)}, expected {_KEY}")
         question = _question(stored[_KEY], arrays)
@@ -87,7 +95,7 @@ def load_question(folder: Path) -> Question | None:
             _check_belongs(question, read_manifest(folder)[0])
         return question
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
+        raise InputError(f"{path} is damaged ({error}). {_REMEDY}") from error
 
 
 def _encoded(facts: _Facts) -> str:

@@ -113,9 +113,9 @@ def _write_tensors(
     inside = folder / FIELD_FOLDER
     if texts:
         write_text_vectors(inside / TEXTS_FILE, texts)
+    field.save(inside, beside=digests_beside(inside, [path, inside / TEXTS_FILE, *folder.glob("*.json")]))
     if question is not None:
         save_question(inside, question)
-    field.save(inside, beside=digests_beside(inside, [path, inside / TEXTS_FILE, *folder.glob("*.json")]))
 
 
 def _slim(checkpoint: Checkpoint) -> dict[str, Any]:

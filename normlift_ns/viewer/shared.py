@@ -102,7 +102,8 @@ class Run:
             raise InputError("No query yet; there is nothing to save.")
         whole = merged(load_question(self.folder / FIELD_FOLDER), question)
         save_question(self.folder / FIELD_FOLDER, whole)
-        return f"The run stores {len(whole.texts)} prompts now; ns-render and ns-viewer draw them."
+        stored = "one prompt" if len(whole.texts) == 1 else f"{len(whole.texts)} prompts"
+        return f"The run stores {stored} now, for ns-render and ns-viewer to draw."
 
     def exported(self, mask: Bool[torch.Tensor, " n"], name: str, answer: Answer | None) -> tuple[str, bytes, str]:
         """Some Gaussians as a PLY file: its name, its content, and a message.

@@ -640,7 +640,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any, opened
     assert torch.equal(chosen(pipeline), (similar > 0.9) & field.valid())
     clicked = chosen(pipeline)
     panel.act("Save prompts in run")
-    assert "the run stores 1 prompts" in said(panel)
+    assert "the run stores one prompt" in said(panel)
     ask(panel, "left")
     assert panel.answer.question.threshold == 0.5  # not that of the click
     stored = load_question(pipeline.model.config.semantics)

@@ -39,6 +39,17 @@ def test_what_is_stored_is_loaded(question: Question, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["queries.safetensors"]
 
 
+def test_nothing_is_stored_in_a_run_that_is_gone_or_was_replaced(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"normlift is gone: .* moved or deleted .* nothing was stored"):
+        save_question(tmp_path / "normlift", WHOLE)
+    assert list(tmp_path.iterdir()) == []
+    manifest = {"num_gaussians": 1, "means_fingerprint": "", "form": "float16", "schema_version": 1, "features": {}}
+    write_manifest(tmp_path, {**manifest, "dimension": 4}, {})
+    with pytest.raises(InputError, match="its vectors have 3 numbers, the features of the run 4"):
+        save_question(tmp_path, WHOLE)
+    assert not (tmp_path / "queries.safetensors").exists()
+
+
 FACTS = {"texts": ["a"], "negatives": [], "form": "cosine", "threshold": 0.5, "min_reliability": 0, "refined": True}
 
 
@@ -49,7 +60,7 @@ FACTS = {"texts": ["a"], "negatives": [], "form": "cosine", "threshold": 0.5, "m
 def test_a_damaged_file_says_what_to_do(facts: str | None, tmp_path: Path) -> None:
     metadata = None if facts is None else {"question": facts}
     save_file({"vectors": torch.eye(3)[:1]}, tmp_path / "queries.safetensors", metadata=metadata)
-    with pytest.raises(ValueError, match=r"queries\.safetensors is damaged .*--save True"):
+    with pytest.raises(ValueError, match=r"queries\.safetensors is damaged\b.*--save True"):
         load_question(tmp_path)
     (tmp_path / "queries.safetensors").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"queries\.safetensors is damaged"):
@@ -63,7 +74,7 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
         changed = bytearray(whole)
         changed[bit // 8] ^= 1 << bit % 8
         path.write_bytes(changed)
-        with pytest.raises(ValueError, match=r"queries\.safetensors is damaged .*--save True"):
+        with pytest.raises(ValueError, match=r"queries\.safetensors is damaged\b.*--save True"):
             load_question(tmp_path)
 
 

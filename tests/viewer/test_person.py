@@ -339,7 +339,7 @@ def test_clicks_are_armed_cancelled_and_asked_again(crowd, run):
     page.says("like click 1")
     page.says(f"**{BLOCK}** of")
     page.gui["Save prompts in run"].press()
-    page.says("stores 1 prompts")
+    page.says("stores one prompt")
     again = opened(crowd, 1, "another")
     again.until(lambda: again.gui["Prompts"].value == "like click 1")
     again.gui["Ask"].press()
