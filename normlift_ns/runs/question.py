@@ -84,10 +84,10 @@ def load_question(folder: Path) -> Question | None:
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
         return None
-    if not os.path.isfile(path):
-        raise InputError(f"{path} is damaged (it is no file). {_REMEDY}")
-    arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
     try:
+        if not os.path.isfile(path):
+            raise InputError("it is no file")
+        arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
         if set(stored) != {_KEY}:
             raise InputError(f"its metadata has {sorted(stored)}, expected {_KEY}")
         question = _question(stored[_KEY], arrays)
@@ -95,7 +95,7 @@ def load_question(folder: Path) -> Question | None:
             _check_belongs(question, read_manifest(folder)[0])
         return question
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise InputError(f"{path} is damaged ({error}). {_REMEDY}") from error
+        raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
 
 
 def _encoded(facts: _Facts) -> str:
