@@ -36,3 +36,12 @@ def visible(text: str, keep: str = "") -> str:
     return "".join(
         c if c.isprintable() or c in keep else c.encode("unicode_escape", "surrogatepass").decode() for c in text
     )
+
+
+def shortened(text: str, most: int = 40) -> str:
+    """The text, cut where it is longer than `most` characters.
+
+    >>> shortened("a red bowl", 8)
+    'a red b…'
+    """
+    return text if len(text) <= most else text[: most - 1] + "…"

@@ -31,7 +31,7 @@ class NormLiftQuery:
     load_config: Path
     """Path to config YAML file of the lifted run."""
     text: tuple[str, ...] = ()
-    """What to look for, one or several texts."""
+    """What to look for, one or several texts: --text mug 'red bowl'. A text may contain commas."""
     ask: AskOptions = field(default_factory=AskOptions)
     interactive: bool = False
     """Ask text after text at a prompt; the run stays open."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from normlift_ns.errors import InputError
 from normlift_ns.ranges import check_device, check_options
 from normlift_ns.scripts.early import check_lifted, readable_file
 from normlift_ns.scripts.shared import Terminated, run_command, run_process, say
@@ -48,6 +50,7 @@ class NormLiftView:
     def main(self) -> None:
         """Serves until it is interrupted."""
         check_device(self.device)
+        _check_host(self.host)
         check_lifted(self.load_config, self.data)
         readable_file(self.text_vectors, "--text-vectors")
         from normlift_ns.viewer.serving.door import Door  # noqa: PLC0415 (--help should not wait for viser)
@@ -83,6 +86,18 @@ class NormLiftView:
         shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.share_readonly, lambda: run.votes)
         people = People(shared)
         door.open(f"normlift: {run.scene.name}", people.come, people.go)
+
+
+def _check_host(host: str) -> None:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"--host {host} is no address that this machine can listen at ({error}). Leave it out to let only this "
+            "machine look, or give 0.0.0.0 to let everybody in who can reach it."
+        ) from None
 
 
 def entrypoint() -> None:

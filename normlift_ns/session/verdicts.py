@@ -21,10 +21,10 @@ class Verdict:
     """Of the prompt."""
     histogram: Histogram
     words: str
-    """That it is probably not in the scene, and where the scene is most like it; empty: it stands out, or nobody can
-    tell."""
+    """That it is probably not in the scene, or that nothing reaches the threshold, and where the scene is most like it;
+    empty: something is selected that stands out, or nobody can tell."""
     nearest: tuple[float, float, float] | None = None
-    """Where the scene is most like it, if it is probably not there."""
+    """Where the scene is most like it, if there are words."""
 
 
 def verdicts(state: State, *, most: int = 3) -> tuple[Verdict, ...]:
@@ -46,12 +46,19 @@ def verdicts(state: State, *, most: int = 3) -> tuple[Verdict, ...]:
 
 
 def _words(finding: Finding, histogram: Histogram) -> str:
-    if is_click(finding.text) or histogram.stands_out is not False:
+    if is_click(finding.text) or histogram.stands_out is None:
         return ""
     place = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
+    if not histogram.stands_out:
+        return (
+            f"{finding.text}: probably not in this scene. The nearest match{place} has relevancy {histogram.top:.2f}; "
+            f"things that are in a scene reach {histogram.limit:.2g} or more."
+        )
+    if finding.peak is None or bool(finding.mask.any()):
+        return ""
     return (
-        f"{finding.text}: probably not in this scene. The nearest match{place} has relevancy {histogram.top:.2f}; "
-        f"things that are in a scene reach {histogram.limit:.2g} or more."
+        f"{finding.text}: nothing is above the threshold of {finding.answer.question.threshold:.2f}. "
+        f"The nearest match{place} has relevancy {finding.peak:.2f}; lower the threshold, or press Suggested."
     )
 
 

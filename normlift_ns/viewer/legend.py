@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from normlift_ns.colors import Colormap, colors_of
-from normlift_ns.errors import visible
+from normlift_ns.errors import shortened, visible
 
 LEAST_HEIGHT = 160
 """Pictures that are lower, as viewers draw them while the camera moves, have no room for a legend."""
@@ -28,8 +28,7 @@ def clipped(text: str, most: int) -> str:
     >>> clipped("a  red bowl", 8)
     'a red b…'
     """
-    line = visible(" ".join(text.split()))
-    return line if len(line) <= most else line[: most - 1] + "…"
+    return shortened(visible(" ".join(text.split())), most)
 
 
 @lru_cache(maxsize=16)

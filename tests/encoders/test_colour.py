@@ -153,6 +153,7 @@ def test_several_names_answer_alike():
 @pytest.mark.parametrize(
     ("prompt", "message"),
     [
+        (10_000 * "x", f"'{39 * 'x'}…' contains no colour name"),
         ("darkred chair", "'darkred chair' contains no colour name.*dark red.*--encoder open_clip"),
         ("bleu", "blue"),
         ("7", "such as red, dark green, sky blue"),

@@ -41,6 +41,9 @@ def test_help_tells_every_flag_and_loads_nothing_heavy():
         (("--load-config", "config.yml", "--port", "70000"), "--port"),
         (("--load-config", "config.yml", "--most-drawn", "0"), "--most-drawn"),
         (("--load-config", "config.yml", "--device", "tpu"), "tpu"),
+        (("--load-config", "config.yml", "--host", "192.0.2.1"), "--host 192.0.2.1 is no address that this machine"),
+        (("--load-config", "config.yml", "--host", "no-such-host.invalid"), "--host no-such-host.invalid is no"),
+        (("--load-config", "config.yml", "--host", "a" * 70), "is no address that this machine can listen at"),
     ],
 )
 def test_mistakes_are_told_before_anything_is_loaded(flags, message, tmp_path):

@@ -104,3 +104,12 @@ def test_floaters_are_a_selection_like_any_other():
     assert bool((actions.hide(after).drawn == rows(0, 2, 3)).all())
     with pytest.raises(InputError, match="no likely floaters"):
         actions.select_floaters(state, COLOUR.none())
+
+
+def test_a_threshold_that_nothing_reaches_is_said_with_the_best_match():
+    state = asked(COLOUR, "red")
+    assert not verdicts(state)[0].words
+    (verdict,) = verdicts(actions.threshold(state, 1.0))
+    assert verdict.words.startswith("red: nothing is above the threshold of 1.00. The nearest match at ")
+    assert verdict.words.endswith(" has relevancy 1.00; lower the threshold, or press Suggested.")
+    assert verdict.nearest is not None

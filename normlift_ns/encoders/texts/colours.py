@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from normlift_ns.encoders.texts.prompts import check_prompts
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -182,6 +182,6 @@ def _unknown(prompt: str) -> str:
     near = [name for name in near if _COARSE.isdisjoint(name.split())]
     shown = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
-        f"text {prompt!r} contains no colour name; the colour encoder knows the names of the XKCD colour survey only, "
-        f"such as {shown}: use one of them, or lift with --encoder open_clip for other words"
+        f"text {shortened(prompt)!r} contains no colour name; the colour encoder knows the names of the XKCD colour "
+        f"survey only, such as {shown}: use one of them, or lift with --encoder open_clip for other words"
     )

@@ -21,7 +21,7 @@ from normlift_ns.core.disk.arrays import array_digest
 from normlift_ns.core.files import new_file
 from normlift_ns.encoders.npy import read_array
 from normlift_ns.encoders.texts.prompts import check_prompts, unit_rows
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -151,7 +151,7 @@ def look_up(prompts: Sequence[str], vectors: Mapping[str, Any], where: str) -> F
             hint = (
                 f"which holds {len(vectors)}; near names: {', '.join(near)}" if len(vectors) > 0 else "which holds none"
             )
-            raise InputError(f"text {prompt!r} has no vector in {where}, {hint}")
+            raise InputError(f"text {shortened(prompt)!r} has no vector in {where}, {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
