@@ -105,16 +105,17 @@ def different(**paths: Path | None) -> None:
             seen[place] = name.replace("_", "-")
 
 
-def check_config(config: Path, data: Path | None, step: int | None = None) -> None:
+def check_config(config: Path, data: Path | None, step: int | None = None, *, wrote: str = "ns-train") -> None:
     """A config.yml that can be opened, its dataset, and its checkpoint where a step is named."""
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
         clean(run_dir.parent)  # a lift that was killed while it replaced the run
     if not config.is_file():
         hint = f"; {config / 'config.yml'} exists, give that" if (config / "config.yml").is_file() else ""
+        method = "splatfacto" if wrote == "ns-train" else "normlift"
         raise FileNotFoundError(
-            f"No config at {config}{hint}. Expected the config.yml that ns-train wrote, "
-            "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
+            f"No config at {config}{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
         )
     _check_access(config, "--load-config")
     if data is not None and not data.exists():
@@ -138,7 +139,7 @@ def check_config(config: Path, data: Path | None, step: int | None = None) -> No
 
 def check_lifted(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
     """A lifted run, and what is needed to ask it texts."""
-    check_config(config, data)
+    check_config(config, data, wrote="ns-normlift")
     folder = field_folder(Path(os.path.abspath(config)).parent)
     if ask is None:
         return

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 
 from normlift_ns.errors import InputError
 from normlift_ns.session.prompts import join_prompts
@@ -26,6 +27,12 @@ class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     look_at: Place
     up: Place
     fov: Annotated[float, msgspec.Meta(gt=0, lt=3.14)]
+
+    @property
+    def looks(self) -> bool:
+        """Whether it looks anywhere: not at where it is, and not along its vertical."""
+        ahead = np.subtract(self.look_at, self.position)
+        return bool(np.linalg.norm(np.cross(ahead, self.up)) > 0)
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

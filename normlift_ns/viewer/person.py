@@ -306,7 +306,7 @@ class Person:
     def _follow(self, link: Link) -> None:
         """Asks the question of a link, from its camera."""
         self._memory.clicks.update({name: n for name, n in link.clicks.items() if is_click(name)})
-        if link.view is not None:
+        if link.view is not None and link.view.looks:
             self._eye.go(link.view)
         if link.look in get_args(Look):
             self._show(self._memory.history.do(actions.look(self.state, link.look)))

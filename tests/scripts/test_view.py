@@ -37,7 +37,10 @@ def test_help_tells_every_flag_and_loads_nothing_heavy():
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--load-config", "nowhere/config.yml"), "No config at nowhere/config.yml"),
+        (
+            ("--load-config", "nowhere/config.yml"),
+            "No config at nowhere/config.yml. Expected the config.yml that ns-normlift wrote",
+        ),
         (("--load-config", "config.yml", "--port", "70000"), "--port"),
         (("--load-config", "config.yml", "--most-drawn", "0"), "--most-drawn"),
         (("--load-config", "config.yml", "--device", "tpu"), "tpu"),

@@ -64,3 +64,12 @@ def test_other_greetings_are_refused(text):
 def test_damaged_links_are_told(link):
     with pytest.raises(InputError, match="copy it again"):
         read_link("q=" + base64.urlsafe_b64encode(link.encode()).decode())
+
+
+@pytest.mark.parametrize(
+    ("look_at", "up", "looks"),
+    [((0, 1, 0), (0, 0, 1), True), ((1e-9, 0, 0), (0, 0, 1), True), ((0, 0, 0), (0, 0, 1), False),
+     ((0, 1, 0), (0, 0, 0), False), ((0, 0, 2), (0, 0, 1), False), ((1e30, 1e30, 0), (0, 0, 1e30), True)],
+)  # fmt: skip
+def test_a_camera_that_looks_nowhere_is_known(look_at, up, looks):
+    assert View((0, 0, 0), look_at, up, 1.0).looks is looks
