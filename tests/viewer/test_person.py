@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
 from normlift_ns import Camera, GaussianScene
 from normlift_ns.insight.floaters import find_floaters
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.runs.question import load_question
-from normlift_ns.viewer.links import read_link
+from normlift_ns.viewer.links import View, read_link, write_link
 from normlift_ns.viewer.people import People
 from normlift_ns.viewer.records import make_records
 from normlift_ns.viewer.shared import Run
@@ -417,6 +418,10 @@ def test_a_link_carries_question_and_camera(crowd, run):
     other.until(lambda: other.gui["Threshold"].value == 0.25)
     broken = opened(crowd, 2, "three", page.link[:-7])
     broken.says("copy it again")
+    nowhere = View((1, 2, 3), (1, 2, 3), (0, 0, 1), 1.0)
+    blind = opened(crowd, 3, "four", write_link(structs.replace(link, view=nowhere)))
+    blind.says(f"**{3 * BLOCK}** of")
+    assert not np.array_equal(blind.camera.position, blind.camera.look_at)  # it stays where a page begins
 
 
 def test_a_page_that_is_gone_before_its_panel_is_made_leaves_nothing(crowd):
