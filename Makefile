@@ -1,8 +1,11 @@
 # make demo, make test and make test-slow work on a fresh clone with Python 3.10 to 3.12 and make alone: they create .venv and install everything.
 PYTHON ?= python3
 BIN := .venv/bin
+# Files of tests are shared among so many processes; one after the other: make test WORKERS=0
+WORKERS ?= 2
+BESIDE := -n $(WORKERS) --dist loadfile
 
-.PHONY: test test-slow test-viser1 soak torture demo bench lint format clean
+.PHONY: check style changed-types quick-tests test test-slow test-viser1 soak torture demo docs bench lint format clean
 
 .venv/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 12) else f"Python 3.10 to 3.12 is needed, this is {v[0]}.{v[1]}; try: make PYTHON=python3.11 $(MAKECMDGOALS)")'
@@ -11,16 +14,33 @@ BIN := .venv/bin
 	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv pip install --quiet -e ".[dev]"
 	touch $@
 
-lint: .venv/installed
+style: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
+
+lint: style
 	$(BIN)/basedpyright
 
-test: lint
-	$(BIN)/pytest -m "not slow"
+# The inner loop: style, types of the files that differ from main, and the fastest tests of the core
+check: style changed-types quick-tests
 
+changed-types: .venv/installed
+	@base=$$(git merge-base HEAD main 2>/dev/null || echo HEAD); \
+	{ git diff --name-only --diff-filter=d $$base; git ls-files --others --exclude-standard; } | sort -u | \
+	grep -E '^(normlift_ns|benchmarks)/.*\.py$$' | xargs -r $(BIN)/basedpyright
+
+QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metrics checks)
+quick-tests: .venv/installed
+	$(BIN)/pytest -q $(BESIDE) -m "not slow" $(QUICK) tests/test_imports.py
+
+test: lint
+	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow"
+
+# A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time
 test-slow: .venv/installed
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest $(BESIDE) $(JUNIT) -m slow --ignore=tests/browser
+	$(BIN)/pytest -m slow tests/browser
 
 # The viewer with viser 1.x, in an environment of its own
 test-viser1: .venv/installed
@@ -35,6 +55,9 @@ torture: .venv/installed
 
 demo: .venv/installed
 	$(BIN)/python -m normlift_ns.scripts.demo
+
+docs: .venv/installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: .venv/installed
 	$(BIN)/python -m benchmarks.cpu

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from normlift_ns.demo import DemoRoom
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # another process tests beside this one; read when torch is imported
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Imports stand inside the fixtures: the other tests need not wait for them.
 _OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")
@@ -18,9 +25,9 @@ _OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")
 @pytest.fixture(scope="session")
 def room() -> DemoRoom:
     """The room itself."""
-    from normlift_ns.demo import demo_room  # noqa: PLC0415
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415
 
-    return demo_room(6000)
+    return plain_room(6000)
 
 
 @pytest.fixture(scope="session")
@@ -53,6 +60,16 @@ def opened(lifted: Path, tmp_path: Path, doctest_namespace: dict[str, Any], monk
     monkeypatch.setitem(doctest_namespace, "config", lifted)
     monkeypatch.setitem(doctest_namespace, "folder", tmp_path)
     monkeypatch.setattr(CONSOLE, "quiet", True)
+
+
+@pytest.fixture(autouse=True)
+def _gradients() -> Iterator[None]:
+    """No test leaves torch without gradients: the next that trains in the same process would fail in its place."""
+    yield
+    torch = sys.modules.get("torch")
+    if torch is not None and not torch.is_grad_enabled():
+        torch.set_grad_enabled(True)
+        pytest.fail("gradients are switched off after this test")
 
 
 @pytest.fixture(autouse=True)

@@ -1,10 +1,10 @@
 """Accuracy where the truth is known: the refinement's variants and other methods over a ladder of damage.
 
-    python -m benchmarks.accuracy                     tabletop and demo room, every Gaussian votes; for a GPU
+    python -m benchmarks.accuracy                     tabletop and plain room, every Gaussian votes; for a GPU
     python -m benchmarks.accuracy --voters 4000 --views 22
                                                       for CPUs: a sample votes and counts, half of the tabletop's views,
                                                       no 2D accuracy, no A^2 and top-k weights
-    python -m benchmarks.accuracy --quick             demo room of 20,000 Gaussians, three steps of the ladder, 2 seeds
+    python -m benchmarks.accuracy --quick             plain room of 20,000 Gaussians, three steps of the ladder, 2 seeds
     python -m benchmarks.accuracy --minutes 9         no new observation after so many minutes; the same command goes on
 
 Writes results/accuracy.json: means over seeds with 95 % intervals (Student's t), in points (per cent). Keys without a

@@ -1,8 +1,8 @@
 """Which R says of a consensus's answers how good they are, and which one a vote should use: that of F or that of F'.
 
-    python -m benchmarks.consensus                 tabletop (half of its views), demo room and second room
+    python -m benchmarks.consensus                 tabletop (half of its views), plain room and second room
     python -m benchmarks.consensus --minutes 9     no new observation after so many minutes; the same command goes on
-    python -m benchmarks.consensus --quick         demo room of 20,000 Gaussians, two steps, one seed
+    python -m benchmarks.consensus --quick         plain room of 20,000 Gaussians, two steps, one seed
 
 Writes results/consensus.json. Damage and seeds are those on which no parameter was fitted (`fit.HELD_OUT`, seeds from
 200 on), and the two of the ladder whose mistakes are not independent. Of every observation: Kendall's tau of R and of

@@ -1,6 +1,6 @@
 """Whether the study of coverage suggests photographs that help: its choices against random ones.
 
-    python -m benchmarks.coverage                     demo room and, where the captures are, the tabletop
+    python -m benchmarks.coverage                     plain room and, where the captures are, the tabletop
     python -m benchmarks.coverage --scenes demo --steps "noise only"
 
 Of the training views, eight neighbours are lifted, as if a capture had begun. Four more are added: those that the study

@@ -1,6 +1,6 @@
 """Hyper-parameters of the vote, fitted on some damages and seeds and reported on others; sensitivity curves.
 
-    python -m benchmarks.fit                                        tabletop and demo room, for a GPU
+    python -m benchmarks.fit                                        tabletop and plain room, for a GPU
     python -m benchmarks.fit --scenes demo --voters 500 --seeds 1   for CPUs
 
 Procedure: K stays at 36, because the time of the vote grows with its square, and sigma_d at 1 or more, because below

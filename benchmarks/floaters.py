@@ -1,15 +1,15 @@
 """Likely floaters: the share that is found and the share of real Gaussians that is lost, with floaters put in.
 
-    python -m benchmarks.floaters                     demo room, and the tabletop where the captures are
+    python -m benchmarks.floaters                     plain room, and the tabletop where the captures are
     python -m benchmarks.floaters --scenes demo --quick
 
 Writes results/floaters.json. `worlds.with_floaters` puts 5 % more Gaussians before the cameras, half-transparent blobs
 that belong to nothing. Real are Gaussians of known class; masks and features are damaged as in `damage`.
 
 The rule by which the limit was chosen, written before this benchmark gave a number, but after looking at how well
-single signals tell floaters, at 1 % lost: on the demo room with damage "mild" and seed 0, the least limit, rounded up
+single signals tell floaters, at 1 % lost: on the plain room with damage "mild" and seed 0, the least limit, rounded up
 to a tenth, at which at most 1 % of the real Gaussians are lost. All other rows are not looked at for it. The terms of
-the score were chosen in sight of both scenes: by the distance alone that suits the demo room, in units of the scene's
+the score were chosen in sight of both scenes: by the distance alone that suits the plain room, in units of the scene's
 median distance, 15 % of the tabletop's real Gaussians were lost, because a capture is coarse far away from its middle.
 
 Keys: <scene>.<damage>.found and .lost at the default limit, in % of Gaussians; .lost_weight in % of W_j of real ones;
@@ -121,6 +121,6 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", nargs="+", default=["demo", "tabletop"], help="demo, tabletop")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--views", type=int, default=16, help="training views of the tabletop")
-    parser.add_argument("--quick", action="store_true", help="one seed, a smaller demo room")
+    parser.add_argument("--quick", action="store_true", help="one seed, a smaller plain room")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

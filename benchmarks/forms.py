@@ -2,7 +2,7 @@
 
 On the tabletop capture the exact instance masks are the regions; features are real CLIP text vectors of the objects'
 names, disturbed anew in every view by noise of a given length. Errors are measured on every eighth of the 1,203 names
-of the vector file, against float64 directions. On the tabletop, the demo room and the fox, the colour encoder sees
+of the vector file, against float64 directions. On the tabletop, the plain room and the fox, the colour encoder sees
 masks or, where there are none, superpixels; its errors are measured on the survey's colour names.
 
     python -m benchmarks.forms
@@ -27,10 +27,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.captures import SHARED, trained_scene, training_cameras, training_indices
+from benchmarks.plain_room import plain_room
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, Evidence, SemanticField, lift, rasterize_evidence
 from normlift_ns.core.consensus import consensus
-from normlift_ns.demo import demo_cameras, demo_room, view_image, view_labels
+from normlift_ns.demo import demo_cameras, view_image, view_labels
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Superpixels
 from normlift_ns.encoders.source import joint_partition
@@ -89,12 +90,12 @@ def clip_cases(some: Sequence[str]) -> Iterator[Case]:
 
 def colour_cases(some: Sequence[str]) -> Iterator[Case]:
     """Mean colours of masks, or of superpixels where there are none."""
-    encoder, room = ColourEncoder(), demo_room()
+    encoder, room = ColourEncoder(), plain_room()
     names = [name.removesuffix("_colour") for name in some if name.endswith("_colour")]
     queries = encoder.text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
     for name in names:
         scene = room.scene if name == "demo" else trained_scene(name)
-        cameras = demo_cameras() if name == "demo" else training_cameras(name)
+        cameras = demo_cameras(width=320, height=240) if name == "demo" else training_cameras(name)
         images = [view_image(room, x) for x in cameras] if name == "demo" else photographs(name, cameras)
         labels = (
             [view_labels(room, camera).int() - 1 for camera in cameras] if name == "demo"

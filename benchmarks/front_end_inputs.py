@@ -13,6 +13,7 @@ import transformers
 from torch import Tensor
 
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.hub.encoder import HubEncoder
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.encoders.sam.network import SamNetwork
 from normlift_ns.options import SamPrecision
@@ -32,9 +33,11 @@ class Size:
     """Width, layers, heads and input side of SAM's image encoder."""
     cold: int = 50
     """Images of the process that begins without compiled kernels."""
+    siglip: tuple[int, int, int, int] = (768, 12, 12, 256_000)
+    """Width, layers and heads of both towers of SigLIP 2, and tokens of its vocabulary; by default those of base."""
 
 
-SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128), 2)
+SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128), 2, (32, 2, 2, 300))
 SMALL_CLIP = {
     "embed_dim": 24,
     "vision_cfg": {"image_size": 32, "layers": 2, "width": 64, "head_width": 32, "patch_size": 8},
@@ -65,6 +68,26 @@ def random_clip(size: Size, folder: Path, device: str) -> OpenClipEncoder:
         open_clip.add_model_config(folder / f"{size.clip}.json")
     torch.save(open_clip.create_model(size.clip).state_dict(), folder / "clip.pt")
     return OpenClipEncoder(size.clip, str(folder / "clip.pt"), device=device)
+
+
+def random_siglip2(size: Size, folder: Path, device: str) -> HubEncoder:
+    """SigLIP 2 at 224 pixels with patches of 16, written as transformers does, with a tokenizer of two tokens."""
+    width, layers, heads, vocabulary = size.siglip
+    tower = {
+        "hidden_size": width,
+        "intermediate_size": 4 * width,
+        "num_hidden_layers": layers,
+        "num_attention_heads": heads,
+    }
+    config = transformers.SiglipConfig(text_config={**tower, "vocab_size": vocabulary}, vision_config=tower)
+    model = transformers.SiglipModel(config)
+    with torch.no_grad():  # transformers leaves both at 0, which says nothing
+        model.logit_scale.fill_(4.7)
+        model.logit_bias.fill_(-16.0)
+    tokenizer = transformers.Siglip2Tokenizer(model_input_names=["input_ids"], padding_side="right")
+    model.save_pretrained(folder)
+    transformers.SiglipProcessor(transformers.SiglipImageProcessor(), tokenizer).save_pretrained(folder)
+    return HubEncoder("siglip2", str(folder), device=device)
 
 
 def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> Tensor:

@@ -1,4 +1,5 @@
-"""What seeing the images costs: SAM's network, the rules on its masks, CLIP on their crops, CLIP's patches.
+"""What seeing the images costs: SAM's network, the rules on its masks, CLIP and SigLIP 2 on their crops and in patches;
+SAM 2.
 
 All networks have random weights. Masks are injected: cells of a power diagram, whose areas spread as those of objects
 do, each grown over its neighbours; for the suppression three in ten are replaced by near copies of others. Images are
@@ -37,13 +38,15 @@ from benchmarks.front_end_inputs import (
     injected_sam,
     random_clip,
     random_sam,
+    random_siglip2,
     with_copies,
 )
 from benchmarks.front_end_networks import Exact, add_networks, decode_all, seconds
+from benchmarks.front_end_sam2 import add_sam2
 from benchmarks.report import RESULTS, Report
 from normlift_ns.encoders import source as source_module
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.sam import masks as sam_module
 from normlift_ns.encoders.sam import network as network_module
 from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
@@ -163,13 +166,31 @@ STEPS = {
 }
 
 
+def add_siglip2(report: Report, size: Size, image: Tensor, g: torch.Generator, device: str) -> None:
+    """SigLIP 2 base on the crops of masks and in patches; errors are those against float32 on the CPU."""
+    with tempfile.TemporaryDirectory() as folder:
+        encoder = random_siglip2(size, Path(folder), device)
+        exact = replace(encoder, device="cpu")
+        _ = encoder.network, exact.network
+    for count in size.masks[:2]:
+        labels = stack_masks(injected_masks(count, size, g, device))
+        encode_s = seconds(lambda labels=labels: encoder.encode(image, labels), device)
+        few = labels.where(labels < 8, -1)
+        off = (1 - (encoder.encode(image, few) * exact.encode(image, few.cpu())).sum(dim=1)).abs().max()
+        report.add(f"siglip2_encode_{count}_s", encode_s, f"s/image, SigLIP 2 base on {count} masks", off)
+    patches, near = PatchFeatures(encoder, size.patches), PatchFeatures(exact, size.patches)
+    off = (1 - (patches.features(image, "") * near.features(image, "")).sum(dim=1)).abs().max()
+    time_s = seconds(lambda: patches.features(image, ""), device)
+    report.add("siglip2_patches_s", time_s, f"s/image, SigLIP 2 base in {size.patches} patches", off)
+
+
 def main(quick: bool, output: Path, device: str, variants: bool) -> None:
     size = SMALL if quick else Size()
     report, g = Report("front_ends"), torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (size.height, size.width, 3), generator=g, dtype=torch.uint8)
     model = random_sam(size, device).requires_grad_(False)
     sam = injected_sam(size, model, device)
-    network = sam.network
+    network: Any = sam.network
 
     crops = crop_boxes(size.height, size.width, MaskRules().crop_overlap)
     pixels = network.pixels([image[y0:y1, x0:x1] for x0, y0, x1, y1 in crops])
@@ -240,6 +261,8 @@ def main(quick: bool, output: Path, device: str, variants: bool) -> None:
     near = PatchFeatures(exact, size.patches).features(image, "")
     off = (1 - (normalize(patches.features(image, ""), dim=1) * near).sum(dim=1)).abs().max()
     report.add("patches_s", seconds(lambda: patches.features(image, ""), device), "s/image", off)
+    add_siglip2(report, size, image, g, device)
+    add_sam2(report, size, image, device)
     if device == "cuda":
         report.add("gpu_peak_gib", torch.cuda.max_memory_allocated() / 2**30, "GiB")
     report.write(output)

@@ -179,7 +179,7 @@ def variants(room: Room, most: int = 2**17) -> None:
     n = len(room.means)
     voters = voting.spatial_order(room.means)
     voters = voters[n // 3 : n // 3 + most]
-    gaussians = kernel.members(voters, room.neighbors.index)
+    gaussians = kernel.members(voters, room.neighbors.index, len(room.means))
     rows = room.lifted.directions(gaussians)
     row_of = torch.zeros(n, dtype=torch.int32, device=rows.device)
     row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=rows.device)
@@ -188,7 +188,7 @@ def variants(room: Room, most: int = 2**17) -> None:
     def cast(config: RefineConfig, precision: Any) -> torch.Tensor:
         source = torch.full((n,), -1, dtype=torch.int32, device=rows.device)
         arrays = (voters, room.neighbors.index, room.neighbors.distance, rows, row_of, room.reliability, source)
-        numbers, width = config.numbers, float(voting.decay_width(room.neighbors, config))
+        numbers, width = config.numbers, float(voting.decay_width(room.neighbors.spacing, config))
         given = {"tau": numbers.tau, "gamma": numbers.gamma, "width": width, "delta": numbers.delta}
         own = room.own if config.vote == "posterior" else None
         kernel.vote(*arrays, **given, own=own, prior=config.prior, precision=precision)

@@ -4,7 +4,7 @@
     python -m benchmarks.grid --minutes 9           no new cell after so many minutes; the same command goes on later
     python -m benchmarks.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second third
                                                     for CPUs: a sample votes and counts
-    python -m benchmarks.grid --quick               a small demo room, three cells per kind of region, for the tests
+    python -m benchmarks.grid --quick               a small plain room, three cells per kind of region, for the tests
 
 Every finished cell is one line of `--rows`, which a later call reads first. The decision so far is always printed;
 results/grid.json is written when no cell is missing, or with `--report`.
@@ -52,9 +52,9 @@ def site_of(place: Place, settings: Settings) -> Site:
     return Site(place, settings)
 
 
+@torch.no_grad()
 def run_cells(cells: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, deadline: float) -> int:
     """Runs cells of one place until the deadline (`time.time`), and says how many."""
-    torch.set_grad_enabled(False)
     for done, cell in enumerate(cells):
         if time.time() > deadline:
             return done
@@ -100,8 +100,8 @@ def cells_to_run(scenes: Sequence[str], quick: bool) -> list[Cell]:
     return [cell for cell in cells if not quick or (cell[1:4] in QUICK_CELLS and cell.views in ("all", "3"))]
 
 
+@torch.no_grad()
 def main(arguments: argparse.Namespace) -> None:
-    torch.set_grad_enabled(False)
     start = time.time()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     given = {key: getattr(arguments, key) for key in ("voters", "gaussians", "views", "room_views", "pieces")}
@@ -139,7 +139,7 @@ if __name__ == "__main__":
     parser.add_argument("--pieces", type=int, help="superpixels, cells or patches per image; 256, 256, 1024 by default")
     parser.add_argument("--workers", type=int, default=1, help="processes that run cells")
     parser.add_argument("--minutes", type=float, help="no cell begins later than this")
-    parser.add_argument("--quick", action="store_true", help="a few cells of a small demo room")
+    parser.add_argument("--quick", action="store_true", help="a few cells of a small plain room")
     parser.add_argument("--report", action="store_true", help="write the report even if cells are missing")
     parser.add_argument("--rows", type=Path, default=RESULTS / "grid_rows.jsonl", help="file of finished cells")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the report")

@@ -1,13 +1,13 @@
 """Thresholds suggested from histograms, and the word "probably not in this scene", against the truth.
 
-    python -m benchmarks.honest_answers           demo room, and the tabletop where the captures are
+    python -m benchmarks.honest_answers           plain room, and the tabletop where the captures are
     python -m benchmarks.honest_answers --scenes demo
 
 Writes results/honest_answers.json. CLIP-like features are made as in `damage`, of vectors of LVIS names: those of the
-scene's classes (in the demo room 13 names drawn at random), and four others as negatives. 60 names more, none closer to
-a class than a cosine of 0.9, are asked for as well and are in no scene. The colour encoder looks at pictures of the
-demo room, cut into superpixels and into squares; words that are not in the scene are all names of the XKCD survey whose
-cosine to every colour of the room is below 0.5.
+scene's classes (in the plain room 13 names drawn at random), and four others as negatives. 60 names more, none closer
+to a class than a cosine of 0.9, are asked for as well and are in no scene. The colour encoder looks at pictures of
+the plain room, cut into superpixels and into squares; words that are not in the scene are all names of the XKCD
+survey whose cosine to every colour of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
   iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5), suggested, Otsu's, and
@@ -27,12 +27,13 @@ import numpy as np
 import torch
 
 from benchmarks.damage import LADDER, observe
+from benchmarks.plain_room import plain_room
 from benchmarks.report import RESULTS, Report
 from benchmarks.worlds import Words, World, demo, real_words, tabletop
 from normlift_ns import nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import lift
-from normlift_ns.demo import demo_cameras, demo_room, view_image
+from normlift_ns.demo import demo_cameras, view_image
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid, Superpixels
 from normlift_ns.encoders.source import RegionFeatures
@@ -144,10 +145,10 @@ def clip_like(report: Report, world: World) -> None:
 
 
 def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:
-    """Rows of the demo room, seen by the colour encoder."""
+    """Rows of the plain room, seen by the colour encoder."""
     from matplotlib.colors import XKCD_COLORS  # noqa: PLC0415 (the names)
 
-    room, cameras, texts = demo_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColourTexts()
+    room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColourTexts()
     names = [name.removeprefix("xkcd:") for name in XKCD_COLORS if "/" not in name]
     classes, survey = texts.text(room.names), texts.text(names)
     others = survey[(survey @ classes.T).amax(1) < NOT_A_COLOUR]

@@ -1,4 +1,4 @@
-"""What the presets cost in task accuracy: mIoU against that of the default on the same damaged masks of the demo room.
+"""What the presets cost in task accuracy: mIoU against that of the default on the same damaged masks of the plain room.
 
     python -m benchmarks.losses      a few minutes on two CPU cores
 

@@ -1,7 +1,7 @@
 """What a query and a lift cost against another version of the program: as whole commands, run in turns.
 
     git worktree add ../before b9779a0
-    python -m benchmarks.overhead --before ../before                  a demo room, 15 runs each
+    python -m benchmarks.overhead --before ../before                  a plain room, 15 runs each
     python -m benchmarks.overhead --before ../before --config FILE    a trained run of your own
     python -m benchmarks.overhead --before ../before --quick          3 runs of a small room
 
@@ -97,10 +97,11 @@ def spread(values: list[float]) -> float:
 
 
 def demo(folder: Path, gaussians: int) -> Path:
-    """config.yml of a trained demo room."""
-    from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415 (nerfstudio)
+    """config.yml of a trained plain room."""
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415 (nerfstudio)
+    from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415 (nerfstudio)
 
-    room = demo_room(gaussians)
+    room = plain_room(gaussians)
     write_capture(room, folder / "room", views=12, held_out=2, width=320, height=240)
     return write_splatfacto_run(room, folder / "room", folder / "outputs")
 
@@ -145,7 +146,7 @@ def main(before: Path, config: Path | None, repeats: int, gaussians: int, output
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", type=Path, required=True, help="checkout of the version to compare with")
-    parser.add_argument("--config", type=Path, help="config.yml of a trained run; by default that of a demo room")
+    parser.add_argument("--config", type=Path, help="config.yml of a trained run; by default that of a plain room")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--quick", action="store_true", help="3 runs of a small room")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")

@@ -1,4 +1,4 @@
-"""The demo room at step "hard" of the ladder of damage, every pixel in the colour of its class.
+"""The plain room at step "hard" of the ladder of damage, every pixel in the colour of its class.
 
 python -m benchmarks.pictures      docs/refinement.png and docs/consensus.png
 
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.damage import LADDER, Observed, observe
+from benchmarks.plain_room import plain_room
 from benchmarks.plots import DOCS
 from benchmarks.variants import Scores, lifted_scores, refined_scores
 from benchmarks.worlds import World, demo, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors, render
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.metrics import classify, mask_iou
-from normlift_ns.demo import demo_room
 
 STEP, SEED, VIEW = "hard", 0, 0
 """The view is one of those held out."""
@@ -69,7 +69,7 @@ def main() -> None:
     torch.set_grad_enabled(False)
     world = demo()
     means, classes = world.scene.means, (words := made_words(world.classes)).classes
-    palette = np.array([*(to_rgb(f"xkcd:{name}") for name in demo_room(2000).names), (0, 0, 0)])
+    palette = np.array([*(to_rgb(f"xkcd:{name}") for name in plain_room(2000).names), (0, 0, 0)])
     observed = observe(world, words, LADDER[STEP], SEED)
     near = nearest_neighbors(means, RefineConfig().k)
     lifted = lift(observed.evidence, observed.features)

@@ -26,7 +26,7 @@ from benchmarks.features import (
 )
 from benchmarks.worlds import Words, World
 from normlift_ns import Evidence, rasterize_evidence
-from normlift_ns.encoders.clip.patches import patch_grid
+from normlift_ns.encoders.patches import patch_grid
 from normlift_ns.encoders.regions import Grid, Superpixels, resample_nearest
 
 KINDS = ("superpixels", "grid", "patches")

@@ -24,7 +24,8 @@ from benchmarks.captures import SHARED
 from benchmarks.gpu_cases import Case, capture_case, timed
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, RefineConfig, SemanticField, lift, nearest_neighbors, refine
-from normlift_ns.core.refine import decay_width, spatial_order
+from normlift_ns.core.portions import spatial_order
+from normlift_ns.core.refine import decay_width
 from normlift_ns.kernels.vote import vote
 
 
@@ -69,7 +70,8 @@ def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
         vote(
             *(spatial_order(means), neighbors.index, neighbors.distance, directions, row_of),
             *(lifted.scalars.reliability, source),
-            tau=numbers.tau, gamma=numbers.gamma, width=float(decay_width(neighbors, config)), delta=numbers.delta,
+            tau=numbers.tau, gamma=numbers.gamma, delta=numbers.delta,
+            width=float(decay_width(neighbors.spacing, config)),
             own=own if config.vote == "posterior" else None, prior=config.prior,
             precision="tf32",
         )  # fmt: skip

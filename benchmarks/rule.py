@@ -5,7 +5,7 @@ variant is the mean mIoU over Gaussians, in points, of its 4 seeds, the same for
 cell is the value of `none` less its own. Cells count equally. Seeds are 1000 to 1003, which no earlier fit, table or
 test has seen.
 
-*Scenes.* Choices are made on the tabletop and the demo room. Two more rooms (`benchmarks.second_room` and
+*Scenes.* Choices are made on the tabletop and the plain room. Two more rooms (`benchmarks.second_room` and
 `benchmarks.third_room`) confirm or refute what was chosen and are never looked at for a choice.
 
 *History.* At first there was the second room alone, and it refuted the first choice, consensus with power 2: better by
@@ -28,7 +28,7 @@ minutes, because what distinguishes pieces is what they show, and these two span
 
 That is 212 cells of masks and 87 of pieces per scene, 299 x 4 x 4 seeds = 4,784 observations.
 
-*Candidates* are those of `candidates.CANDIDATES`. One is **eligible** if, on the cells of tabletop and demo room,
+*Candidates* are those of `candidates.CANDIDATES`. One is **eligible** if, on the cells of tabletop and plain room,
 
 1. undamaged (step "noise only" with all views, every statistic and kind of region), it loses at most 0.2 points on
    average,

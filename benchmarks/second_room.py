@@ -1,4 +1,4 @@
-"""A second room: what is chosen on the tabletop and the demo room is confirmed or refuted here, and nowhere else.
+"""A second room: what is chosen on the tabletop and the plain room is confirmed or refuted here, and nowhere else.
 
 A long bedroom beside `normlift_ns.demo`'s square room with a table in the middle: other objects, other sizes, other
 densities, a camera that walks through instead of round. It was written before anything was fitted on the grid, and no

@@ -1,6 +1,6 @@
 """What R knows: Gaussians without evidence, R against opacity, accuracy by number of views, and what mixing does.
 
-    python -m benchmarks.signals                  demo room and, where the captures are, the tabletop
+    python -m benchmarks.signals                  plain room and, where the captures are, the tabletop
     python -m benchmarks.signals --scenes demo
 
 Writes results/signals.json. Drift: two features of different classes are mixed, a f + (1 - a) g; it drifts where the

@@ -7,6 +7,7 @@ from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps, ta
 from benchmarks.grid_tables import columns, verdicts
 from benchmarks.hard_case import DOUBLE, QUANTITIES
 from benchmarks.numerics import CASES
+from benchmarks.segments_tables import segments, segments_objects
 from benchmarks.signals import STEP
 
 PREFIXES = {"tabletop": "tabletop.", "demo": "demo."}
@@ -47,6 +48,8 @@ def tables(found: Documents) -> dict[str, str]:
         "grid-second": verdicts(found["grid"], "second"),
         "grid-third": verdicts(found["grid"], "third"),
         "grid-columns": columns(found["grid"]),
+        "segments": segments(found["segments"]),
+        "segments-objects": segments_objects(found["segments"]),
     }
 
 

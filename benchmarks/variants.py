@@ -66,7 +66,7 @@ def refined_scores(
 
 
 def _average(reliability: Tensor, scores: Scores, neighbors: Neighbors, config: RefineConfig) -> Scores:
-    cosine, valid, width = scores.cosine.clone(), scores.valid.clone(), decay_width(neighbors, config)
+    cosine, valid, width = scores.cosine.clone(), scores.valid.clone(), decay_width(neighbors.spacing, config)
     for i in (neighbors.index >= 0).any(1).nonzero().squeeze(1).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i].long()], dim=1).clamp(min=0)
         weight = voting_weights(neighbors, width, i, reliability).to(scores.cosine)

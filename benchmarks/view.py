@@ -188,7 +188,9 @@ def fox_run(folder: Path) -> Path:
 
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     options, colour = LiftOptions(max_views=12, lift_downscale=2), SourceOptions(encoder="colour")
-    return NormLift(source, source=colour, lift=options, output_dir=folder, timestamp="view").main().config
+    run = NormLift(source, source=colour, lift=options, output_dir=folder, timestamp="view").main()
+    assert run is not None
+    return run.config
 
 
 def add_fox_view(report: Report) -> None:

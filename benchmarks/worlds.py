@@ -18,11 +18,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.captures import SHARED, all_cameras, base_colors, trained_scene, training_indices
+from benchmarks.plain_room import plain_room
 from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
 from normlift_ns.core.evidence import MASKED
 from normlift_ns.core.metrics import NO_CLASS
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras, view_labels
+from normlift_ns.demo import DemoRoom, demo_cameras, held_out_cameras, view_labels
 from normlift_ns.encoders.source import joint_partition
 
 BLOCKS = 40
@@ -166,9 +167,9 @@ def tabletop(views: int | None = None) -> World:
 
 
 def demo(num_gaussians: int = 40_000, views: int = 24, width: int = 320) -> World:
-    """The demo room: thirteen classes, known of every Gaussian but floaters, whether any view sees it or not."""
+    """The plain room: thirteen classes, known of every Gaussian but floaters, whether any view sees it or not."""
     size = width, width * 3 // 4
-    return world_of_room("demo", demo_room(num_gaussians), demo_cameras(views, *size), held_out_cameras(4, *size))
+    return world_of_room("demo", plain_room(num_gaussians), demo_cameras(views, *size), held_out_cameras(4, *size))
 
 
 def world_of_room(name: str, room: DemoRoom, cameras: list[Camera], held_out: list[Camera]) -> World:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from normlift_ns.raster.settings import RasterSettings as RasterSettings
     from normlift_ns.scenes.opening import open_splat as open_splat
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "asking": ("Answer", "Finding"),

@@ -14,6 +14,7 @@ from torch import Tensor
 from normlift_ns.core.field import SemanticField
 from normlift_ns.insight.histogram import Histogram, histogram, suggested_threshold, top_limit
 from normlift_ns.objects import SceneObject, find_objects
+from normlift_ns.options import RULES
 from normlift_ns.question import Question
 from normlift_ns.selection import Selection
 from normlift_ns.text_encoders import encoder_name
@@ -197,7 +198,7 @@ def answer(field: SemanticField, means: Float[Tensor, "n 3"], question: Question
     Raises:
         ValueError: vectors of another length than the field's, a rule without its negatives.
     """
-    given = None if question.rule == "cosine" else question.negative_vectors
+    given = question.negative_vectors if RULES[question.rule].compares else None
     negatives = None if given is None else torch.from_numpy(given)
     vectors = torch.from_numpy(question.vectors)
     relevancy = field.relevancy(vectors, negatives, rule=question.rule, refined=question.refined)

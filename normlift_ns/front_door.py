@@ -6,46 +6,34 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.asking import answer
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import clean
-from normlift_ns.core.gpu import choose_device, wake
+from normlift_ns.core.gpu import choose_device
+from normlift_ns.core.portions import ALONE
 from normlift_ns.core.scene import Scene, camera_summary, cameras_differ
-from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.encoders.given import GivenFeatures, given_features
-from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.lifting import Export, drawn_by, lift_scene
-from normlift_ns.options import CANONICAL_NEGATIVES, LiftOptions, SourceOptions
-from normlift_ns.question import Question, make_question
-from normlift_ns.ranges import check_bool, check_number, check_path, check_texts
-from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.options import LiftOptions, SourceOptions
+from normlift_ns.ranges import check_number, check_path
 from normlift_ns.runs.files import (
-    FIELD_FOLDER,
-    TEXTS_FILE,
-    cache_folder,
     check_run,
     load_field,
     recorded_rules,
-    refuse_existing_run,
-    run_directory,
-    tidy,
-    with_paths,
 )
-from normlift_ns.runs.write import write_run
-from normlift_ns.scenes.match import judge, match_photographs
-from normlift_ns.scenes.nerfstudio.load import CheckedViews, NerfstudioScene, load_scene
-from normlift_ns.scenes.opening import SplatScene
+from normlift_ns.scenes.added import with_saved
+from normlift_ns.scenes.nerfstudio.load import CheckedViews, load_scene
 from normlift_ns.scenes.saved import is_saved_splat, open_saved_splat
-from normlift_ns.stages import Report, Stages
-from normlift_ns.text_encoders import encoder_settings, given_settings, with_texts
+from normlift_ns.stages import Report
+from normlift_ns.team.seen import Export
+from normlift_ns.text_encoders import with_texts
+from normlift_ns.together import lift_run_together
 
 
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
@@ -72,6 +60,7 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
         scene = open_saved_splat(run_dir, data=place, load_step=load_step)
     else:
         scene = load_scene(config, data=place, load_step=load_step, by_nerfstudio=_by_nerfstudio)
+        scene = with_saved(scene, run_dir)
     rules = recorded_rules(run_dir)
     return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
 
@@ -166,7 +155,8 @@ def lift_run(
         texts: with `features`: what the run can be asked, with vectors [D]; they are stored in the run.
         lift: how to lift.
         queries: texts to store in the run; ns-render and ns-viewer show their relevancy.
-        data, load_step: as in `open_scene`, for a config.
+        data: as in `open_scene`, for a config.
+        load_step: likewise.
         output_dir: in place of the run's own outputs folder.
         timestamp: name of the new run directory; None: the present time, with a number where a run has that name.
         overwrite: replace a run directory of that name, and exported files of other content.
@@ -189,101 +179,21 @@ def lift_run(
     >>> 0.2 < run.ask("left")["left"].fraction < 0.8
     True
     """
-    if features is None and texts is not None:
-        raise InputError("texts are for features of your own; give features too, or leave texts out")
-    if features is not None and source is not None:
-        raise InputError("features of your own take the place of source; give one of the two")
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step are for a config; give them to open_scene")
-    check_texts("queries", queries)
-    check_bool("overwrite", overwrite)
-    check_bool("check", check)
-    target = None if output_dir is None else check_path("output_dir", output_dir)
-    if timestamp is not None:
-        run_directory(Path(), "run", timestamp)  # its name shows before the scene loads
-    for name, value, kind in (
-        ("source", source, SourceOptions),
-        ("lift", lift, LiftOptions),
-        ("export", export, Export),
-    ):
-        if value is not None and not isinstance(value, kind):
-            raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
-    device, options = choose_device(device), source or SourceOptions()
-    wake(device)
-    made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
-    if made is not None and len(queries) > 0:
-        made.text(queries)
-    scene = config_or_scene
-    if isinstance(scene, str | Path):
-        scene = open_scene(scene, data=data, load_step=load_step)
-    if not isinstance(scene, NerfstudioScene | SplatScene):
-        raise TypeError(
-            f"lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got {type(scene).__name__}"
-        )
-    run_dir = run_directory(target or scene.runs_dir, scene.name, timestamp)
-    tidy(run_dir)
-    if timestamp is not None:
-        refuse_existing_run(run_dir, overwrite)
-    say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
-    for remark in scene.remarks:
-        say(f"Warning: {remark}")
-    how, stages = lift or LiftOptions(), Stages(report)
-    if check:
-        with stages("check") as step:
-            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)), device=device)
-            warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
-            step()
-        if warning is not None:
-            say(f"Warning: {warning}")
-    if export is not None:
-        _refuse_equal_stems(scene.train.names)
-    settings = encoder_settings(options)
-    if made is None:
-        made = given_features(features, texts, scene.train.names)
-        texts = made.texts
-        settings = given_settings(TEXTS_FILE if texts else None)
-        if len(queries) > 0:
-            made.text(queries)
-    field, seconds = lift_scene(
-        scene, made, how, cache_folder(run_dir), device=device, encoder=settings, export=export, report=report
-    )
-    if features is None:
-        field = replace(field, manifest={**field.manifest, "source": source_settings(options, device)})
-    seconds = {**stages.seconds, **seconds}
-    with stages("write") as step:
-        question = _question(field, scene.gaussians.means, made, queries)
-        run_dir = write_run(
-            scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
-        )
-        field = field.to("cpu")
-        step()
-    seconds["write"] = stages.seconds["write"]
-    return LiftedRun(run_dir, scene, with_paths(field, run_dir / FIELD_FOLDER), device, seconds)
+    run = lift_run_together(
+        ALONE, opener(config_or_scene, data, load_step), source=source, features=features, texts=texts, lift=lift,
+        queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check, device=device,
+        export=export, report=report, say=say,
+    )  # fmt: skip
+    assert run is not None
+    return run
 
 
-def _refuse_equal_stems(names: Sequence[str]) -> None:
-    """LangSplat's format names files by the stems of the images."""
-    stems = [Path(name).stem for name in names]
-    for i, stem in enumerate(stems):
-        if stem in stems[:i]:
-            raise InputError(
-                f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
-                "Give the images other names, or lift without --export-langsplat."
-            )
-
-
-def _question(
-    field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
-) -> Question | None:
-    if len(queries) == 0:
-        return None
-    length = source.text(queries).shape[1]
-    if length != field.dimension:
-        raise InputError(
-            f"the vectors of --queries have {length} numbers, the features {field.dimension}; name the model that made "
-            "the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
-        )
-    negatives = None
-    if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
-        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
-    return answer(field, means, make_question(field, source.text, queries, negatives=negatives)).question
+def opener(
+    config_or_scene: str | Path | Scene, data: str | Path | None = None, load_step: int | None = None
+) -> Callable[[], Scene]:
+    """What opens a scene when it is needed."""
+    if not isinstance(config_or_scene, str | Path):
+        return lambda: config_or_scene
+    return partial(open_scene, config_or_scene, data=data, load_step=load_step)

@@ -23,17 +23,22 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
 from normlift_ns.insight.floaters import Floaters, find_floaters
 from normlift_ns.insight.why import Why
-from normlift_ns.options import FLOATER_LIMIT, Rule
+from normlift_ns.objects.catalogue import Catalogue, Similarity, make_catalogue
+from normlift_ns.objects.instances import Instances, find_instances
+from normlift_ns.options import FLOATER_LIMIT, MIN_SIZE, REACH, TRANSFER_DISTANCE, Rule
 from normlift_ns.question import Question, make_question
-from normlift_ns.ranges import check_bool, check_path
+from normlift_ns.ranges import check_bool, check_number, check_path
 from normlift_ns.raster.rasterize import render, render_picture
 from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, texts_cache
 from normlift_ns.runs.question import load_question, save_question
-from normlift_ns.runs.splats import export_files, write_splats
+from normlift_ns.runs.splats import drawn_rows, export_files, instances_of, semantic_columns, write_splats
+from normlift_ns.runs.transfer import Labelled, label_cloud, read_cloud
 from normlift_ns.runs.votes import Votes
+from normlift_ns.scenes.similarity import capture_worlds
 from normlift_ns.text_encoders import Texts, encoder_of
 from normlift_ns.viewer.display import draw, make_display
+from normlift_ns.viewer.pictures import write_masks
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -138,14 +143,19 @@ class LiftedRun:
         *,
         answer: Answer | None = None,
         objects: Mapping[str, Any] | None = None,
+        reach: float = REACH,
+        min_size: int = MIN_SIZE,
         overwrite: bool = False,
     ) -> Int64[ndarray, " m"]:
         """Writes Gaussians to a PLY file, and beside it their rows in the scene as <stem>_rows.npy; returns those rows.
+        With an answer, the names of its classes and objects go to <stem>_names.json.
 
         Args:
             part: what an answer, or one of its findings, selects; or a mask of Gaussians; None: the whole scene.
-            answer: whose relevancies and labels the file gets; None: that of `part`, if it has one.
+            answer: whose relevancies, class_id and instance_id the file gets; None: that of `part`, if it has one.
             objects: a table to write beside it as <stem>_objects.json, JSON types only.
+            reach: of objects, as in `find_objects`.
+            min_size: likewise.
             overwrite: replace files of these names; without `objects`, an earlier table of them goes.
         Raises:
             FileExistsError: a file is there and `overwrite` is False.
@@ -159,11 +169,12 @@ class LiftedRun:
         if answer is not None and not isinstance(answer, Answer):
             raise InputError(f"answer must be an answer of this run, got {type(answer).__name__}")
         refuse_run_files(*export_files(path), instead="name")
-        for file in export_files(path)[: 2 if objects is None else 3]:
-            if file.exists() and not overwrite:
+        answer = _asked(part) if answer is None else answer
+        ply, numbers, names, table = export_files(path)
+        for file, wanted in ((ply, True), (numbers, True), (names, answer is not None), (table, objects is not None)):
+            if wanted and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        asked = _asked(part)
-        answer = asked if answer is None else answer
+        instances = None if answer is None else instances_of(answer, reach=reach, min_size=min_size)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
         return write_splats(
             path,
@@ -173,9 +184,98 @@ class LiftedRun:
             keep=keep,
             spherical_harmonics=self.scene.has_harmonics,
             rasterize_mode=self.scene.rasterize_mode,
+            instances=instances,
             objects=objects,
             overwrite=overwrite,
         )
+
+    def masks(
+        self,
+        folder: str | Path,
+        part: Answer | Finding | Bool[Tensor, " n"],
+        *,
+        rest: bool = False,
+        overwrite: bool = False,
+    ) -> list[Path]:
+        """Writes a PNG per training photograph, of its size, 255 where a selection makes more than half of a pixel,
+        else 0. What stands before hides it. Lens distortion is taken out, as the scene was trained. Returns the paths.
+
+        Args:
+            part: what an answer, or one of its findings, selects; or a mask of Gaussians.
+            rest: 255 where the photograph shows anything else, or nothing.
+            overwrite: replace files of these names.
+        Raises:
+            FileExistsError: a file is there and `overwrite` is False.
+            ValueError: a mask of another type or length.
+
+        >>> from normlift_ns import open_run
+        >>> run = open_run(config)
+        >>> files = run.masks(folder / "masks", run.ask("red")["red"])
+        >>> len(files) == len(run.scene.train), files[0].suffix
+        (True, '.png')
+        """
+        settings, folder = RasterSettings.recorded(self.field.manifest), check_path("folder", folder)
+        return write_masks(self.scene, self._mask(part), folder, rest=rest, settings=settings, overwrite=overwrite)
+
+    def transfer(
+        self,
+        cloud: str | Path,
+        path: str | Path,
+        part: Answer | Finding,
+        *,
+        transfer_distance: float = TRANSFER_DISTANCE,
+        coordinates: Literal["capture", "scene"] = "capture",
+        overwrite: bool = False,
+    ) -> Labelled:
+        """Writes a point cloud or mesh again, with relevancies, class_id and instance_id of the nearest Gaussian.
+
+        Args:
+            cloud: a PLY file.
+            path: the PLY file to write.
+            part: an answer, or one of its findings, whose answer is taken.
+            transfer_distance: how far a point may be from the centre of its Gaussian, in units of their median spacing.
+            coordinates: those of the cloud. capture: of the cameras before nerfstudio turned and scaled them. scene: of
+                the Gaussians.
+            overwrite: replace a file of that name.
+        Raises:
+            FileNotFoundError: no such cloud.
+            FileExistsError: a file is there and `overwrite` is False.
+            ValueError: no answer, no PLY file, one that has such labels already; a distance that is not positive.
+
+        >>> from normlift_ns import open_run
+        >>> run = open_run(config)
+        >>> rows = run.export(folder / "cloud.ply")
+        >>> labelled = run.transfer(folder / "cloud.ply", folder / "red.ply", run.ask("red"), coordinates="scene")
+        >>> labelled.points == len(rows), labelled.share  # every point is a Gaussian
+        (True, 1.0)
+        """
+        answer, path = _asked(part), check_path("path", path)
+        if answer is None:
+            raise InputError(
+                f"part must be an answer of this run, or what it says of a text; got {type(part).__name__}"
+            )
+        check_number("transfer_distance", transfer_distance)
+        how: dict[str, Any] = {"distance": transfer_distance, "coordinates": coordinates, "overwrite": overwrite}
+        return self.transfer_to(read_cloud(check_path("cloud", cloud)), path, answer, instances_of(answer), **how)
+
+    def transfer_to(
+        self,
+        cloud: Any,
+        path: Path,
+        answer: Answer,
+        instances: Instances,
+        *,
+        distance: float,
+        coordinates: Literal["capture", "scene"],
+        overwrite: bool,
+    ) -> Labelled:
+        """`transfer`, of a cloud that is read and with objects that are found."""
+        rows = drawn_rows(self.scene.parameters, spherical_harmonics=self.scene.has_harmonics)
+        means = self.scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
+        means = self.to_capture.points(means) if coordinates == "capture" else means
+        columns = semantic_columns(self.field, answer, instances)
+        columns = {name: x[rows] for name, x in columns.items() if name not in ("reliability", "n_eff")}
+        return label_cloud(cloud, path, means, columns, distance, overwrite=overwrite)
 
     @cached_property
     def votes(self) -> Votes:
@@ -202,6 +302,53 @@ class LiftedRun:
         """
         asked = _asked(part)
         return self.votes.explain(self._mask(part), refined=asked is None or asked.question.refined)
+
+    def catalogue(
+        self, part: Answer | Finding | Bool[Tensor, " n"], *, metres_per_unit: float | None = None
+    ) -> Catalogue:
+        """The objects of a selection: number, size, oriented box, centroid, extent, R, and the photographs that show
+        each, in the coordinates of the capture and in those of the scene. docs/objects.md explains every number.
+
+        Args:
+            part: what an answer, or one of its findings, selects; or a mask of Gaussians, whose objects have no text.
+                A Gaussian that several texts select belongs to the one of largest relevancy.
+            metres_per_unit: length of one unit of the capture; places in the capture are in metres then.
+        Raises:
+            ValueError: a mask of another type or length, a length that is not positive, a damaged
+                dataparser_transforms.json.
+            FileNotFoundError: the run has no dataparser_transforms.json.
+
+        >>> from normlift_ns import open_run
+        >>> run = open_run(config)
+        >>> ball = run.catalogue(run.ask("red", "yellow"), metres_per_unit=2.0).objects[0]
+        >>> ball.id, ball.text, ball.gaussians > 20, ball.views, len(ball.best_views)
+        (1, 'red', True, 10, 3)
+        >>> bool(max(ball.capture.box.size) < 1.5 * min(ball.capture.box.size))  # about as wide as high
+        True
+        """
+        if metres_per_unit is not None:
+            check_number("metres_per_unit", metres_per_unit)
+        how: dict[str, Any] = {"metres_per_unit": metres_per_unit, "device": self.device}
+        return make_catalogue(self.scene, self.field, self._instances(part), self.to_capture, **how)
+
+    @property
+    def to_capture(self) -> Similarity:
+        """From the coordinates of the Gaussians to those of the capture, the transform of its training undone.
+
+        Raises:
+            FileNotFoundError, ValueError: as `catalogue`.
+        """
+        found = Similarity.identity()
+        for world in capture_worlds(self.folder, self.scene.identity):
+            found = Similarity.undoing(world.transform, world.scale).then(found)
+        return found
+
+    def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:
+        """Classes and objects of a part."""
+        if isinstance(part, Answer):
+            return instances_of(part)
+        text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
+        return find_instances((text,), self.scene.gaussians.means, mask.float(), mask)
 
     def floaters(self, limit: float = FLOATER_LIMIT) -> Floaters:
         """Gaussians that likely belong to no surface, see `insight.floaters`. `run.export(path, ~found.mask)` writes

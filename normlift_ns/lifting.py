@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -19,45 +19,24 @@ from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.lift import Lifted, Scalars, lift
 from normlift_ns.core.neighbors import nearest_neighbors
-from normlift_ns.core.refine import possible, refine, unsupported
-from normlift_ns.core.scene import Scene, View, camera_summary
-from normlift_ns.encoders.cache import cached
-from normlift_ns.encoders.langsplat.source import refuse_equal_stems, write_langsplat
+from normlift_ns.core.portions import ALONE, Portion, Team
+from normlift_ns.core.refine import decay_width, possible, refine, unsupported, vote_of
+from normlift_ns.core.scene import Scene, camera_summary
+from normlift_ns.encoders.langsplat.source import refuse_equal_stems
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.errors import InputError
-from normlift_ns.observing import BLOCK, block_evidence, observe_views, region_levels, spread
-from normlift_ns.options import BackendName, LiftOptions, RefineConfig
+from normlift_ns.observing import spread
+from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.raster.gsplat import rules_named
 from normlift_ns.raster.rasterize import backend_of
 from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.rehearsal import rehearse
 from normlift_ns.stages import Report, Stages, cost
+from normlift_ns.team.exchange import with_neighbors
+from normlift_ns.team.seen import Drawing, Export, look
 
 _FEW = 0.01
 """Share of Gaussians with features below which something is wrong, or nearly nothing was labelled."""
-
-
-class Export(NamedTuple):
-    """Where 2D features go besides the lift."""
-
-    folder: Path
-    overwrite: bool
-    """Replace files of other content."""
-
-
-class Drawing(NamedTuple):
-    """How the weights of a lift are rasterized."""
-
-    rules: str
-    """Version of gsplat that says what is drawn."""
-    backend: BackendName
-    """What computes it."""
-    dtype: torch.dtype
-
-    @property
-    def settings(self) -> RasterSettings:
-        """The constants of the rules."""
-        return RasterSettings.of_gsplat(self.rules)
 
 
 class LiftResult(NamedTuple):
@@ -92,22 +71,49 @@ def lift_scene(
             Nothing that is labelled at all.
         MemoryError: the GPU's memory does not hold the lift.
     """
-    stages = Stages(report)
+    result = lift_together(
+        ALONE, scene, source, options, cache, device=device, encoder=encoder, export=export, report=report
+    )
+    assert result is not None
+    return result
+
+
+def lift_together(
+    team: Team,
+    scene: Scene,
+    source: FeatureSource,
+    options: LiftOptions,
+    cache: Path,
+    *,
+    device: str,
+    encoder: Mapping[str, Any],
+    export: Export | None,
+    report: Report,
+) -> LiftResult | None:
+    """`lift_scene` by the processes of a team, each with the whole scene; process 0 alone gets the result.
+
+    It does not depend on how many there are: what is found of a view does not depend on the views beside it, and
+    Gaussians are worked on in the same blocks.
+    """
+    stages = Stages(team.counted(report))
     gaussians, views = scene.gaussians.to(device), scene.train
     options = replace(options, vote=possible(options.vote, len(gaussians))) if options.refine else options
-    drawing = _drawing(scene, gaussians, options)
+    drawing = drawing_of(scene, gaussians, options)
     names = set(source.available(views.names))
     usable = [index for index, name in enumerate(views.names) if name in names]
     used = [usable[i] for i in spread(len(usable), options.max_views)]
     if export is not None:
         refuse_equal_stems([views.names[index] for index in used])
-    ready = _get_ready(scene, gaussians, options, drawing)
-    evidence, features, level = _observe(scene, gaussians, used, source, options, drawing, cache, export, stages, ready)
-    table, agreed = _agree(evidence, features, level, options, stages) if options.consensus else (features, {})
+    ready = get_ready(scene, gaussians, options, drawing)
+    portion = Portion.of(team, gaussians.means)
+    evidence, features, level = look(
+        scene, gaussians, used, source, options, drawing, cache, export, stages, ready, portion
+    )
+    table, agreed = _agree(evidence, features, level, options, portion, stages) if options.consensus else (features, {})
     with stages("lift") as step:
         how = {"beta": options.beta, "unlabeled": options.unlabeled}
         lifted = lift(evidence, table, **how)
-        _check_seen(evidence, lifted.scalars, source)
+        _check_seen(evidence, lifted.scalars, source, portion)
         own = lifted.scalars.own_evidence
         if options.consensus:
             seen = lift(evidence, features, **how).scalars
@@ -115,7 +121,7 @@ def lift_scene(
             lifted = replace(lifted, scalars=seen_reliability(lifted.scalars, seen))
         step()
     counts = {"views": len(used), "left_out": len(views) - len(usable), "excluded": evidence.num_excluded}
-    copied, shares = _vote(gaussians, lifted, own, options.vote, stages) if options.refine else (None, {})
+    voted = vote_together(gaussians.means, lifted, own, options.vote, portion, stages) if options.refine else (None, {})
     with stages("store") as step:
         provenance = {
             **scene.identity,
@@ -128,11 +134,13 @@ def lift_scene(
             "views_without_features": [name for name in views.names if name not in names],
             "gsplat_rules": drawing.rules,
             "backend": drawing.backend,
-            "statistics": {**counts, **agreed, **_statistics(lifted.scalars), **shares},
+            "statistics": {**counts, **agreed, **_statistics(portion.join(lifted.scalars.reliability)), **voted[1]},
         }
         rule = {"tolerance": options.tolerance, "storage": options.storage}
-        built = SemanticField.build(lifted, gaussians.means, copied, provenance=provenance, **rule)
+        built = SemanticField.build_together(lifted, gaussians.means, voted[0], portion, provenance=provenance, **rule)
         step()
+    if built is None:
+        return None
     built = replace(built, manifest={**built.manifest, "cost": cost(stages.seconds, device)})
     return LiftResult(built, stages.seconds)
 
@@ -146,7 +154,7 @@ def drawn_by(scene: Scene, options: LiftOptions) -> str:
     return rules_named(options.gsplat_rules, scene.identity.get("gsplat_rules"))
 
 
-def _drawing(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Drawing:
+def drawing_of(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Drawing:
     """How to rasterize, refused before anything has been looked at where it cannot be done."""
     rules = drawn_by(scene, options)
     dtype = torch.float64 if options.precision == "double" else torch.float32
@@ -156,7 +164,7 @@ def _drawing(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Dr
     return Drawing(rules, backend, dtype)
 
 
-def _get_ready(scene: Scene, gaussians: GaussianScene, options: LiftOptions, drawing: Drawing) -> Callable[[], None]:
+def get_ready(scene: Scene, gaussians: GaussianScene, options: LiftOptions, drawing: Drawing) -> Callable[[], None]:
     """Has kernels compiled or loaded meanwhile; waits for them when it is called."""
     if drawing.backend == "numba":
         from normlift_ns.raster.numba import warm  # noqa: PLC0415 (importing numba takes a second)
@@ -168,14 +176,16 @@ def _get_ready(scene: Scene, gaussians: GaussianScene, options: LiftOptions, dra
     return rehearse(gaussians, scene.train.cameras[0], options, rasterize_mode=scene.rasterize_mode, **how).join
 
 
-def _check_seen(evidence: Evidence, scalars: Scalars, source: FeatureSource) -> None:
+def _check_seen(evidence: Evidence, scalars: Scalars, source: FeatureSource, portion: Portion) -> None:
     """A lift that tells nothing is none.
 
     Raises:
         ValueError: no Gaussian has a direction.
     """
-    found, total = int((scalars.norm > 0).sum()), scalars.norm.numel()
-    if found == 0 and evidence.rows.column.numel() == 0:
+    entries = torch.tensor(evidence.nnz, device=scalars.norm.device)
+    found, entries = portion.team.add(torch.stack([(scalars.norm > 0).sum(), entries])).tolist()
+    total = len(portion.order)
+    if found == 0 and entries == 0:
         raise InputError(
             f"nothing was labelled: no pixel that any of the {total:,} Gaussians is seen in belongs to a region (of "
             f"{_named(source)}). Likely causes: every value in the label maps is the background (--regions-background)"
@@ -201,84 +211,61 @@ def _named(source: FeatureSource) -> str:
     return str(kind) if folder is None else f"{kind} in {folder}"
 
 
-def _observe(
-    scene: Scene,
-    gaussians: GaussianScene,
-    used: Sequence[int],
-    source: FeatureSource,
-    options: LiftOptions,
-    drawing: Drawing,
-    cache: Path,
-    export: Export | None,
-    stages: Stages,
-    ready: Callable[[], None],
-) -> tuple[Evidence, Float[Tensor, "s d"], Int64[Tensor, " s"]]:
-    """Evidence, feature table and levels of the regions of some training views, block by block, so that an interrupted
-    lift can resume.
-    """
-    seen = cached(source, cache) if options.reuse_evidence else source
-    parts, tables, levels = [], [], []
-    for start in range(0, len(used), BLOCK):
-        with stages("features", len(used)) as step:
-
-            def done(view: View, step: Callable[[], None] = step) -> None:
-                if export is not None:
-                    write_langsplat(seen, view.image, view.name, *export)
-                step()
-
-            rendered = drawing.settings if options.image_source == "render" else None
-            chosen = used[start : start + BLOCK]
-            block = observe_views(scene, chosen, seen, rendered=rendered, divisor=options.lift_downscale, done=done)
-            tables.extend(block.features)
-            levels.extend(region_levels(*x) for x in zip(block.regions, map(len, block.features)))
-        with stages("evidence", len(used)) as step:
-            ready()
-            evidence = block_evidence(
-                gaussians,
-                block,
-                cache / "evidence",
-                rasterize_mode=scene.rasterize_mode,
-                settings=drawing.settings,
-                backend=drawing.backend,
-                weight_power=options.weight_power,
-                dtype=drawing.dtype,
-                reuse=options.reuse_evidence,
-                done=step,
-            )
-            parts.append(evidence)
-    return Evidence.merge(*parts), torch.cat(tables).to(gaussians.means.device, drawing.dtype), torch.cat(levels)
-
-
 def _agree(
-    evidence: Evidence, features: Float[Tensor, "s d"], level: Int64[Tensor, " s"], options: LiftOptions, stages: Stages
+    evidence: Evidence,
+    features: Float[Tensor, "s d"],
+    level: Int64[Tensor, " s"],
+    options: LiftOptions,
+    portion: Portion,
+    stages: Stages,
 ) -> tuple[Float[Tensor, "s d"], dict[str, Any]]:
     """The feature table on which the views agree, and what the manifest says of it."""
     with stages("consensus") as step:
         power, sample = options.consensus_power, options.consensus_sample
-        found = consensus(evidence, features, level=level, power=power, sample=sample)
+        found = consensus(evidence, features, level=level, power=power, sample=sample, portion=portion)
         step()
     facts = {"power": power, "sample": sample, "seed": SEED, "gaussians": found.gaussians, "agreement": found.agreement}
     return found.features, {"consensus": facts}
 
 
-def _vote(
-    gaussians: GaussianScene, lifted: Lifted, own: Float[Tensor, " n"], config: RefineConfig, stages: Stages
-) -> tuple[Int32[Tensor, " n"], dict[str, float]]:
-    """Whose direction every Gaussian takes, and the shares of Gaussians that change theirs and that nobody supports."""
-    means, reliability, n = gaussians.means, lifted.scalars.reliability, len(gaussians)
-    with stages("neighbors", n):
-        neighbors = nearest_neighbors(means, config.k, progress=partial(stages.tell, "neighbors"))
-    with stages("vote", n):
+def vote_together(
+    means: Float[Tensor, "n 3"],
+    lifted: Lifted,
+    own: Float[Tensor, " m"],
+    config: RefineConfig,
+    portion: Portion,
+    stages: Stages,
+) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
+    """Whose direction every Gaussian of the portion takes, and the shares of all Gaussians that change theirs and that
+    nobody supports.
+    """
+    mine = portion.gaussians
+    with stages("neighbors", len(mine)):
+        told = partial(stages.tell, "neighbors")
+        of = mine if portion.team.size > 1 else None
+        neighbors = nearest_neighbors(means, config.k, of=of, progress=told, team=portion.team)
+    with stages("vote", len(mine)):
         told = partial(stages.tell, "vote")
-        copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=told)
-    changed = copied != torch.arange(len(copied), device=copied.device)
-    lost = unsupported(neighbors, reliability)
-    return copied, {"refined_share": float(changed.float().mean()), "unsupported_share": float(lost.float().mean())}
+        if portion.team.size == 1:
+            reliability = lifted.scalars.reliability
+            copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=told)
+        else:
+            around = with_neighbors(lifted, neighbors, portion)
+            neighbors, reliability = around.neighbors, portion.join(lifted.scalars.reliability)[around.gaussians]
+            own = torch.cat([own, own.new_zeros(len(around.gaussians) - len(own))])
+            how = {"own": None if config.vote == "paper" else own, "progress": told}
+            width = decay_width(portion.team.join(neighbors.spacing), config)
+            voting = around.lifted.directions
+            places = vote_of(portion.along, neighbors, voting, reliability, config, width=width, **how)[: len(mine)]
+            copied = around.gaussians[places.long()].int()
+        changed, lost = (copied != mine).sum(), unsupported(neighbors, reliability).sum()
+        changed, lost = portion.team.add(torch.stack([changed, lost])).tolist()
+    return copied, {"refined_share": changed / len(means), "unsupported_share": lost / len(means)}
 
 
-def _statistics(scalars: Scalars) -> dict[str, Any]:
-    found = scalars.reliability[scalars.reliability > 0].double().sort().values
+def _statistics(reliability: Float[Tensor, " n"]) -> dict[str, Any]:
+    found = reliability[reliability > 0].double().sort().values
     shares = (0.05, 0.25, 0.5, 0.75, 0.95)
     quantiles = {str(q): float(found[round(q * (len(found) - 1))]) for q in shares} if len(found) > 0 else {}
-    n = scalars.norm.numel()
+    n = reliability.numel()
     return {"gaussians": n, "zero_evidence_share": 1 - len(found) / max(1, n), "reliability_quantiles": quantiles}

@@ -22,16 +22,16 @@ from normlift_ns.encoders.source import FeatureSource, each_view
 from normlift_ns.encoders.undistorted import check_undistorted
 from normlift_ns.errors import InputError
 from normlift_ns.options import BackendName, RasterizeMode
+from normlift_ns.raster.kept import Place, joined_views, keep_views, kept_views
 from normlift_ns.raster.rasterize import rasterize_evidence, render_picture
 from normlift_ns.raster.settings import RasterSettings
 
-BLOCK = 16
-"""Views per file of evidence: what an interrupted run may lose."""
+_LARGEST_CHUNK = 16
 _READERS = 8
 """Photographs that are read at a time."""
 _SMALLEST = 8
 """Pixels along a side of an image made smaller; fewer show nothing."""
-_KEY = "normlift_ns.block/5"
+_KEY = "normlift_ns.block/6"
 """Part of every key: to be raised when evidence changes for the same input."""
 
 
@@ -56,6 +56,21 @@ class Block(NamedTuple):
     regions: list[Int32[Tensor, "levels c"]]
     """Region of every cell, -1 none."""
     features: list[Float[Tensor, "r d"]]
+
+
+def in_chunks(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
+    """Views that are looked at together, whose evidence is one file: what an interrupted lift may lose.
+
+    Where several processes divide the chunks, all have as many. What is found of a view does not depend on what else is
+    in its chunk.
+
+    >>> [[len(chunk) for chunk in in_chunks(range(45), processes)] for processes in (1, 2)]
+    [[15, 15, 15], [12, 12, 12, 9]]
+    """
+    chunks = -(-len(views) // _LARGEST_CHUNK)
+    chunks = processes * max(1, -(-chunks // processes))
+    size = max(1, -(-len(views) // chunks))
+    return [views[first : first + size] for first in range(0, len(views), size)]
 
 
 def spread(count: int, most: int | None) -> list[int]:
@@ -156,30 +171,31 @@ def block_evidence(
 ) -> Evidence:
     """Evidence of the regions of a block.
 
-    That of its cells, from which it is made, is taken from the folder if it was rasterized before with the same scene,
-    cameras and labels, whatever the regions and features were.
+    That of the cells of a view, from which it is made, is taken from the folder if it was rasterized before with the
+    same scene, camera and labels, whatever the regions and features were, and whichever views were in its block.
     """
     facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
-    path = _place(gaussians, block, folder, facts)
-    evidence = _kept(path) if reuse else None
-    if evidence is not None:
-        for _ in block.cameras:
-            done()
-        return of_regions(evidence.to(gaussians.means.device), block)
-    evidence = rasterize_evidence(
-        gaussians,
-        block.cameras,
-        block.labels,
-        num_regions=[regions.shape[1] for regions in block.regions],
-        backend=backend,
-        rasterize_mode=rasterize_mode,
-        weight_power=weight_power,
-        settings=settings,
-        dtype=dtype,
-        progress=lambda *_: done(),
-    )
-    evidence.save(path, key=path.stem)
-    return of_regions(evidence, block)
+    keys = view_keys(gaussians, block, facts)
+    found = kept_views(folder, keys) if reuse else {}
+    new = [view for view in range(len(keys)) if view not in found]
+    for _ in found:
+        done()
+    if len(new) > 0:
+        evidence = rasterize_evidence(
+            gaussians,
+            [block.cameras[view] for view in new],
+            [block.labels[view] for view in new],
+            num_regions=[block.regions[view].shape[1] for view in new],
+            backend=backend,
+            rasterize_mode=rasterize_mode,
+            weight_power=weight_power,
+            settings=settings,
+            dtype=dtype,
+            progress=lambda *_: done(),
+        )
+        keep_views(evidence, folder, [keys[view] for view in new])
+        found.update((view, Place(evidence, place)) for place, view in enumerate(new))
+    return of_regions(joined_views(found).to(gaussians.means.device), block)
 
 
 def kept_evidence(
@@ -195,24 +211,22 @@ def kept_evidence(
 ) -> Evidence | None:
     """What `block_evidence` has kept of a block; None where it is not there, and would have to be rasterized again."""
     facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
-    evidence = _kept(_place(gaussians, block, folder, facts))
-    return None if evidence is None else of_regions(evidence, block)
+    found = kept_views(folder, view_keys(gaussians, block, facts))
+    return of_regions(joined_views(found), block) if len(found) == len(block.cameras) else None
 
 
-def _place(gaussians: GaussianScene, block: Block, folder: Path, facts: Sequence[Any]) -> Path:
-    """Where the evidence of the cells of a block is kept, whether it is there or not."""
-    counts = [regions.shape[1] for regions in block.regions]
-    tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, *block.labels]
-    tensors += [x for camera in block.cameras for x in (camera.K, camera.world_to_camera)]
-    return folder / f"{_digest([_KEY, *facts, counts], tensors)}.safetensors"
+def view_keys(gaussians: GaussianScene, block: Block, facts: Sequence[Any]) -> list[str]:
+    """What finds the evidence of the cells of each view again: digests of all that it is made from.
 
-
-def _kept(path: Path) -> Evidence | None:
-    """Evidence that was rasterized before; None also where the file is damaged, or is that of another block."""
-    try:
-        return Evidence.load(path, key=path.stem)
-    except (FileNotFoundError, ValueError):
-        return None
+    Args:
+        facts: how it is rasterized, ready for JSON.
+    """
+    scene = _digest([_KEY, *facts], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities])
+    views = zip(block.cameras, block.labels, block.regions)
+    return [
+        _digest([scene, regions.shape[1]], [labels, camera.K, camera.world_to_camera])
+        for camera, labels, regions in views
+    ]
 
 
 def of_regions(evidence: Evidence, block: Block) -> Evidence:

@@ -5,7 +5,9 @@ The docstring under a field is the help of its flag.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -28,8 +30,7 @@ Rule = Literal["cosine", "lerf", "margin"]
 Unlabeled = Literal["ignore", "dilute"]
 """What a pixel without a region counts as: nothing at all, or an observation of the zero vector."""
 
-EncoderName = Literal["open_clip", "colour"]
-RegionsName = Literal["auto", "sam", "patches", "superpixel", "grid", "files"]
+RegionsName = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
 FeaturesName = Literal["none", "langsplat"]
 SamPrecision = Literal["auto", "float32", "float16", "bfloat16"]
 Fill = Literal["black", "white"]
@@ -37,20 +38,48 @@ Missing = Literal["error", "skip"]
 
 DEFAULT_MODEL, DEFAULT_PRETRAINED = "ViT-B-16", "laion2b_s34b_b88k"
 """Of OpenCLIP."""
-DEFAULT_SAM = "facebook/sam-vit-huge"
+DEFAULT_SAM, DEFAULT_SAM3 = "facebook/sam-vit-huge", "facebook/sam3"
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 """Negative prompts of LERF."""
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
-THRESHOLDS: dict[Rule, float] = {"cosine": 0.5, "lerf": 0.5, "margin": 0.02}
-"""Relevancy above which a Gaussian is selected. margin: the paper's; lerf: a draw; cosine: for the colour encoder, and
-where nothing is known yet: see `question.make_question`."""
+
+
+class RuleFacts(NamedTuple):
+    """What belongs to a rule besides its formula, which is in `core.query` for torch and in `quick` for numpy."""
+
+    threshold: float
+    """Relevancy above which a Gaussian is selected."""
+    compares: bool
+    """Whether it needs negatives."""
+    least: float
+    """Relevancy of a Gaussian without a direction: no threshold selects it."""
+    faintest: float
+    """Relevancy below which pictures tell nothing apart."""
+    present: float | None
+    """Top relevancy below which a text is probably not in the scene; None: that depends on the encoder."""
+
+
+RULES: dict[Rule, RuleFacts] = {
+    # the threshold suits the colour encoder, and questions of which nothing is known: see `question.make_question`
+    "cosine": RuleFacts(0.5, compares=False, least=0.0, faintest=0.0, present=None),
+    # the threshold is a draw
+    "lerf": RuleFacts(0.5, compares=True, least=0.0, faintest=0.0, present=0.62),
+    # the threshold is the paper's; a text is present by the same lead over the negatives as with lerf
+    "margin": RuleFacts(0.02, compares=True, least=-2.0, faintest=-0.1, present=math.log(0.62 / (1 - 0.62)) / 10),
+}
 VoteKind = Literal["paper", "posterior"]
 """How a vote weighs what a Gaussian has seen itself against its neighbours; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class of a Gaussian without a direction, where one is scored: none, or the first."""
 REACH, MIN_SIZE = 4.0, 20
 """How far apart Gaussians of one object may be, in units of the selection's median spacing, and how many it needs."""
+ARRAY_FILES = ("coord.npy", "segment.npy", "instance.npy", "names.json")
+"""Of labels as arrays."""
+TRANSFER_DISTANCE = 6.0
+"""How far a point may be from the Gaussian that labels it, in units of the scene's median spacing."""
+OBJECT_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
+"""Of a catalogue: all of it, its table, and the boxes in the coordinates of the capture and in those of the scene."""
 FLOATER_LIMIT = 1.9
 """Score above which a Gaussian is a likely floater, see `insight.floaters`."""
 
@@ -69,30 +98,35 @@ class SourceOptions:
     ('colour', True)
     """
 
-    encoder: EncoderName = "open_clip"
-    """open_clip: CLIP features of masked crops, or of patches. colour: mean colours against colour names, without
-    learned weights."""
+    encoder: str = "open_clip"
+    """open_clip: CLIP features of masked crops, or of patches. siglip, siglip2, metaclip2: the same with networks of
+    the transformers library. colour: mean colours against colour names, without learned weights. Or the name of an
+    encoder of another package."""
     encoder_model: str = DEFAULT_MODEL
-    """Architecture of the open_clip encoder."""
+    """open_clip: architecture. siglip, siglip2, metaclip2: a name on the Hugging Face hub or a folder, by default
+    google/siglip-base-patch16-224, google/siglip2-base-patch16-224, facebook/metaclip-2-worldwide-huge-quickgelu."""
     encoder_pretrained: str = DEFAULT_PRETRAINED
     """Weights of the open_clip encoder: a tag to download, or a local file of that architecture."""
     crop_fill: Fill = "black"
-    """Colour around a region in the crop that the open_clip encoder sees."""
+    """Colour around a region in the crop that a network sees."""
     text_template: str = "{}"
-    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
-    seven templates. By default the bare text."""
+    """What a network reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
+    seven templates of OpenCLIP. By default the bare text."""
     regions: RegionsName = "auto"
-    """sam: SAM's masks. patches: the patches of a CLIP vision transformer, each with a feature of its own. superpixel:
-    SLIC superpixels. grid: squares. files: label maps from --regions-dir. auto: files if --regions-dir is given, sam if
-    --sam-model is. Otherwise, for open_clip, sam on a GPU if its weights are on this machine, else patches where the
-    model has them; superpixel for all other encoders."""
+    """sam: SAM's masks. sam3: what SAM 3 finds for the texts of --queries. patches: the patches of a vision
+    transformer, each with a feature of its own. superpixel: SLIC superpixels. grid: squares. files: label maps from
+    --regions-dir. auto: files if --regions-dir is given, sam if --sam-model is. Otherwise, where a network sees the
+    images, sam on a GPU if its weights are on this machine, else patches if the network has them; else superpixel."""
+    region_texts: tuple[str, ...] = ()
+    """What --regions sam3 looks for. By default the texts of --queries."""
     region_count: int | None = None
     """Approximate number of regions per image. By default 256 for superpixel and grid, 1024 for patches."""
     sam_model: str | None = None
-    """Weights of SAM: a folder in the format of transformers, a file published by Meta, or a name to download. By
-    default facebook/sam-vit-huge, as LangSplat uses."""
+    """Weights of SAM, SAM 2 or HQ-SAM: a folder in the format of transformers, a file of the first SAM published by
+    Meta, or a name to download, such as facebook/sam2.1-hiera-large. By default facebook/sam-vit-huge, as LangSplat
+    uses. With --regions sam3 those of SAM 3, by default facebook/sam3."""
     sam_precision: SamPrecision = "auto"
-    """Precision of SAM's network. auto: float16 on a GPU, float32 elsewhere."""
+    """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
     regions_dir: Path | None = None
     """Folder with one label map per image, PNG or NPY with the same stem."""
     regions_background: int = 0
@@ -115,6 +149,12 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
+        check_texts("region_texts", self.region_texts)
+
+    def looking_for(self, queries: Sequence[str]) -> SourceOptions:
+        """The same options, with the texts that regions of sam3 are made of where none are given."""
+        asked = self.regions == "sam3" and len(self.region_texts) == 0
+        return replace(self, region_texts=tuple(queries)) if asked else self
 
 
 @dataclass(frozen=True)
@@ -297,13 +337,14 @@ class AskOptions:
     """
 
     negatives: tuple[str, ...] | None = None
-    """Texts to compare with. By default LERF's (object, things, stuff, texture) for open_clip, none for colour."""
+    """Texts to compare with. By default as the encoder says: LERF's (object, things, stuff, texture) for networks, none
+    for colour."""
     rule: Rule | Literal["auto"] = "auto"
     """How relevancy is computed. cosine: the cosine itself. lerf: against each negative. margin: above the best
-    negative. auto: lerf with negatives, else cosine."""
+    negative. auto: as the encoder says, which is lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected. auto: what the histogram of the relevancies suggests. By default
-    0.5 for lerf, 0.02 for margin, 0.5 for cosines of the colour encoder, and auto for cosines of all others."""
+    as the encoder says, else 0.5 for lerf, 0.02 for margin, and auto for cosines; of the colour encoder 0.5."""
     min_reliability: float = 0.0
     """Minimum reliability of a selected Gaussian, in 0..1."""
     refined: bool = True
@@ -311,8 +352,8 @@ class AskOptions:
     text_vectors: Path | None = None
     """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
     text_template: str | None = None
-    """What open_clip reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
-    seven templates. By default as the run was lifted."""
+    """What a network reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
+    seven templates of OpenCLIP. By default as the run was lifted."""
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import THRESHOLDS, Rule
+from normlift_ns.options import RULES, Rule
 from normlift_ns.ranges import check_bool, check_number, shown
-from normlift_ns.text_encoders import Field, default_negatives, encoder_digest, encoder_name
+from normlift_ns.text_encoders import Field, default_rule, encoder_digest
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +60,10 @@ def make_question(
 
     Args:
         read: makes one vector per text, of an encoder that fits the field.
-        negatives: what the texts are compared with; None: `default_negatives`.
-        rule: "auto": lerf with negatives, cosine without.
-        threshold: "auto": what the histogram suggests. None: that of `THRESHOLDS`; but "auto" for bare cosines of
-            any encoder but colour, of which no number is known that selects something.
+        negatives: what the texts are compared with; None: as the encoder says, see `default_rule`.
+        rule: "auto": as the encoder says; lerf where other negatives are given, cosine where none are.
+        threshold: "auto": what the histogram suggests. None: that of the encoder for its rule, else that of
+            `RULES`; but "auto" for bare cosines, of which no number is known that selects something.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         refined: use refined features.
     Raises:
@@ -73,8 +73,8 @@ def make_question(
         raise InputError(f"negatives must be a list of texts, got {shown(negatives)}")
     if isinstance(negatives, str):
         raise InputError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
-    if rule not in ("auto", *get_args(Rule)):
-        raise InputError(f"rule must be auto, {', '.join(get_args(Rule))}; got {rule!r}")
+    if rule not in ("auto", *RULES):
+        raise InputError(f"rule must be auto, {', '.join(RULES)}; got {rule!r}")
     min_reliability = check_number("min_reliability", min_reliability)
     if isinstance(threshold, str):
         if threshold != "auto":
@@ -82,18 +82,20 @@ def make_question(
     elif threshold is not None:
         threshold = check_number("threshold", threshold)
     check_bool("refined", refined)
-    negatives = tuple(default_negatives(field) if negatives is None else negatives)
+    default = default_rule(field)
     if rule == "auto":
-        rule = "cosine" if len(negatives) == 0 else "lerf"
-    if threshold is None and rule == "cosine" and encoder_name(field) != "colour":
-        threshold = "auto"
+        rule = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
+    if threshold is None:
+        known = RULES[rule].threshold if RULES[rule].compares else "auto"
+        threshold = default.threshold if rule == default.rule else known
+    negatives = tuple(default.negatives if negatives is None else negatives)
     return Question(
         texts=tuple(texts),
         vectors=read(texts),
         negatives=negatives,
         negative_vectors=read(negatives) if len(negatives) > 0 else None,
         rule=rule,
-        threshold=THRESHOLDS[rule] if threshold is None or threshold == "auto" else threshold,
+        threshold=RULES[rule].threshold if threshold == "auto" else threshold,
         suggest=threshold == "auto",
         min_reliability=min_reliability,
         refined=refined,

@@ -6,7 +6,7 @@ What it answers is what `LiftedRun.ask` answers, but for the rounding of float32
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,12 +19,23 @@ from scipy.sparse import csr_array
 from normlift_ns.core.disk.field_file import FieldArrays, read_field
 from normlift_ns.errors import InputError
 from normlift_ns.insight.histogram import Histogram, histogram, suggested_threshold, top_limit
-from normlift_ns.options import Rule
+from normlift_ns.options import RULES, Rule
 from normlift_ns.question import Question, make_question
 from normlift_ns.runs.files import check_run, field_folder, stored_paths, texts_cache
 from normlift_ns.selection import Selection
 from normlift_ns.text_encoders import Texts, encoder_name, encoder_of, with_texts
 
+
+def _lead(positive: np.ndarray, negative: np.ndarray) -> np.ndarray:
+    return positive - negative.max(axis=1, keepdims=True)
+
+
+FORMULAS: dict[Rule, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "cosine": lambda positive, negative: positive,
+    "lerf": lambda positive, negative: 1 / (1 + np.exp(-10 * _lead(positive, negative))),
+    "margin": _lead,
+}
+"""As those of `core.query`."""
 _BLOCK = 2**21
 """Elements converted to float32 at once; few stay in a processor's cache."""
 
@@ -136,27 +147,17 @@ def answer(field: FieldArrays, question: Question) -> QuickAnswer:
     """
     arrays = field.arrays
     source = arrays["source"] if question.refined else slice(None)
-    negatives = question.negative_vectors if question.rule != "cosine" else None
+    negatives = question.negative_vectors if RULES[question.rule].compares else None
     given = question.vectors if negatives is None else np.concatenate([question.vectors, negatives])
     cosine, count = _cosines(field, given)[source], len(question.vectors)
     valid = (arrays["norm"] > 0)[source]
-    relevancy = _relevancy(cosine[:, :count], cosine[:, count:], question.rule)
-    relevancy = np.where(valid[:, None], relevancy, np.float32(-2 if question.rule == "margin" else 0))
+    relevancy = FORMULAS[question.rule](cosine[:, :count], cosine[:, count:])
+    relevancy = np.where(valid[:, None], relevancy, np.float32(RULES[question.rule].least))
     if question.suggest:
         suggested = suggested_threshold(relevancy, valid)
         question = replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
     sure = valid & (arrays["reliability"] >= np.float32(question.min_reliability))
     return QuickAnswer(question, field, relevancy, valid, (relevancy > question.threshold) & sure[:, None])
-
-
-def _relevancy(
-    positive: Float32[np.ndarray, "n q"], negative: Float32[np.ndarray, "n b"], rule: Rule
-) -> Float32[np.ndarray, "n q"]:
-    """As `core.query.relevancy`."""
-    if rule == "cosine":
-        return positive
-    difference = positive - negative.max(axis=1, keepdims=True)
-    return difference if rule == "margin" else 1 / (1 + np.exp(-10 * difference))
 
 
 def _cosines(field: FieldArrays, given: Float[np.ndarray, "q d"]) -> Float32[np.ndarray, "n q"]:

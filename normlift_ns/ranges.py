@@ -51,6 +51,7 @@ _ANY = Range(-_LARGEST, _LARGEST, "finite")
 RANGES: dict[str, Range] = {
     # the vote
     "k": _at_least(1),
+    "num_devices": _at_least(1, 4096),
     "sigma_d": _POSITIVE,
     "tau": Range(-1.0, 1.0, "in -1..1"),
     "gamma": _POSITIVE,
@@ -71,10 +72,13 @@ RANGES: dict[str, Range] = {
     # questions
     "threshold": _ANY,
     "min_reliability": _SHARE,
+    "segment_views": _at_least(1),
     # objects
     "reach": _POSITIVE,
     "min_size": _at_least(1),
     "floater_limit": _ANY,
+    "metres_per_unit": _POSITIVE,
+    "transfer_distance": _POSITIVE,
     # evaluation
     "min_opacity": _SHARE,
     "margin": _ANY,

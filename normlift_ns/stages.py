@@ -11,8 +11,7 @@ from pathlib import Path
 
 import torch
 
-Report = Callable[[str, int, int], None]
-"""Called with (stage, steps done, steps in all)."""
+from normlift_ns.core.portions import Report
 
 
 class Stages:
@@ -39,7 +38,7 @@ class Stages:
         self._report(stage, self._done.get(stage, 0), total)
         try:
             yield step
-        except torch.OutOfMemoryError as error:
+        except torch.cuda.OutOfMemoryError as error:
             raise MemoryError(
                 f"the GPU's memory is full in stage {stage} ({error}); lift on the CPU: --device cpu"
             ) from error

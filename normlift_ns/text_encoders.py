@@ -9,14 +9,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
-from normlift_ns.core.disk.digests import file_digest, text_digest
-from normlift_ns.encoders.texts.colours import ColourTexts, refuse_template
+from normlift_ns.core.disk.digests import text_digest
+from normlift_ns.encoders.kinds import EncoderKind, Texts, absolute_paths, encoder_kind, known_kind
 from normlift_ns.encoders.texts.files import TextVectors
-from normlift_ns.encoders.texts.kept import ClipTexts
+from normlift_ns.encoders.texts.kept import KeptTexts
 from normlift_ns.errors import InputError
-from normlift_ns.options import CANONICAL_NEGATIVES, EncoderName, SourceOptions
+from normlift_ns.options import Rule, SourceOptions
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
@@ -24,10 +24,17 @@ GIVEN = "given"
 """In the manifest in place of an encoder: features of the user's own."""
 _CHOSEN = "texts_chosen"
 """Key in the manifest of an opened run: texts are looked up in a file that the user named, whatever the lift had."""
-_OF_FILES = ("xxh3_128:", "blake2b:")
-"""How the identities of weights begin that are the content of a file, and no tag."""
-Texts = ColourTexts | TextVectors | ClipTexts
-"""Readers of texts: `rows` gives arrays, `text` tensors."""
+
+
+class DefaultRule(NamedTuple):
+    """A rule of relevancy, what it compares with, and its threshold; "auto": what the histogram suggests."""
+
+    rule: Rule
+    negatives: tuple[str, ...]
+    threshold: float | Literal["auto"]
+
+
+_COSINES = DefaultRule("cosine", (), "auto")
 
 
 class Field(Protocol):
@@ -44,9 +51,8 @@ FieldT = TypeVar("FieldT", bound=Any)
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
     """What `encoder_of` needs to know, ready for JSON; paths of files absolute, so that they mean the same anywhere."""
-    vectors, pretrained = options.text_vectors, options.encoder_pretrained
-    settings = {key: getattr(options, key) for key in ENCODER_KEYS}
-    settings["encoder_pretrained"] = os.path.abspath(pretrained) if os.path.isfile(pretrained) else pretrained
+    settings = {key: getattr(options, key) for key in ENCODER_KEYS} | absolute_paths(options)
+    vectors = options.text_vectors
     return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
 
 
@@ -83,9 +89,9 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
         FileNotFoundError: its weights, or its text vectors, are not there any more.
     """
     options = _options(field)
-    if not field.manifest.get(_CHOSEN):
-        _check_files(field.manifest.get("features"), options)
     if options.text_vectors is not None:
+        if not field.manifest.get(_CHOSEN):
+            _check_vectors(options.text_vectors, _identity(field.manifest.get("features")).get("content"))
         vectors = TextVectors(options.text_vectors)
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
@@ -93,25 +99,52 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
                 f"{field.manifest['dimension']}; give texts with vectors of the network that made them (--text-vectors)"
             )
         return vectors
-    if options.encoder == "colour":
-        refuse_template(options.text_template)
-        return ColourTexts()
-    if options.encoder != "open_clip":
-        raise InputError(f"unknown encoder {options.encoder!r}; it is one of {', '.join(get_args(EncoderName))}")
+    kind = _kind(options.encoder)
+    recorded = _identity(field.manifest.get("features"))
+    if kind.texts is not None:
+        return kind.texts(options, device, cache, recorded)
+    return _read_and_kept(kind, options, device, cache, recorded)
+
+
+def _kind(name: str) -> EncoderKind:
+    try:
+        return encoder_kind(name)
+    except InputError as error:
+        raise InputError(
+            f"the run was lifted with an encoder that is not to be had here: {error}. Install its package, or give "
+            "texts with vectors of it (--text-vectors)"
+        ) from None
+
+
+def _read_and_kept(
+    kind: EncoderKind, options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
+) -> KeptTexts:
+    """The texts of an encoder, which is made where a text is new; it must be that of the lift."""
 
     def network() -> Any:
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (needs torch)
-        from normlift_ns.encoders.clip.text_tower import load_text_tower  # noqa: PLC0415
+        from normlift_ns.encoders.build import make_encoder  # noqa: PLC0415
 
-        there = "cpu" if device == "auto" else choose_device(device)  # a text takes less than waking a GPU
-        tower = load_text_tower(options.encoder_model, options.encoder_pretrained, options.text_template, there)
-        if tower is not None:
-            return tower
-        from normlift_ns.encoders.build import make_texts  # noqa: PLC0415 (imports open_clip)
+        encoder = make_encoder(options, choose_device(device))
+        if len(recorded) > 0 and json.dumps(encoder.identity, sort_keys=True) != json.dumps(recorded, sort_keys=True):
+            raise InputError(
+                f"the encoder {options.encoder} is not what the run was lifted with, and would give other answers: it "
+                f"is {encoder.identity}, expected {dict(recorded)}. Put its files of the lift back; or give texts with "
+                "vectors of the same network, --text-vectors; or lift again with: ns-normlift"
+            )
+        return encoder
 
-        return make_texts(options, choose_device(device))
+    def settings() -> dict[str, Any]:
+        identity = recorded if len(recorded) > 0 else network().identity
+        return {"encoder": identity, "template": options.text_template}
 
-    return ClipTexts(options.encoder_model, options.encoder_pretrained, options.text_template, network, cache)
+    return KeptTexts(settings, network, cache)
+
+
+def _identity(features: object) -> Mapping[str, Any]:
+    """What the manifest says of the encoder that made features; nothing where it does not."""
+    found = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
 
 
 def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
@@ -122,35 +155,17 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
     return text_digest(json.dumps(features.get("texts", features.get("encoder", features)), sort_keys=True))
 
 
-def _check_files(features: object, options: SourceOptions) -> None:
-    """Makes sure that the files of the encoder have the content that they had in the lift, by its digests in the
-    manifest. Files are read whole at every use.
-    """
+def _check_vectors(path: Path, expected: object) -> None:
+    """Makes sure that a file of text vectors has the content that it had in the lift. It is read whole at every use."""
     remedy = (
         "put the file of the lift back there; or give texts with vectors of the same network, --text-vectors; or lift "
         "again with: ns-normlift"
     )
-    texts = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
-    texts = texts if isinstance(texts, Mapping) else {}
-    if options.text_vectors is not None:
-        path, expected, found = options.text_vectors, texts.get("content"), ""
-        if os.path.lexists(path) and not path.is_file():
-            raise InputError(f"the run's file of text vectors {path} is no file any more; {remedy}")
-        if not path.is_file():
-            raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
-        if isinstance(expected, str):
-            found = TextVectors(path).identity["content"]
-    elif options.encoder == "open_clip":
-        path, expected, found = Path(options.encoder_pretrained), texts.get("pretrained"), options.encoder_pretrained
-        if path.is_file():
-            found = file_digest(path, like=str(expected))
-        elif isinstance(expected, str) and expected.startswith(_OF_FILES) and os.path.lexists(path):
-            raise InputError(f"weight file {path}, with which the run was lifted, is no file any more; {remedy}")
-        elif isinstance(expected, str) and expected.startswith(_OF_FILES):
-            raise FileNotFoundError(f"weight file {path}, with which the run was lifted, does not exist; {remedy}")
-    else:
-        return
-    if isinstance(expected, str) and found != expected:
+    if os.path.lexists(path) and not path.is_file():
+        raise InputError(f"the run's file of text vectors {path} is no file any more; {remedy}")
+    if not path.is_file():
+        raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
+    if isinstance(expected, str) and (found := TextVectors(path).identity["content"]) != expected:
         raise InputError(
             f"{path} is not what the run was lifted with, and would give other answers: its content is {found}, "
             f"expected {expected}. {remedy[0].upper()}{remedy[1:]}"
@@ -178,11 +193,18 @@ def encoder_name(field: Field) -> str | None:
     return name if isinstance(name, str) else None
 
 
-def default_negatives(field: Field) -> tuple[str, ...]:
-    """LERF's negatives where the encoder knows them: the colour encoder does not, a file of text vectors may."""
+def default_rule(field: Field) -> DefaultRule:
+    """How the encoder of a field is asked unless a question says otherwise. A file of text vectors may not know its
+    negatives; then cosines are left, as of an encoder that is not known here."""
     stored = field.manifest.get("encoder")
-    if not isinstance(stored, Mapping) or stored.get("encoder") not in ("open_clip", GIVEN):
-        return ()
-    vectors = stored.get("text_vectors")
-    known = CANONICAL_NEGATIVES if vectors is None else TextVectors(Path(vectors)).names
-    return CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(known) else ()
+    if not isinstance(stored, Mapping):
+        return _COSINES
+    name, vectors = stored.get("encoder"), stored.get("text_vectors")
+    kind = known_kind("open_clip" if name == GIVEN else name)
+    if kind is None:
+        return _COSINES
+    if vectors is not None:  # it may be written later, with the run
+        known = TextVectors(Path(vectors)).names if Path(vectors).is_file() else ()
+        if not set(kind.negatives) <= set(known):
+            return _COSINES
+    return DefaultRule(kind.rule, kind.negatives, kind.threshold)

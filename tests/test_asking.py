@@ -16,7 +16,7 @@ from normlift_ns import SemanticField
 from normlift_ns.core.disk.digests import file_digest
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.texts.files import TextVectors
-from normlift_ns.encoders.texts.kept import ClipTexts
+from normlift_ns.encoders.texts.kept import KeptTexts
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, SourceOptions
 from normlift_ns.text_encoders import ENCODER_KEYS, encoder_of, encoder_settings, given_settings, with_texts
@@ -50,7 +50,7 @@ def lifted(request: pytest.FixtureRequest, tmp_path: Path) -> SemanticField:
 def test_replaced_weights_are_refused(lifted: SemanticField, tmp_path: Path) -> None:
     path = tmp_path / "w.pt"
     encoder = encoder_of(lifted, cache=tmp_path / "texts")
-    assert isinstance(encoder, ClipTexts)
+    assert isinstance(encoder, KeptTexts)
     content = bytearray(path.read_bytes())
     content[77] ^= 1
     stamps = path.stat()

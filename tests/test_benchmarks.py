@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.minutes import minutes
 from benchmarks.report import RESULTS, Report, as_text
 from tests.captures import needs_shared
 
@@ -60,6 +61,8 @@ def test_quick_front_ends_benchmark(tmp_path):
     assert metrics["nms_10_s"]["error"] == 0
     assert metrics["encode_10_s"]["error"] < 1e-5 and metrics["patches_s"]["error"] < 1e-5
     assert metrics["sam_encoder_s"]["error"] < 1e-5 and metrics["sam_decoder_s"]["error"] < 1e-4
+    assert metrics["sam2_encoder_s"]["error"] < 1e-5 and metrics["sam2_decoder_s"]["error"] < 1e-4
+    assert metrics["sam2_labels_s"]["value"] > 0
     assert metrics["view_s"]["error"] == 0 == metrics["cold_2_s"]["error"]
 
 
@@ -102,3 +105,10 @@ def test_a_report_is_valid_json(tmp_path):
         {"key": "time_s", "value": 0.25, "unit": "s", "error": 1e-7},
         {"key": "of one seed_ci95", "value": None, "unit": "points", "error": None},
     ]
+
+
+def test_minutes_are_summed_by_part(tmp_path):
+    cases = (("tests.core.test_lift", 30), ("tests.core.test_query", 90), ("tests.test_grid", 6))
+    rows = "".join(f'<testcase classname="{name}" time="{time}"/>' for name, time in cases)
+    (tmp_path / "tests.xml").write_text(f"<testsuites><testsuite>{rows}</testsuite></testsuites>")
+    assert list(minutes(tmp_path / "tests.xml").items()) == [("tests/core", 2.0), ("tests/test_grid", 0.1)]

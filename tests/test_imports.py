@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import normlift_ns
 ROOT = Path(normlift_ns.__file__).parent
 LAYERS = (
     ("errors",),
+    ("crash",),
     ("ranges",),
     ("options",),
     ("kernels",),
@@ -20,10 +22,12 @@ LAYERS = (
     ("raster", "encoders"),
     ("colors", "observing", "objects", "insight", "stages", "rehearsal", "scenes", "selection", "text_encoders"),
     ("question",),
-    ("lifting", "asking"),
-    ("runs", "session"),
+    ("team",),
+    ("lifting", "asking", "segmenting"),
+    ("runs", "session", "planning"),
     ("quick", "viewer"),
     ("lifted_run", "nerfstudio_plugin"),
+    ("together",),
     ("front_door", "method_configs", "plugin"),
     ("evaluation", "demo"),
     ("__init__",),
@@ -34,6 +38,7 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 FOREIGN = {
     "errors": set(),
+    "crash": set(),
     "ranges": set(),
     "options": set(),
     "kernels": {"torch", "jaxtyping", "triton"},
@@ -42,8 +47,9 @@ FOREIGN = {
     "encoders": BASE | {"xxhash", "open_clip", "skimage", "PIL", "huggingface_hub", "torchvision"},
     "colors": {"torch", "jaxtyping", "matplotlib"},
     "observing": {"torch", "jaxtyping", "xxhash"},
-    "objects": BASE,
+    "objects": BASE | {"trimesh", "plyfile"},
     "insight": BASE,
+    "team": {"torch", "jaxtyping"},
     "lifting": {"torch", "jaxtyping"},
     "stages": {"torch"},
     "rehearsal": {"torch"},
@@ -53,17 +59,31 @@ FOREIGN = {
     "question": {"numpy", "jaxtyping"},
     "quick": {"numpy", "scipy", "jaxtyping"},
     "asking": {"torch", "jaxtyping"},
+    "segmenting": {"torch", "jaxtyping"},
     "runs": BASE | {"plyfile", "msgspec"},
+    "planning": {"torch", "jaxtyping"},
     "session": BASE,
     "viewer": {"torch", "numpy", "jaxtyping", "matplotlib", "PIL", "msgspec", "viser"},
     "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "viser"},
     "lifted_run": {"torch", "numpy", "jaxtyping"},
+    "together": {"torch", "jaxtyping"},
     "front_door": {"torch", "jaxtyping"},
     "method_configs": {"nerfstudio"},
     "plugin": set(),
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "scripts": {"torch", "numpy", "jaxtyping", "PIL", "tyro", "rich", "docstring_parser", "yaml", "prompt_toolkit"},
+    "scripts": {
+        "torch",
+        "numpy",
+        "jaxtyping",
+        "PIL",
+        "plyfile",
+        "tyro",
+        "rich",
+        "docstring_parser",
+        "yaml",
+        "prompt_toolkit",
+    },
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/run.py")
@@ -79,8 +99,16 @@ def module(path: Path) -> str:
     return ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
-def imports(path: Path) -> Iterator[tuple[str, bool]]:
+MODULES = {module(file) for file in FILES}
+
+
+@cache
+def imports(path: Path) -> tuple[tuple[str, bool], ...]:
     """Modules that a file imports, wherever it does, and whether while it is itself imported."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[str, bool]]:
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         for child in ast.iter_child_nodes(node):
@@ -92,8 +120,7 @@ def imports(path: Path) -> Iterator[tuple[str, bool]]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path} uses a relative import"
             found = [f"{node.module}.{alias.name}" for alias in node.names]
-            modules = {module(file) for file in FILES}
-            names = [name if name in modules else node.module or "" for name in found]
+            names = [name if name in MODULES else node.module or "" for name in found]
         parent, now = node, True
         while parent is not tree:
             parent = parent.parent  # type: ignore[attr-defined]

@@ -318,6 +318,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     assert torch.equal(run.render(np.int64(3)), run.render(Path("images/0003")))
 
 
+@pytest.mark.slow
 def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: Path, monkeypatch) -> None:
     """Check, evidence, pictures, scores and another lift of the lifted run."""
     drawn: list[nl.RasterSettings] = []
@@ -348,3 +349,11 @@ def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: P
         nl.lift_run(trained, **given, lift=plain, output_dir=tmp_path / "plain").field.manifest["gsplat_rules"] == "1.4"
     )
     assert set(drawn) == {nl.RasterSettings()}
+
+
+def test_nothing_that_is_kept_depends_on_our_version(trained: Path, lifted: Path) -> None:
+    """A later version opens runs and finds what is in the cache: schemas and digests say what fits."""
+    folder = trained.parents[2]
+    kept = [path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".png", ".jpg")]
+    assert lifted in kept and any(path.suffix == ".safetensors" for path in kept)
+    assert [path for path in kept if f"{nl.__version__}".encode() in path.read_bytes()] == []

@@ -37,9 +37,10 @@ from normlift_ns.encoders.source import FeatureSource, ViewFeatures
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
 from normlift_ns.evaluation.votes import voting_scalars
-from normlift_ns.lifting import Export, lift_scene
+from normlift_ns.lifting import lift_scene
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from normlift_ns.scenes.photographs import PhotographViews
+from normlift_ns.team.seen import Export
 from normlift_ns.viewer.pictures import picture_names, training_cameras
 from tests.scenes import generator
 

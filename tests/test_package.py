@@ -1,6 +1,7 @@
 """What is shipped: a wheel and an sdist with one top-level package, which imports in a clean environment."""
 
 import json
+import re
 import subprocess
 import sys
 import tarfile
@@ -8,7 +9,14 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 import pytest
-import tomllib
+
+import normlift_ns
+from benchmarks import licences
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "normlift_ns").rglob("*.py")}
@@ -23,7 +31,7 @@ def run(*command: object, cwd: Path, **kwargs) -> str:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, Path]:
-    """The wheel and the sdist."""
+    """The sdist, and the wheel, which is built from what the sdist holds."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--outdir", folder, ROOT, cwd=folder)
     (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
@@ -42,7 +50,30 @@ def test_wheel_and_sdist_hold_one_package(built):
             PurePosixPath(*PurePosixPath(member.name).parts[1:]).as_posix() for member in archive if member.isfile()
         }
     assert members >= MODULES
-    assert not [name for name in members if name.startswith(("method_configs", "tests", "benchmarks"))]
+    beside = {"LICENSE", "MANIFEST.in", "PKG-INFO", "README.md", "pyproject.toml", "setup.cfg", "setup.py"}
+    packed = {name for name in members if not name.startswith(("normlift_ns/", "normlift_ns.egg-info/"))}
+    assert packed == beside and "normlift_ns/encoders/texts/xkcd.json" in members & names
+    assert not [name for name in members | names if "__pycache__" in name or name.startswith(".")]
+
+
+@pytest.mark.slow
+def test_an_index_shows_readme_with_links_that_lead_somewhere(built):
+    (name,) = (name for name in zipfile.ZipFile(built[0]).namelist() if name.endswith("dist-info/METADATA"))
+    shown = zipfile.ZipFile(built[0]).read(name).decode()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    files = f"{project['urls']['Source']}/blob/main/"
+    links = re.findall(r"\]\(([^)#]+)", shown)
+    assert len(links) > 15 and all(link.startswith("https://") for link in links)
+    paths = [link.removeprefix(files).removesuffix("?raw=true") for link in links if link.startswith(files)]
+    assert len(paths) > 15 and all((ROOT / path).is_file() for path in paths)
+    assert f"({files}docs/demo.png?raw=true)" in shown and "Description-Content-Type: text/markdown" in shown
+    assert f"\nVersion: {normlift_ns.__version__}\n" in shown
+
+
+def test_every_place_has_the_same_version():
+    version = normlift_ns.__version__
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf8"), re.MULTILINE)[0] == version
 
 
 @pytest.mark.slow
@@ -62,7 +93,12 @@ def test_the_wheel_imports_in_a_clean_environment(built, tmp_path):
     where, nnz = run(python, "-c", code, cwd=tmp_path).split()
     assert str(tmp_path) in where
     assert nnz == "1"
-    assert run(python.with_name("ns-normlift"), "--version", cwd=tmp_path).startswith("normlift_ns ")
+    command = python.with_name("ns-normlift")
+    assert run(command, "--version", cwd=tmp_path).strip() == f"normlift_ns {normlift_ns.__version__}"
+    assert "--load-ply" in run(command, "--help", cwd=tmp_path)
+    run(python, "-m", "normlift_ns.scripts.demo", "--num-gaussians", 3000, "--views", 6, cwd=tmp_path)
+    answers = json.loads((tmp_path / "demo" / "answers.json").read_text())
+    assert {"tomato red", "pumpkin"} <= {query["text"] for query in answers["queries"]}
     discovered = (
         "from importlib.metadata import entry_points as e; "
         "print([p.load().config.method_name for p in e(group='nerfstudio.method_configs')])"
@@ -104,3 +140,20 @@ def test_the_type_checker_resolves_method_configs(tmp_path):
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
     shown = run(checker, "--pythonpath", sys.executable, cwd=tmp_path)
     assert 'is "MethodSpecification"' in shown
+
+
+def test_every_dependency_and_its_licence_are_listed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [*project["dependencies"], *(x for extra in project["optional-dependencies"].values() for x in extra)]
+    names = {re.split(r"[\s<>=!~;\[]", line)[0].lower().replace("_", "-") for line in named} - {"normlift-ns"}
+    rows = [line.split("|")[1:4] for line in licences.PAGE.read_text("utf8").splitlines() if line.startswith("| ")][1:]
+    assert {row[0].strip() for row in rows} == names, "refresh the table: python -m benchmarks.licences"
+    assert all(row[1].strip() not in ("", "see its page") for row in rows)
+    assert licences.packages().keys() <= names  # those of the installed metadata, which make refreshes
+    assert licences.licence("pytest") == "MIT"
+
+
+def test_the_project_has_addresses():
+    assert {"Source", "Issues", "Changelog"} <= set(
+        tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    )

@@ -12,6 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,9 +25,11 @@ from prompt_toolkit.output import DummyOutput
 
 from normlift_ns import InputError, SemanticField, asking, open_run, quick
 from normlift_ns.core.disk.field_file import read_field
+from normlift_ns.core.query import FORMULAS
+from normlift_ns.options import RULES, Rule
 from normlift_ns.question import Question
 from normlift_ns.scripts import query
-from normlift_ns.scripts.prompting import answer_lines, converse
+from normlift_ns.scripts.answers.prompting import answer_lines, converse
 from tests.core.test_field import FORMS, D, example
 from tests.scenes import unit_rows
 from tests.scripts.conftest import run_entry, said
@@ -36,7 +39,7 @@ from tests.scripts.conftest import run_entry, said
 @given(
     seed=st.integers(0, 50),
     form=st.sampled_from(FORMS),
-    rule=st.sampled_from(["cosine", "lerf", "margin"]),
+    rule=st.sampled_from(get_args(Rule)),
     refined=st.booleans(),
     min_reliability=st.sampled_from([0.0, 0.2, 0.9]),
 )
@@ -64,6 +67,10 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
             assert bins == (None if same is None else pytest.approx(same, abs=1e-5))
             for name, value in ours.items():
                 assert value == (pytest.approx(theirs[name], abs=1e-5) if value is not None else None), name
+
+
+def test_every_rule_has_both_formulas_and_its_facts():
+    assert set(FORMULAS) == set(quick.FORMULAS) == set(RULES) == set(get_args(Rule))
 
 
 def test_vectors_of_another_encoder_are_refused(tmp_path):
@@ -94,6 +101,7 @@ def ask(*flags: object, stdin: str = "") -> subprocess.CompletedProcess[str]:
 
 
 def test_colours_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
+    lifted = shutil.copytree(lifted.parent, tmp_path / "run") / "config.yml"  # others ask what is stored, too
     outputs = ("--json", tmp_path / "a.json", "--output-path", tmp_path / "a.npz", "--save")
     done = ask("--load-config", lifted, "--text", "red", "sky blue", *outputs)
     assert done.returncode == 0, done.stderr
@@ -108,7 +116,7 @@ def test_colours_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
         assert row == {key: pytest.approx(value, abs=1e-5) for key, value in other.items()}
     stored = run.ask_stored()
     assert stored is not None and stored.texts == ("red", "sky blue")
-    assert torch.equal(stored.relevancy, expected.relevancy)
+    assert torch.allclose(stored.relevancy, expected.relevancy, rtol=0, atol=1e-6)
 
 
 def test_given_texts_need_neither(lifted, tmp_path):

@@ -23,6 +23,7 @@ from normlift_ns.objects import connected_components
 from normlift_ns.options import AskOptions, LiftOptions, RefineConfig, SourceOptions, SplatOptions
 from normlift_ns.ranges import LONGEST_TEXT, RANGES, check_device, check_number, check_texts, named_as_flags
 from normlift_ns.scripts.batch import NormLiftBatch
+from normlift_ns.scripts.check import NormLiftCheck
 from normlift_ns.scripts.demo import Demo
 from normlift_ns.scripts.evaluate import NormLiftEval
 from normlift_ns.scripts.export import NormLiftExport
@@ -32,6 +33,7 @@ from normlift_ns.scripts.view import NormLiftView
 
 OPTIONS: dict[type, dict[str, Any]] = {
     **{cls: {} for cls in (LiftOptions, RefineConfig, SourceOptions, SplatOptions, AskOptions, NormLift, Demo)},
+    NormLiftCheck: {},
     **{cls: {} for cls in (ScannetOptions, LerfOptions, MaskOptions)},
     NormLiftBatch: {"captures": Path("captures.txt")},
     NormLiftQuery: {"load_config": Path("config.yml"), "text": ("red",)},
@@ -44,6 +46,11 @@ OPTIONS: dict[type, dict[str, Any]] = {
 
 def kinds(hint: Any) -> set[Any]:
     return set(get_args(hint)) - {type(None)} or {hint}
+
+
+def named(x: Any) -> str:
+    """A parameter as every process of the tests calls it."""
+    return "" if isinstance(x, set) else getattr(x, "__name__", str(x))
 
 
 FIELDS = [(cls, field.name, kinds(get_type_hints(cls)[field.name])) for cls in OPTIONS for field in fields(cls)]
@@ -61,7 +68,7 @@ def test_every_number_has_a_range_and_defaults_are_in_it():
                 assert getattr(made, one.name) == one.default
 
 
-@pytest.mark.parametrize(("cls", "name", "kind"), NUMBERS, ids=lambda x: getattr(x, "__name__", str(x)))
+@pytest.mark.parametrize(("cls", "name", "kind"), NUMBERS, ids=named)
 def test_what_is_no_number_or_in_no_range_is_refused(cls, name, kind):
     ends = [RANGES[name].low - 1 - abs(RANGES[name].low), RANGES[name].high * 2 + 1]
     for value in [*HOSTILE, *ends, *([1.5] if kind == {int} else [])]:
@@ -69,7 +76,7 @@ def test_what_is_no_number_or_in_no_range_is_refused(cls, name, kind):
             cls(**{**OPTIONS[cls], name: value})
 
 
-@pytest.mark.parametrize(("cls", "name", "kind"), FIELDS, ids=lambda x: getattr(x, "__name__", str(x)))
+@pytest.mark.parametrize(("cls", "name", "kind"), FIELDS, ids=named)
 def test_values_of_other_types_are_refused(cls, name, kind):
     if name == "holdout":  # a number is a share
         return
@@ -111,7 +118,7 @@ def test_values_take_the_type_of_their_field():
     assert SplatOptions(holdout=0.1).holdout == ("0.1",)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["encoder", "regions", "features", "crop_fill", "features_missing"])
+@pytest.mark.parametrize("name", ["regions", "features", "crop_fill", "features_missing"])
 def test_words_are_those_of_the_list(name):
     for value in ("x", "", 1, None):
         with pytest.raises(InputError, match=f"^{name} must be one of .*; got "):
@@ -120,7 +127,7 @@ def test_words_are_those_of_the_list(name):
 
 @pytest.mark.parametrize("value", ["a\0b", "a\udc80"])
 def test_names_hold_characters_only(value):
-    for name in ("encoder_model", "encoder_pretrained", "level", "text_template"):
+    for name in ("encoder", "encoder_model", "encoder_pretrained", "level", "text_template"):
         with pytest.raises(InputError, match=name):
             SourceOptions(**{name: value})
 

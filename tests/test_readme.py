@@ -1,22 +1,56 @@
 """What the README shows works."""
 
+import json
 import re
-from dataclasses import fields
+import shlex
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
 import torch
 
-from normlift_ns.core.refine import RefineConfig
-from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions
-from normlift_ns.scripts import lift
-from normlift_ns.scripts.batch import NormLiftBatch
-from normlift_ns.scripts.query import NormLiftQuery
+from benchmarks.documents import documents
+from benchmarks.reference import COMMANDS
+from benchmarks.tables import tables
+from normlift_ns.scripts.lift import NormLift
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
+README = (ROOT / "README.md").read_text("utf8")
+PYTHON = (ROOT / "docs" / "python.md").read_text("utf8")
+PAGE_NAMES = (
+    "front_ends",
+    "splats",
+    "scale",
+    "check",
+    "viewer",
+    "objects",
+    "install",
+    "files",
+    "troubleshooting",
+    "honest_answers",
+)
+PAGES = [(ROOT / "docs" / f"{name}.md").read_text("utf8") for name in PAGE_NAMES]
+TERMINAL = {"--quiet", "--log-file", "--version", "--help"}
+OTHERS = {"--app_opt", "--eval", "--filter-value", "--no-deps", "--no-normalize-world-space", "--normalize-world-space"}
+OTHERS |= {"--pose_opt", "--rendered-output-names", "--scenes", "--texts", "--viewer"}
+OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}  # torchrun
+"""Of other programs: pip, uv, ns-train, gsplat's trainer, our benchmarks, and so on."""
+
+
+def python_of(text: str) -> list[str]:
+    """The blocks of Python in a page."""
+    return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+
+
+def flags(options: Any) -> set[str]:
+    """Those of a command, of the options within it too."""
+    hints, found = get_type_hints(options), set()
+    for field in fields(options):
+        hint = hints[field.name]
+        found |= flags(hint) if is_dataclass(hint) else {f"--{field.name.replace('_', '-')}"}
+    return found
 
 
 @pytest.mark.slow
@@ -26,38 +60,120 @@ def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     means = Demo().main()
     print(means)
-    assert means["before refinement"] >= 0.85
-    assert means["after refinement"] >= 0.9
+    assert means["before refinement"] >= 0.78
+    assert means["after refinement"] >= 0.82
     assert (tmp_path / "demo" / "pictures" / "overview.png").stat().st_size > 10_000
-    script, own = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    (script,), (_, own, _) = python_of(README), python_of(PYTHON)
     capsys.readouterr()
     names: dict[str, Any] = {}
     exec(compile(script, "README.md", "exec"), names)
     shown = capsys.readouterr().out
-    assert "sky blue" in shown
-    assert (tmp_path / "demo" / "red.ply").exists()
-    assert names["picture"].shape == (240, 320, 3)
+    assert "tomato red" in shown
+    assert (tmp_path / "demo" / "banana.ply").exists()
+    assert names["picture"].shape == (300, 400, 3)
     (trained,) = Path("demo/outputs/room/splatfacto").glob("*/config.yml")
-    names |= {"labels": np.zeros((240, 320), int), "vectors": np.eye(1, 8), "vector": torch.eye(8)[0]}
+    names |= {"labels": np.zeros((300, 400), int), "vectors": np.eye(1, 8), "vector": torch.eye(8)[0]}
     exec(compile(own.replace("outputs/…/splatfacto/…/config.yml", str(trained)), "README.md", "exec"), names)
     assert names["run"].ask("fox")["fox"].fraction > 0.9
 
 
-FRONT_ENDS = (ROOT / "docs" / "front_ends.md").read_text()
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= 120
 
 
-COMMANDS = "".join(re.findall(r"^    ns-normlift(?:-query)? (?:.*\\\n)*.*\n", README, flags=re.MULTILINE))
-TABLE = README.split("## Options of ns-normlift")[1].split("## Limits")[0]
+def test_the_lift_of_bare_tensors_runs(capsys):
+    exec(compile(python_of(PYTHON)[2], "python.md", "exec"), {})
+    assert capsys.readouterr().out == "tensor([[0.6000, 0.8000]]) tensor([0.5000])\n"
 
 
-SPLATS = "".join(re.findall(r"`ns-normlift [^`]*`", (ROOT / "docs" / "splats.md").read_text()))
+def commands(text: str) -> list[list[str]]:
+    """The indented command lines of ours in a page, as words."""
+    lines = re.sub(r"\\\n +", "", text)
+    found = re.findall(r"^    (ns-(?:normlift|train normlift).*)$", lines, flags=re.MULTILINE)
+    return [shlex.split(line, comments=True) for line in found]
 
 
-SCALE = (ROOT / "docs" / "scale.md").read_text()
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
+)
+def test_commands_that_are_shown_have_the_options_that_they_name(page):
+    for name, *words in commands(page.read_text("utf8")):
+        known = flags(NormLift) if name == "ns-train" else flags(COMMANDS[name]) | TERMINAL
+        if name == "ns-normlift-batch":  # behind -- are options of ns-normlift
+            known |= flags(NormLift)
+        for word in words:
+            if word.startswith("--pipeline."):
+                word = f"--{word.rsplit('.', 1)[1]}"  # noqa: PLW2901
+            elif name == "ns-train":
+                continue
+            assert not word.startswith("--") or word == "--" or word in known, (name, word)
 
 
-@pytest.mark.parametrize("text", [TABLE, COMMANDS, FRONT_ENDS, SPLATS, SCALE])
-def test_options_that_are_shown_exist(text):
-    named = {flag.removeprefix("--").replace("-", "_") for flag in re.findall(r"--[a-z][a-z0-9-]*", text)} - {"help"}
-    commands = (lift.NormLift, LiftOptions, RefineConfig, SourceOptions, SplatOptions, NormLiftQuery, NormLiftBatch)
-    assert named <= {f.name for cls in commands for f in fields(cls)}
+@pytest.mark.parametrize("text", [README, PYTHON, *PAGES], ids=["README", "python", *PAGE_NAMES])
+def test_options_that_are_named_exist(text):
+    """In the whole text of a page; those of other programs are listed."""
+    ours = set().union(*(flags(command) for command in COMMANDS.values())) | TERMINAL
+    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) - ours <= OTHERS
+
+
+def test_figures_of_the_readme_are_those_of_the_results():
+    made, shown = tables(documents()), README.split("## Accuracy")[1]
+    rows = [line for line in shown.splitlines() if line.startswith("| ") and "±" in line]
+    sources = [
+        ("ablation-both", "without refinement"),
+        ("ablation-both", "the paper's vote"),
+        ("ablation-both", "consensus, own evidence"),
+        ("undamaged", "consensus, own evidence"),
+        ("views3", "consensus, own evidence"),
+    ]
+    for row, (table, method) in zip(rows, sources, strict=True):
+        cells = [cell.strip() for cell in row.split("|")[2:-1]]
+        made_row = next(line for line in made[table].splitlines() if line.startswith(f"| {method} |"))
+        found = [cell.strip() for cell in made_row.split("|")]
+        assert cells == [found[2], found[5], found[6]], row
+    hard = next(line for line in made["reliability-tabletop"].splitlines() if line.startswith("| hard |"))
+    assert "51 to 100 %" in hard and "51 % of the Gaussians in its lowest tenth are right, and 100 %" in shown
+    for table, gain in (("grid-second", "5.1 ± 0.8"), ("grid-third", "5.1 ± 1.0")):
+        assert gain in made[table].splitlines()[2] and gain in shown
+
+
+def test_times_of_the_readme_are_those_of_the_results():
+    def metric(document: str, key: str) -> float:
+        found = json.loads((ROOT / "benchmarks" / "results" / f"{document}.json").read_text("utf8"))["metrics"]
+        return next(x["value"] for x in found if x["key"] == key)
+
+    room = {key: metric("h100", f"rooms_1930k.{key}") for key in ("evidence_lift_s", "rgb_s", "neighbors_s", "vote_s")}
+    fox = [metric("cpu", f"fox_{key}_s") for key in ("evidence", "lift", "neighbors", "refine")]
+    wanted = (
+        f"{room['evidence_lift_s']:.2f} s (an RGB render: {room['rgb_s']:.2f} s; "
+        f"stock gsplat: {metric('h100', 'rooms_1930k.gsplat512_s'):.0f} s)",
+        f"{room['neighbors_s'] + room['vote_s']:.2f} s; {metric('h100', 'rooms_1930k.query_ms'):.1f} ms; "
+        f"{metric('h100', 'rooms_1930k.peak_gib'):.1f} GiB",
+        "; ".join(f"{seconds:.1f} s" for seconds in fox),
+        f"H100 | {metric('front_ends', 'view_s'):.2f} s",
+        f"first {metric('command', 'first.wall_s'):.0f} s; features cached {metric('command', 'cached.wall_s'):.1f} s",
+    )
+    for text in wanted:
+        assert text in README
+
+
+def test_times_of_front_ends_are_those_of_the_results():
+    found = json.loads((ROOT / "benchmarks" / "results" / "front_ends.json").read_text("utf8"))["metrics"]
+    seconds = {x["key"]: x["value"] for x in found}
+    network = seconds["sam_encoder_s"] + seconds["sam_decoder_s"]
+    wanted = (
+        f"costs {network:.2f} s of SAM ViT-H's network and {seconds['view_s']:.2f} s in all, "
+        f"{seconds['view_clip_s']:.2f} s of it for CLIP on the {seconds['sam_masks_l']:.0f} masks of a level; CLIP on "
+        f"300 masks takes {seconds['encode_300_s']:.2f} s, and patches {1000 * seconds['patches_s']:.0f} ms"
+    )
+    assert wanted in " ".join(PAGES[PAGE_NAMES.index("front_ends")].split())
+
+
+def test_messages_of_troubleshooting_are_in_the_code():
+    code = "".join(path.read_text("utf8") for path in sorted((ROOT / "normlift_ns").rglob("*.py")))
+    code = re.sub(r'"\n\s*f?"', "", code)
+    page = (ROOT / "docs" / "troubleshooting.md").read_text("utf8")
+    messages = re.findall(r"^\| `([^`]+)` \|", page, flags=re.MULTILINE)
+    assert len(messages) > 20
+    for part in (part.strip(" ;(") for message in messages for part in message.split("…")):
+        assert part in code, part

@@ -110,7 +110,7 @@ def linear_average(
     directions: Float[Tensor, "n d"], reliability: Float[Tensor, " n"], neighbors: Neighbors, config: RefineConfig
 ) -> Float[Tensor, "n d"]:
     """normalise(sum_{k in N+} R_k d_ik u_k); u_i where nobody counts."""
-    out, width = torch.empty_like(directions), decay_width(neighbors, config)
+    out, width = torch.empty_like(directions), decay_width(neighbors.spacing, config)
     for i in torch.arange(len(directions), device=directions.device).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)
         weight = voting_weights(neighbors, width, i, reliability).to(directions.dtype)

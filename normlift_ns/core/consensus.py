@@ -35,13 +35,14 @@ from normlift_ns.core.checks import check_tensors, check_unit_rows
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.lift import Scalars
+from normlift_ns.core.portions import ALONE, Portion, Team, join_sparse
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 
 LEAST = 0.1
 """Overlaps below this, one-sided or J, count as none."""
 SEEN = 0.5
-"""A view sees a Gaussian whose weight in it is at least this share of the median over the view's Gaussians."""
+"""A view sees a Gaussian whose weight in it is at least this share of the median over those that its regions hold."""
 CHANCE, THINGS = 0.4, 0.5
 """B of regions that overlap by chance, and from which all regions are those of things."""
 FAINT = 0.02
@@ -92,6 +93,7 @@ def consensus(
     level: Int[Tensor, " s"] | None = None,
     power: float = 1.0,
     sample: int = 50,
+    portion: Portion | None = None,
 ) -> Consensus:
     """F' of every region; formulas at the top of this file.
 
@@ -100,6 +102,7 @@ def consensus(
         level: of every region; regions of different levels are not compared. None: all are of one.
         power: q, the exponent of c_ts, >= 0.
         sample: Gaussians that every region has at least, or all that it has; >= 1.
+        portion: which Gaussians the evidence is of, where others of the team have the rest; None: all there are.
     Raises:
         ValueError: a table or levels of another length, rows that are neither unit vectors nor 0, negative levels, a
             power or a sample outside its range.
@@ -127,19 +130,34 @@ def consensus(
         raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
     check_unit_rows(features, "feature rows", "normalise them, or set those without a feature to 0", zeros=True)
     device = evidence.rows.weight.device
-    chosen, chance = sampled_gaussians(evidence.rows, size, sample)
-    rows = evidence.rows.select_rows(chosen)
+    chosen, chance = sampled_gaussians(evidence.rows, size, sample, portion)
+    seen = evidence.select_gaussians(chosen)
     level = torch.zeros(size, dtype=torch.int64) if level is None else level
     out, agreement = features.to(device, copy=True), []
     levels = level.unique().tolist()
-    total = seen_weights(evidence, chosen, max(1, len(levels)))
+    if portion is not None and portion.team.size > 1:
+        seen, chance = _of_the_team(seen, portion.gaussians[chosen], chance, portion.team)
+        if portion.team.rank > 0:
+            return Consensus(portion.team.spread(out), portion.team.tell(None), len(chance))
+    rows, total = seen.rows, seen_weights(seen, torch.arange(len(chance), device=device), max(1, len(levels)))
     for number in levels:
         columns = (level == number).nonzero().squeeze(1).to(device)
         part = rows if len(columns) == size else rows.select_columns(columns, size)
         overlaps = region_overlaps(part, evidence.region_view[columns], chance, total)
         out[columns] = agreed(out[columns], overlaps, power)
         agreement.append(overlaps.agreement)
-    return Consensus(out, agreement, len(chosen))
+    if portion is not None:
+        out, agreement = portion.team.spread(out), portion.team.tell(agreement)
+    return Consensus(out, agreement, len(chance))
+
+
+def _of_the_team(
+    seen: Evidence, numbers: Int64[Tensor, " m"], chance: Float64[Tensor, " m"], team: Team
+) -> tuple[Evidence, Float64[Tensor, " all"]]:
+    """The sampled Gaussians of all processes with their chances, in the order of their numbers."""
+    order = team.join(numbers).argsort()
+    rows, unlabeled = (join_sparse(team, part).select_rows(order) for part in (seen.rows, seen.unlabeled))
+    return replace(seen, rows=rows, unlabeled=unlabeled), team.join(chance)[order]
 
 
 def seen_reliability(agreed: Scalars, seen: Scalars) -> Scalars:
@@ -162,20 +180,26 @@ def agreed(features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.
 
 
 def sampled_gaussians(
-    rows: SparseRows, num_columns: int, least: int
+    rows: SparseRows, num_columns: int, least: int, portion: Portion | None = None
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, " m"]]:
     """Gaussians so that every region has at least `least` of them or all that it has, and the chance that each had.
 
     Every Gaussian draws a number by its index alone; a region takes those below its share. Sums over the sample, each
     term divided by its chance, are unbiased.
+
+    Args:
+        portion: which Gaussians the rows are of; None: all there are. Regions count those of the whole team.
+    Returns:
+        The rows that were chosen, and the chance of each.
     """
-    count = torch.bincount(rows.column, minlength=num_columns)
+    add = ALONE.add if portion is None else portion.team.add
+    count = add(torch.bincount(rows.column, minlength=num_columns))
     share = ((least + 3 * least**0.5) / count.double().clamp(min=1)).clamp(max=1)
-    number = _numbers(len(rows), rows.offsets.device)
+    number = _numbers(torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.gaussians)
     while True:
         chance = _largest(rows, share)
         chosen = (number < chance).nonzero().squeeze(1)
-        got = torch.bincount(rows.select_rows(chosen).column, minlength=num_columns)
+        got = add(torch.bincount(rows.select_rows(chosen).column, minlength=num_columns))
         lacking = got < count.clamp(max=least)
         if not bool(lacking.any()):
             return chosen, chance[chosen]
@@ -231,9 +255,9 @@ def region_overlaps(
     return Overlaps(SparseRows(row_offsets(row, size), column.int(), iou), inside, agreement)
 
 
-def _numbers(count: int, device: torch.device) -> Float64[Tensor, " n"]:
+def _numbers(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
     """A number in [0, 1) of every index, well mixed: the last step of MurmurHash3."""
-    x = torch.arange(SEED, SEED + count, device=device)
+    x = index + SEED
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
     return (x ^ (x >> 16)).double() / 2**32

@@ -4,7 +4,7 @@ rasterizing yields.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -164,6 +164,11 @@ class Evidence:
         region_view = new_view[self.region_view[columns].long()]
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
 
+    def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
+        """The evidence of some Gaussians only, in the given order."""
+        rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
+        return replace(self, rows=rows, unlabeled=unlabeled)
+
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
         """The evidence of coarser regions, without rasterizing: E'_jt = sum over levels and the columns s of t of E_js.
 
@@ -257,11 +262,12 @@ class Evidence:
             unlabeled=self.unlabeled.to(device),
         )
 
-    def save(self, path: str | Path, *, key: str = "") -> str:
+    def save(self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None) -> str:
         """Writes a safetensors file, complete or not at all, in place of an earlier one; returns its digest.
 
         Args:
             key: what finds the file again in a cache.
+            remarks: what the head of the file says besides, by name.
         Raises:
             OSError: it cannot be written, for instance because the disk is full.
         """
@@ -269,7 +275,8 @@ class Evidence:
         tensors = {"offsets": rows.offsets, "region": rows.column, "weight": rows.weight}
         tensors |= {f"unlabeled_{name}": getattr(blank, name) for name in ("offsets", "column", "weight")}
         tensors["region_view"] = self.region_view
-        facts = {"format": EVIDENCE_FORMAT, **{name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}}
+        counts = {name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}
+        facts = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
         return save_tensors(Path(path), tensors, facts, key=key, overwrite=True)
 
     @staticmethod

@@ -26,10 +26,17 @@ from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import smallest_basis
+from normlift_ns.core.portions import ALONE, Portion
 from normlift_ns.core.query import relevancy
-from normlift_ns.core.storage import StoredDirections, StoredEvidence, sizes_and_bounds, store_directions
+from normlift_ns.core.storage import (
+    StoredDirections,
+    StoredEvidence,
+    sizes_and_bounds,
+    store_directions,
+    store_evidence,
+)
 from normlift_ns.errors import InputError
-from normlift_ns.options import Rule, Storage
+from normlift_ns.options import RULES, Rule, Storage
 
 
 @dataclass(frozen=True)
@@ -93,18 +100,42 @@ class SemanticField:
             ValueError: `means` or `source` of another length, a tolerance <= 0, an unknown storage, or "low_rank" where
                 no rank meets the tolerance.
         """
-        n, dimension = len(lifted.scalars.norm), lifted.features.shape[1]
+        n = len(lifted.scalars.norm)
         if len(means) != n or (source is not None and len(source) != n):
             raise InputError(
                 f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
                 f"{None if source is None else len(source)}"
             )
+        given = {"tolerance": tolerance, "storage": storage, "provenance": provenance}
+        built = SemanticField.build_together(lifted, means, source, Portion.of(ALONE, means), **given)
+        assert built is not None
+        return built
+
+    @staticmethod
+    def build_together(
+        lifted: Lifted,
+        means: Float[Tensor, "n 3"],
+        source: Int[Tensor, " m"] | None,
+        portion: Portion,
+        *,
+        tolerance: float,
+        storage: Storage | Literal["auto"],
+        provenance: Mapping[str, Any] | None,
+    ) -> SemanticField | None:
+        """`build` by a team, each process with the lift of its portion; process 0 alone gets the field.
+
+        Args:
+            means: of all Gaussians.
+            source: of the portion's Gaussians.
+            provenance: that of process 0 counts.
+        """
+        dimension, team = lifted.features.shape[1], portion.team
         if not tolerance > 0:
             raise InputError(f"tolerance must be positive, got {tolerance}")
         if storage not in (*get_args(Storage), "auto"):
             raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
-        basis = smallest_basis(lifted, tolerance)
-        ways = sizes_and_bounds(lifted, basis)
+        basis = smallest_basis(lifted, tolerance, team)
+        ways = sizes_and_bounds(lifted, basis, portion)
         if storage == "auto":
             storage = min(
                 (name for name, facts in ways.items() if facts["bound"] <= tolerance),
@@ -116,23 +147,25 @@ class SemanticField:
                 "evidence"
             )
         if storage == "evidence":
-            store = StoredEvidence(lifted.evidence, lifted.features.float())
+            store = store_evidence(lifted, portion)
         else:
-            store = store_directions(lifted, basis.rows if storage == "low_rank" and basis is not None else None)
+            chosen = basis.rows if storage == "low_rank" and basis is not None else None
+            store = store_directions(lifted, chosen, portion)
+        scalars = lifted.scalars.map(_single).map(portion.join)
+        sources = portion.join(portion.gaussians.int() if source is None else source.int())
+        if store is None:
+            return None
         manifest = {
             **(provenance or {}),
             "schema_version": SCHEMA_VERSION,
-            "num_gaussians": n,
+            "num_gaussians": len(means),
             "dimension": dimension,
             "means_fingerprint": fingerprint(means),
             "form": storage,
             "tolerance": tolerance,
             "forms": ways,
         }
-        scalars = lifted.scalars.map(_single)
-        identity = torch.arange(n, dtype=torch.int32, device=scalars.norm.device)
-        chosen = identity if source is None else source.int()
-        return SemanticField(scalars, chosen, store, manifest, means.detach().float())
+        return SemanticField(scalars, sources, store, manifest, means.detach().float())
 
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """True where a Gaussian has a direction: evidence of its own or, refined, that of the neighbour it copies."""
@@ -173,7 +206,7 @@ class SemanticField:
             text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined
         )
         values = relevancy(cosine[:, :count], cosine[:, count:], rule=rule)
-        return torch.where(self.valid(refined=refined)[:, None], values, -2.0 if rule == "margin" else 0.0)
+        return torch.where(self.valid(refined=refined)[:, None], values, RULES[rule].least)
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Unit directions of all or some Gaussians, 0 where `valid` is False."""

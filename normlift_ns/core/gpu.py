@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from threading import Thread
 from typing import TypeVar
@@ -15,14 +16,23 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.ranges import check_device
 
+OLDEST_TRITON = 3
 Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
 Result = TypeVar("Result")
 
 
 @cache
 def has_triton() -> bool:
-    """Whether torch came with Triton, as it does on Linux."""
-    return find_spec("triton") is not None
+    """Whether torch came with a Triton that the kernels are written for: 3 or newer, as from torch 2.4 on Linux on.
+
+    Elsewhere stock gsplat rasterizes on the GPU.
+    """
+    if find_spec("triton") is None:
+        return False
+    try:
+        return int(version("triton").partition(".")[0]) >= OLDEST_TRITON
+    except (PackageNotFoundError, ValueError):  # of another distribution, which says nothing
+        return True
 
 
 def kernels_apply(tensor: Tensor) -> bool:
@@ -38,7 +48,7 @@ def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[
     """
     try:
         return [run(items)]
-    except torch.OutOfMemoryError as error:
+    except torch.cuda.OutOfMemoryError as error:
         if len(items) <= 1:
             raise MemoryError(f"the GPU's memory is full ({error}); {advice}") from error
     torch.cuda.empty_cache()

@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from normlift_ns.core.lift import Lifted
+from normlift_ns.core.portions import ALONE, Team
 
 _ROUNDING = 1e-6
 """Relative float32 rounding of the stored weights, norms and directions, added to x_j."""
@@ -41,10 +42,10 @@ class SpectralTable(NamedTuple):
     """|F_s - F_s B B^T| of the first r eigenvectors, r = 0 ... D, in column r."""
 
 
-def spectral_table(features: Float[Tensor, "s d"]) -> SpectralTable:
-    """Eigenvectors of the feature table, in float64."""
+def spectral_table(features: Float[Tensor, "s d"], team: Team = ALONE) -> SpectralTable:
+    """Eigenvectors of the feature table, in float64; in a team those that process 0 finds."""
     exact = features.double()
-    vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
+    vectors = team.spread(torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1))
     power = (exact @ vectors) ** 2
     tail = power.flip(1).cumsum(1).flip(1)  # energy in directions r, r + 1, ...
     return SpectralTable(vectors, torch.cat([tail, tail.new_zeros(len(tail), 1)], dim=1).sqrt())
@@ -66,16 +67,17 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
     return Basis(table.vectors[:, :rank].T.contiguous(), torch.where(x > 1, 2.0, bound))
 
 
-def smallest_basis(lifted: Lifted, tolerance: float) -> Basis | None:
+def smallest_basis(lifted: Lifted, tolerance: float, team: Team = ALONE) -> Basis | None:
     """The basis of least rank that keeps every Gaussian's bound, float16 coordinates included, within `tolerance`;
-    None if none does.
+    None if none does. Every process of a team has Gaussians of its own, and all get the same basis.
     """
-    table = spectral_table(lifted.features)
+    table = spectral_table(lifted.features, team)
     low, high, best = 1, lifted.features.shape[1] + 1, None
     while low < high:  # the bound falls with the rank
         rank = (low + high) // 2
         basis = basis_of_rank(lifted, table, rank)
-        if float(basis.bound.max()) + half_precision_error(rank) <= tolerance:
+        worst = torch.cat([basis.bound.new_zeros(1), basis.bound]).max()
+        if float(team.join(worst[None]).max()) + half_precision_error(rank) <= tolerance:
             best, high = basis, rank
         else:
             low = rank + 1

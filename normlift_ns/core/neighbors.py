@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int32
+from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.core.portions import ALONE, Team
 from normlift_ns.errors import InputError
 from normlift_ns.ranges import check_number
 
@@ -28,7 +29,7 @@ Progress = Callable[[int, int], None]
 
 
 class Neighbors(NamedTuple):
-    """The K nearest other Gaussians of each Gaussian, nearest first, equal distances by index.
+    """The K nearest other Gaussians of all or some Gaussians, nearest first, equal distances by index.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors
@@ -39,15 +40,22 @@ class Neighbors(NamedTuple):
     ([0.0, 2.0, inf], [2.0, 2.0, 2.0])
     """
 
-    index: Int32[Tensor, "n k"]  # pyright: ignore[reportIncompatibleMethodOverride]
+    index: Int32[Tensor, "m k"]  # pyright: ignore[reportIncompatibleMethodOverride]
     """-1 where there are fewer than K others with finite means."""
-    distance: Float[Tensor, "n k"]
+    distance: Float[Tensor, "m k"]
     """Euclidean, in the units of the means; inf where index is -1. Computed in float64, stored in float32 on a GPU."""
-    spacing: Float64[Tensor, " n"]
+    spacing: Float64[Tensor, " m"]
     """Distance to the nearest Gaussian that is not at the same place; inf if there is none."""
 
 
-def nearest_neighbors(means: Float[Tensor, "n 3"], k: int, *, progress: Progress | None = None) -> Neighbors:
+def nearest_neighbors(
+    means: Float[Tensor, "n 3"],
+    k: int,
+    *,
+    of: Int64[Tensor, " m"] | None = None,
+    progress: Progress | None = None,
+    team: Team = ALONE,
+) -> Neighbors:
     """The K nearest neighbours in 3D, N_K(i) of the paper, self excluded, exact.
 
     On the CPU by a k-d tree over the distinct places: any number of Gaussians may share one, while a tree over all of
@@ -56,7 +64,9 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int, *, progress: Progress
     A Gaussian whose mean is not finite has no neighbours and is nobody's neighbour.
 
     Args:
+        of: the Gaussians whose neighbours are asked for, one row of the result each; None: all n.
         progress: called after every block of Gaussians with (Gaussians done, Gaussians).
+        team: processes that ask at the same time, each for some of the same Gaussians; they share what work they can.
     Raises:
         ValueError: k < 1, or more than `MOST_NEIGHBORS`.
 
@@ -68,70 +78,85 @@ def nearest_neighbors(means: Float[Tensor, "n 3"], k: int, *, progress: Progress
     """
     if check_number("k", k, int) > MOST_NEIGHBORS:
         raise InputError(f"k must be at most {MOST_NEIGHBORS:,}, got {k:,}: all neighbours are held in memory at once")
-    found = _on_gpu(means.detach(), k, progress) if kernels_apply(means) else None
-    found = _on_cpu(means, k, progress) if found is None else found
+    found = _on_gpu(means.detach(), k, of, progress, team) if kernels_apply(means) else None
+    found = _on_cpu(means, k, of, progress) if found is None else found
     if progress is not None:
-        progress(len(means), len(means))
+        progress(len(found.index), len(found.index))
     return found
 
 
-def _on_gpu(means: Float[Tensor, "n 3"], k: int, progress: Progress | None) -> Neighbors | None:
+def _on_gpu(
+    means: Float[Tensor, "n 3"], k: int, of: Int64[Tensor, " m"] | None, progress: Progress | None, team: Team
+) -> Neighbors | None:
     """None where the kernel does not apply, or cannot be sure."""
     from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
 
-    finite = means.isfinite().all(dim=1).nonzero().squeeze(1)
-    if means.dtype != torch.float32 or k > nearest.MOST_NEIGHBORS or finite.numel() == 0:
+    finite = means.isfinite().all(dim=1)
+    if means.dtype != torch.float32 or k > nearest.MOST_NEIGHBORS or not bool(finite.any()):
         return None
-    points = means if finite.numel() == len(means) else means[finite]
+    every = bool(finite.all())
+    points, known = means if every else means[finite], of
+    if not every:  # which of the points are asked for
+        of = torch.arange(len(means), device=means.device) if of is None else of
+        known = (finite.cumsum(0) - 1)[of[finite[of]]]
+    rows = len(means) if of is None else len(of)
 
     def tell(done: int) -> None:
         torch.cuda.synchronize(means.device)  # what was launched is not yet done
-        if progress is not None and done < len(means):
-            progress(done, len(means))
+        if progress is not None and done < rows:
+            progress(done, rows)
 
-    found = nearest.nearest(points, k, done=None if progress is None else tell)
+    found = nearest.nearest(points, k, of=known, done=None if progress is None else tell, team=team)
     unsure = (~found.certain).nonzero().squeeze(1)
     if unsure.numel() > _MOST_UNSURE:
         return None
     if unsure.numel() > 0:
-        for array, exact in zip(found, nearest.nearest_of_rows(points, unsure, k)):
+        asked = unsure if known is None else known[unsure]
+        for array, exact in zip(found, nearest.nearest_of_rows(points, asked, k)):
             array[unsure] = exact
-    if finite.numel() == len(means):
+    if every or of is None:
         return Neighbors(found.index, found.distance, found.spacing)
-    n = len(means)
-    index, distance = found.index.new_full((n, k), -1), found.distance.new_full((n, k), torch.inf)
-    spacing = found.spacing.new_full((n,), torch.inf)
-    index[finite] = torch.where(found.index < 0, -1, finite.int()[found.index.clamp(min=0)])
-    distance[finite], spacing[finite] = found.distance, found.spacing
+    there, name = finite[of], finite.nonzero().squeeze(1).int()
+    index, distance = found.index.new_full((len(of), k), -1), found.distance.new_full((len(of), k), torch.inf)
+    spacing = found.spacing.new_full((len(of),), torch.inf)
+    index[there] = torch.where(found.index < 0, -1, name[found.index.clamp(min=0)])
+    distance[there], spacing[there] = found.distance, found.spacing
     return Neighbors(index, distance, spacing)
 
 
-def _on_cpu(means: Float[Tensor, "n 3"], k: int, progress: Progress | None = None) -> Neighbors:
-    n = means.shape[0]
+def _on_cpu(
+    means: Float[Tensor, "n 3"], k: int, of: Int64[Tensor, " m"] | None = None, progress: Progress | None = None
+) -> Neighbors:
     points = means.detach().cpu().double().numpy()
-    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    index, distance, spacing = np.full((n, k), -1, dtype=np.int32), np.full((n, k), np.inf), np.full(n, np.inf)
-    if finite.size > 1:
+    of_rows = np.arange(len(points)) if of is None else of.cpu().numpy()
+    m, is_finite = len(of_rows), np.asarray(np.isfinite(points).all(axis=1))
+    finite = np.flatnonzero(is_finite)
+    index, distance, spacing = np.full((m, k), -1, dtype=np.int32), np.full((m, k), np.inf), np.full(m, np.inf)
+    asked = np.flatnonzero(is_finite[of_rows])
+    if finite.size > 1 and asked.size > 0:
         from scipy.spatial import KDTree  # noqa: PLC0415 (a GPU does without)
 
         places, place_of = np.unique(points[finite], axis=0, return_inverse=True)
         place_of = place_of.reshape(-1)
         tree, member = KDTree(places), _members(place_of, k + 1)
+        me = np.searchsorted(finite, of_rows[asked])  # the number of each among the finite ones
+        wanted, row_of = np.unique(place_of[me], return_inverse=True)
         which: Any = range(1, min(k + 2, len(places)) + 1)  # a sequence, so that one neighbour is still a column
         blocks = []
-        for first in range(0, len(places), _BLOCK):
-            reach, near = map(np.asarray, tree.query(places[first : first + _BLOCK], k=which, workers=-1))
+        for first in range(0, len(wanted), _BLOCK):
+            some = wanted[first : first + _BLOCK]
+            reach, near = map(np.asarray, tree.query(places[some], k=which, workers=-1))
             elsewhere = reach[:, 1] if len(places) > 1 else np.full(len(reach), np.inf)
-            blocks.append((*_rank_gaussians(tree, member, first, near, reach, k + 1), elsewhere))
-            if progress is not None and first + _BLOCK < len(places):
-                progress((first + _BLOCK) * n // len(places), n)
-        ranked, ranked_distance, nearest = (np.concatenate(parts)[place_of] for parts in zip(*blocks))
+            blocks.append((*_rank_gaussians(tree, member, some, near, reach, k + 1), elsewhere))
+            if progress is not None and first + _BLOCK < len(wanted):
+                progress((first + _BLOCK) * m // len(wanted), m)
+        ranked, ranked_distance, nearest = (np.concatenate(parts)[row_of.reshape(-1)] for parts in zip(*blocks))
         # Leave out self; it is missing from the list only where k + 1 others share its place.
-        later = np.cumsum(ranked == np.arange(finite.size)[:, None], axis=1)[:, :k] > 0
+        later = np.cumsum(ranked == me[:, None], axis=1)[:, :k] > 0
         chosen = np.where(later, ranked[:, 1:], ranked[:, :k])
-        index[finite] = np.where(chosen < 0, -1, finite[chosen])
-        distance[finite] = np.where(later, ranked_distance[:, 1:], ranked_distance[:, :k])
-        spacing[finite] = nearest
+        index[asked] = np.where(chosen < 0, -1, finite[chosen])
+        distance[asked] = np.where(later, ranked_distance[:, 1:], ranked_distance[:, :k])
+        spacing[asked] = nearest
     return Neighbors(*(torch.from_numpy(x).to(means.device) for x in (index, distance, spacing)))
 
 
@@ -145,10 +170,10 @@ def _members(place_of: np.ndarray, most: int) -> np.ndarray:
 
 
 def _rank_gaussians(
-    tree: Any, member: np.ndarray, first: int, near: np.ndarray, reach: np.ndarray, count: int
+    tree: Any, member: np.ndarray, some: np.ndarray, near: np.ndarray, reach: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For every place from the first one on its `count` nearest Gaussians (-1 where there are fewer) and their
-    distances, sorted by (distance, index).
+    """For each of some places its `count` nearest Gaussians (-1 where there are fewer) and their distances, sorted by
+    (distance, index).
     """
     slots = member.shape[1]
 
@@ -168,7 +193,7 @@ def _rank_gaussians(
     ranked, distance = (np.concatenate(parts) for parts in zip(*blocks))
     if near.shape[1] > count:  # places that tie across the end of the list: the tree kept any of them
         for row in np.flatnonzero(reach[:, count - 1] == reach[:, count]):
-            place = tree.data[first + row]
+            place = tree.data[some[row]]
             around = np.array(tree.query_ball_point(place, reach[row, count] * (1 + 1e-12)))
             far = np.linalg.norm(tree.data[around] - place, axis=1)
             far = np.where(np.isclose(far, reach[row, count], rtol=1e-12, atol=0), reach[row, count], far)

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import CANONICAL_NEGATIVES, Rule
+from normlift_ns.options import CANONICAL_NEGATIVES, RULES, Rule
+
+
+def _lead(positive: Tensor, negative: Tensor) -> Tensor:
+    return positive - negative.max(dim=-1, keepdim=True).values
+
+
+FORMULAS: dict[Rule, Callable[[Tensor, Tensor, float], Tensor]] = {
+    "cosine": lambda positive, negative, temperature: positive,
+    # A softmax over two is a sigmoid of the difference; it falls as the negative rises, so the minimum is at the
+    # largest negative.
+    "lerf": lambda positive, negative, temperature: torch.sigmoid(temperature * _lead(positive, negative)),
+    "margin": lambda positive, negative, temperature: _lead(positive, negative),
+}
+"""Relevancy from cosines to prompts [..., Q] and to negatives [..., B]; `quick` has the same for numpy."""
 
 
 def relevancy(
@@ -34,19 +50,15 @@ def relevancy(
     >>> relevancy(torch.tensor([[0.3]]), torch.tensor([[0.1, 0.2]]), rule="margin")
     tensor([[0.1000]])
     """
-    if rule == "cosine":
-        return positive
-    if rule not in ("lerf", "margin"):
-        raise InputError(f'rule must be "cosine", "lerf" or "margin", got {rule!r}')
-    if negative is None or negative.shape[-1] == 0:
+    if rule not in FORMULAS:
+        raise InputError(f"rule must be one of {', '.join(FORMULAS)}; got {rule!r}")
+    negative = positive[..., :0] if negative is None else negative
+    if RULES[rule].compares and negative.shape[-1] == 0:
         raise InputError(
             f'rule "{rule}" compares with negative prompts; '
             f"give at least one, for example {', '.join(CANONICAL_NEGATIVES)}"
         )
-    rival = negative.max(dim=-1, keepdim=True).values
-    # A softmax over two is a sigmoid of the difference; it falls as the negative rises, so the minimum is at the
-    # largest negative.
-    return positive - rival if rule == "margin" else torch.sigmoid(temperature * (positive - rival))
+    return FORMULAS[rule](positive, negative, temperature)
 
 
 def strongest(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:

@@ -13,11 +13,12 @@ from torch import Tensor
 from normlift_ns.core.checks import check_not_negative, check_tensors, check_unit_rows
 from normlift_ns.core.gpu import in_parts, kernels_apply
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
+from normlift_ns.core.portions import GRAIN, spatial_order
 from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = 2**24
-_BLOCK = (2**14, 2**17)
+_BLOCK = (2 * GRAIN, 16 * GRAIN)
 """Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
 MOST_VOTERS = 256
 """Largest K of a vote, which compares every two of them: its time grows with the square."""
@@ -103,34 +104,58 @@ def refine(
     if tuple(neighbors.index.shape) != (n, config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
     neighbors = Neighbors(*(x.contiguous() for x in neighbors))
-    on_gpu = kernels_apply(means)
-    if given is not None and on_gpu and given.dtype == torch.float32:
+    if given is not None and kernels_apply(means) and given.dtype == torch.float32:
         given, directions = None, given.__getitem__  # the kernel needs as much memory again: a block at a time
-    width = decay_width(neighbors, config)
+    order, width = spatial_order(means), decay_width(neighbors.spacing, config)
+    return vote_of(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
+
+
+def vote_of(
+    voters: Int64[Tensor, " v"],
+    neighbors: Neighbors,
+    directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
+    reliability: Float[Tensor, " n"],
+    config: RefineConfig,
+    *,
+    own: Float[Tensor, " n"] | None,
+    width: Float64[Tensor, ""],
+    progress: Progress | None = None,
+) -> Int32[Tensor, " n"]:
+    """`refine` for some of the Gaussians, those with neighbours: the first m. The rest vote for others only.
+
+    Args:
+        voters: in the order in which they are taken, block by block: neighbours in space near each other.
+        neighbors: of the first m Gaussians, all voters among them.
+        directions, reliability: as in `refine`, of all n.
+        own: as in `refine`, read for voters only; None: the paper's vote.
+        width: sigma_d, in the units of the distances.
+    """
+    n, device, on_gpu = len(reliability), reliability.device, kernels_apply(reliability)
     decay = float(width)
-    source, row_of = (torch.arange(n, dtype=torch.int32, device=means.device) for _ in range(2))
-    # Where no neighbour is reliable, nobody can win.
-    order = spatial_order(means)
-    order = order[_any_reliable(neighbors, reliability)[order]]
+    source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
+    wins = _any_reliable(neighbors, reliability)  # where no neighbour is reliable, nobody can win
 
     def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
             rows = directions
         else:
-            gaussians = _members(voters, neighbors)
+            gaussians = _members(voters, neighbors, n)
             rows = directions(gaussians)
-            row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=means.device)
+            row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
         if on_gpu and rows.dtype != torch.float64 and config.k <= _MOST_IN_KERNEL:
             _vote_on_gpu(voters, neighbors, rows, row_of, reliability, own, source, config, decay)
         else:
             _vote(voters, neighbors, rows, row_of, reliability, own, source, config, width)
 
-    done = n - len(order)
-    for voters in order.split(_BLOCK[on_gpu] if given is None else max(1, n)):
-        in_parts(vote, voters, "refine on the CPU")
-        done += len(voters)
+    size, done = _BLOCK[on_gpu] if callable(directions) else max(1, n), 0
+    there = wins[voters]
+    ends = there.cumsum(0)[size - 1 : -1 : size].tolist()
+    for block in voters[there].tensor_split(ends):
+        if len(block) > 0:
+            in_parts(vote, block, "refine on the CPU")
+        done = min(done + size, len(voters))
         if progress is not None:
-            progress(done, n)
+            progress(done, len(voters))
     return source
 
 
@@ -222,28 +247,12 @@ def _vote_on_gpu(
     )
 
 
-def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
-    """All Gaussians along a Morton curve of 1,024 steps a side: neighbours in space come near each other.
-
-    A scene's far outliers would leave the rest in one cell, so that sides end at the 1st and 99th percentile.
-    """
-    sample = means[:: max(1, len(means) // 100_000)]
-    sample = sample[sample.isfinite().all(dim=1)].double()
-    if len(sample) == 0:
-        return torch.arange(len(means), device=means.device)
-    low, high = sample.quantile(sample.new_tensor([0.01, 0.99]), dim=0)
-    cell = ((means - low) / (high - low).clamp(min=1e-12) * 1023).nan_to_num(0).clamp(0, 1023).long()
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        cell = (cell | (cell << shift)) & mask
-    return (cell[:, 0] | cell[:, 1] << 1 | cell[:, 2] << 2).int().argsort(stable=True)
-
-
-def decay_width(neighbors: Neighbors, config: RefineConfig) -> Float64[Tensor, ""]:
+def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:
     """sigma_d in the units of the means: times the median spacing (1 where all Gaussians are at one place)."""
-    finite = neighbors.spacing[neighbors.spacing.isfinite()]
+    finite = spacing[spacing.isfinite()]
     sigma = config.numbers.sigma_d
     if finite.numel() == 0:
-        return sigma * neighbors.spacing.new_ones(())
+        return sigma * spacing.new_ones(())
     # torch looks for a median with one block of a GPU
     median = finite.sort().values[(finite.numel() - 1) // 2] if finite.is_cuda else finite.median()
     return sigma * median
@@ -308,9 +317,9 @@ def _margin(
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))
 
 
-def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """True where neither a Gaussian nor any neighbour has R > 0: the regions that voting cannot repair (limitation 4
-    of the paper).
+    of the paper). Of those that have a list of neighbours, the first m.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors, unsupported
@@ -318,10 +327,10 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
     >>> unsupported(neighbors, torch.tensor([0.5, 0.0, 0.0, 0.0])).tolist()
     [False, False, True, True]
     """
-    return (reliability <= 0) & ~_any_reliable(neighbors, reliability)
+    return (reliability[: len(neighbors.index)] <= 0) & ~_any_reliable(neighbors, reliability)
 
 
-def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """Whether a neighbour of each Gaussian has R > 0."""
     if kernels_apply(neighbors.index):
         from normlift_ns.kernels.vote import any_reliable  # noqa: PLC0415 (needs triton)
@@ -330,14 +339,14 @@ def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Boo
     return (_gather(reliability, neighbors.index) > 0).any(dim=1)
 
 
-def _members(voters: Int[Tensor, " v"], neighbors: Neighbors) -> Int64[Tensor, " m"]:
-    """The voters and their neighbours, each once, ascending."""
+def _members(voters: Int[Tensor, " v"], neighbors: Neighbors, n: int) -> Int64[Tensor, " m"]:
+    """The voters and their neighbours, of n Gaussians, each once, ascending."""
     if kernels_apply(neighbors.index):
         from normlift_ns.kernels.vote import members  # noqa: PLC0415 (needs triton)
 
-        return members(voters, neighbors.index)
+        return members(voters, neighbors.index, n)
     group = torch.cat([voters, neighbors.index[voters].flatten().long()])
-    read = torch.zeros(len(neighbors.index), dtype=torch.bool, device=voters.device)
+    read = torch.zeros(n, dtype=torch.bool, device=voters.device)
     read[group[group >= 0]] = True
     return read.nonzero().squeeze(1)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import Basis, half_precision_error
+from normlift_ns.core.portions import Portion
 
 _QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
 _CPU_BLOCK, _GPU_BLOCK = 2**21, 2**25
@@ -71,34 +72,57 @@ class StoredDirections:
         return torch.where(found[gaussians][:, None], torch.nn.functional.normalize(rows, dim=1), 0.0)
 
 
-def evidence_bytes(evidence: Evidence) -> int:
-    """Bytes of the evidence's arrays."""
-    rows, blank = evidence.rows, evidence.unlabeled
-    arrays = (rows.offsets, rows.column, rows.weight, evidence.region_view, blank.offsets, blank.column, blank.weight)
-    return sum(a.numel() * a.element_size() for a in arrays)
+def store_evidence(lifted: Lifted, portion: Portion) -> StoredEvidence | None:
+    """E and F of all portions, at process 0 alone."""
+    rows, unlabeled = (portion.deliver_sparse(x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
+    if rows is None or unlabeled is None:
+        return None
+    return StoredEvidence(replace(lifted.evidence, rows=rows, unlabeled=unlabeled), lifted.features.float())
 
 
-def store_directions(lifted: Lifted, basis: Tensor | None) -> StoredDirections:
-    """Directions of the Gaussians with evidence in float16, in the basis if there is one."""
-    blocks = []
-    for first, block in lifted.iter_directions():
-        rows = block[lifted.scalars.norm[first : first + len(block)] > 0]
+def store_directions(lifted: Lifted, basis: Tensor | None, portion: Portion) -> StoredDirections | None:
+    """Directions of the Gaussians with evidence in float16, in the basis if there is one, at process 0 alone.
+
+    Rounding may depend on which rows are multiplied together, so that these are the same for every team.
+    """
+    dimension = lifted.features.shape[1] if basis is None else len(basis)
+    found, blocks = lifted.scalars.norm > 0, [lifted.features.new_zeros(0, dimension, dtype=torch.float16)]
+    rows_of = [found.new_zeros(0, dtype=torch.int64)]
+    for block in portion.blocks():
+        rows_of.append(block[found[block]])
+        rows = lifted.directions(rows_of[-1])
         blocks.append((rows if basis is None else torch.nn.functional.normalize(rows.double() @ basis.T, dim=1)).half())
-    return StoredDirections(torch.cat(blocks), None if basis is None else basis.float())
+    coordinates, gaussians = torch.cat(blocks), portion.gaussians[torch.cat(rows_of)]
+    blocks.clear()
+    parts, numbers = portion.team.deliver(coordinates), portion.team.deliver(gaussians)
+    if parts is None or numbers is None:
+        return None
+    row_of = torch.zeros(len(portion.order) + 1, dtype=torch.int64, device=found.device)
+    for number in numbers:
+        row_of[number + 1] = 1
+    row_of = row_of.cumsum(0)
+    stored = coordinates.new_empty(sum(map(len, parts)), dimension)
+    for number, part in zip(numbers, parts):
+        stored[row_of[number]] = part
+    return StoredDirections(stored, None if basis is None else basis.float())
 
 
-def sizes_and_bounds(lifted: Lifted, basis: Basis | None) -> dict[str, dict[str, Any]]:
+def sizes_and_bounds(lifted: Lifted, basis: Basis | None, portion: Portion) -> dict[str, dict[str, Any]]:
     """What each way of storage costs in bytes, beside scalars and source, and the most that it can change a cosine."""
-    found = lifted.scalars.norm > 0
-    with_evidence, dimension = int(found.sum()), lifted.features.shape[1]
-    exact = evidence_bytes(lifted.evidence) + 4 * lifted.features.numel()
+    found, evidence, team = lifted.scalars.norm > 0, lifted.evidence, portion.team
+    sizes = [found.sum(), found.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]]
+    with_evidence, *entries = team.add(torch.stack(sizes)).tolist()
+    dimension, matrices = lifted.features.shape[1], (evidence.rows, evidence.unlabeled)
+    exact = 4 * (lifted.features.numel() + evidence.num_regions)
+    for count, rows in zip(entries, matrices):
+        exact += 8 * (len(portion.order) + 1) + count * (4 + rows.weight.element_size())
     options: dict[str, dict[str, Any]] = {
         "evidence": {"bytes": exact, "bound": 0.0},
         "float16": {"bytes": 2 * with_evidence * dimension, "bound": half_precision_error(dimension)},
     }
     if basis is not None:
         rank = len(basis.rows)
-        bounds = basis.bound[found].cpu().numpy() if with_evidence > 0 else np.zeros(1)
+        bounds = team.join(basis.bound[found]).cpu().numpy() if with_evidence > 0 else np.zeros(1)
         quantiles = np.quantile(bounds, _QUANTILES) + half_precision_error(rank)
         options["low_rank"] = {
             "bytes": 2 * with_evidence * rank + 4 * rank * dimension,

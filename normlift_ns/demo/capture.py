@@ -13,14 +13,16 @@ from torch import Tensor
 
 from normlift_ns.core.files import new_file, write_text
 from normlift_ns.core.gaussians import Camera
-from normlift_ns.demo.room import DemoRoom
+from normlift_ns.demo.build import DemoRoom
 from normlift_ns.raster.rasterize import render
 
+WIDTH, HEIGHT = 400, 300
+"""Of a photograph, pixels."""
 _FIELD_OF_VIEW = 75.0
 """Horizontal, degrees."""
 
 
-def demo_cameras(count: int = 24, width: int = 320, height: int = 240) -> list[Camera]:
+def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
     """Cameras on a circle inside the room, at three heights in turn, looking across the table. Size in pixels."""
     return [
         _look((1.4, 360 * i / count, (1.0, 1.35, 1.7)[i % 3]), (0, 0, (0.55, 0.45, 0.35)[i % 3]), width, height)
@@ -28,7 +30,7 @@ def demo_cameras(count: int = 24, width: int = 320, height: int = 240) -> list[C
     ]
 
 
-def held_out_cameras(count: int = 4, width: int = 320, height: int = 240) -> list[Camera]:
+def held_out_cameras(count: int = 4, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
     """Cameras for evaluation, on another circle than `demo_cameras`."""
     return [_look((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
 
@@ -50,7 +52,7 @@ def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
 
 
 def write_capture(
-    room: DemoRoom, folder: Path, views: int = 24, held_out: int = 4, width: int = 320, height: int = 240
+    room: DemoRoom, folder: Path, views: int = 24, held_out: int = 4, width: int = WIDTH, height: int = HEIGHT
 ) -> None:
     """Writes a nerfstudio dataset with true masks; files of the same names are replaced.
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
-from normlift_ns.demo.room import DemoRoom
+from normlift_ns.demo.build import DemoRoom
 
 
 def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:

@@ -136,11 +136,16 @@ def cover(shape: Distance, points: Array, count: int, rng: np.random.Generator) 
     Args:
         points: [m, 3], a dense sample of the surface, at least ten points a patch.
     """
+    if count == 0:
+        return Surfels(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
     sample = np.hstack([points, _CREASE * normals(shape, points)])
     centres = rng.choice(sample, count, replace=False)
     for _ in range(6):
         centres = _patch_means(sample, _nearest(centres, sample), centres)
-    means, normal = centres[:, :3], centres[:, 3:] / length(centres[:, 3:])[:, None]
+    means, normal = (
+        centres[:, :3],
+        centres[:, 3:] / length(centres[:, 3:])[:, None].clip(1e-12),
+    )  # none where both sides are one patch
     patch = _nearest(centres, sample)
     offsets = points - means[patch]
     along = (offsets * normal[patch]).sum(axis=1)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.build import make_texts as make_texts
     from normlift_ns.encoders.cache import cached as cached
     from normlift_ns.encoders.images import read_image as read_image
+    from normlift_ns.encoders.kinds import EncoderKind as EncoderKind
     from normlift_ns.encoders.langsplat.source import LangSplat as LangSplat
     from normlift_ns.encoders.langsplat.source import write_langsplat as write_langsplat
     from normlift_ns.encoders.source import Encoder as Encoder
@@ -29,6 +30,7 @@ _HOMES = {
     "build": ("SourceOptions", "make_encoder", "make_regions", "make_source", "make_texts"),
     "cache": ("cached",),
     "images": ("read_image",),
+    "kinds": ("EncoderKind",),
     "langsplat.source": ("LangSplat", "write_langsplat"),
     "source": ("Encoder", "FeatureSource", "RegionFeatures", "Regions", "TextEncoder", "ViewFeatures"),
 }

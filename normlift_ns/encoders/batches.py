@@ -47,6 +47,9 @@ class Batches:
     ) -> Iterator[list[Tensor]]:
         """The function's rows, one per item, of each part, where one batch may hold items of several parts.
 
+        The last batch is filled up with its last item, so that all have the same shape and a row does not depend on
+        what else is asked for: its rounding may.
+
         A part is asked for when those before it leave room in a batch; its rows are given as soon as they are known.
 
         Raises:
@@ -61,6 +64,8 @@ class Batches:
                 rows.extend(row for result in self(function, batch) for row in result)
             while len(counts) > 0 and counts[0] <= len(rows):
                 yield [rows.popleft() for _ in range(counts.popleft())]
-        rows.extend(row for result in self(function, waiting) for row in result)
+        if len(waiting) > 0:
+            filled = [*waiting, *[waiting[-1]] * (self.size - len(waiting))]
+            rows.extend([row for result in self(function, filled) for row in result][: len(waiting)])
         for count in counts:
             yield [rows.popleft() for _ in range(count)]

@@ -10,18 +10,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.patches import PatchFeatures, why_not_dense
-from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.foreign import Foreign
+from normlift_ns.encoders.kinds import absolute_paths, encoder_kind, is_ours
 from normlift_ns.encoders.langsplat.source import LangSplat
+from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.encoders.sam.masks import SamMasks
+from normlift_ns.encoders.sam.text_masks import Sam3Masks
 from normlift_ns.encoders.sam.weights import local_sam
 from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
-from normlift_ns.encoders.texts.colours import refuse_template
 from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.errors import InputError
-from normlift_ns.options import DEFAULT_SAM, EncoderName, FeaturesName, RegionsName, SourceOptions
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, FeaturesName, RegionsName, SourceOptions
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
@@ -55,7 +55,7 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
         raise InputError(
             "--regions and --regions-dir cut images up, but --features brings regions of its own; leave one out"
         )
-    if options.encoder != "open_clip" and options.text_vectors is None:
+    if not encoder_kind(options.encoder).learned and options.text_vectors is None:
         raise InputError(
             f"encoder {options.encoder!r} did not make the features in {options.features_dir}; name the OpenCLIP model "
             "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
@@ -73,7 +73,7 @@ def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, An
     """The options of a lift for its manifest, ready for JSON: "auto" decided, files by their absolute paths."""
     if options.features == "none":
         options = replace(options, regions=resolve_regions(options, device))
-    settings = {**asdict(options), "encoder_pretrained": _absolute(options.encoder_pretrained)}
+    settings = {**asdict(options), **absolute_paths(options)}
     settings["sam_model"] = None if options.sam_model is None else _absolute(options.sam_model)
     return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in settings.items()}
 
@@ -132,15 +132,13 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     Args:
         device: where a network runs, such as "cuda"; results are on the CPU anyway.
     Raises:
-        ValueError: an unknown encoder, model, tag of weights or fill.
+        ValueError: an unknown encoder, model, tag of weights or fill; what an encoder of another package refuses.
         FileNotFoundError: a weight file that does not exist.
     """
-    if options.encoder == "open_clip":
-        return _make_clip(options, device)
-    if options.encoder == "colour":
-        refuse_template(options.text_template)
-        return ColourEncoder()
-    raise InputError(f"unknown encoder {options.encoder!r}; --encoder is one of {', '.join(get_args(EncoderName))}")
+    kind = encoder_kind(options.encoder)
+    if is_ours(kind):
+        return kind.make(options, device)
+    return Foreign.made(options.encoder, lambda: kind.make(options, device))
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
@@ -157,11 +155,12 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
         return "files"
     if options.sam_model is not None:
         return "sam"
-    if options.encoder != "open_clip":
+    kind = encoder_kind(options.encoder)
+    if not kind.learned:
         return "superpixel"
     if device.startswith("cuda") and find_spec("transformers") is not None and local_sam(DEFAULT_SAM) is not None:
         return "sam"
-    return "patches" if why_not_dense(options.encoder_model) is None else "superpixel"
+    return "patches" if kind.has_patches(options) else "superpixel"
 
 
 def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
@@ -171,12 +170,14 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
         device: where a network runs, such as "cuda"; results are on the CPU anyway.
     Raises:
         ValueError: unknown regions, "files" without a folder, a folder or a level that the regions have no use for;
-            what `SamMasks` raises.
+            what `SamMasks` and `Sam3Masks` raise.
         FileNotFoundError: the folder, or the checkpoint of sam, does not exist.
     """
     kind = resolve_regions(options, device)
-    if kind != "sam":
+    if kind not in ("sam", "sam3"):
         _refuse_sam(options, kind)
+    if kind != "sam3":
+        _refuse(" ".join(options.region_texts) or None, "--region-texts", kind, "sam3")
     if kind == "files":
         if options.regions_dir is None:
             raise InputError(
@@ -189,6 +190,8 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
         level: Any = options.level or "l"
         return SamMasks(options.sam_model or DEFAULT_SAM, level, device, options.sam_precision)
     _refuse(options.level, "--level", kind, "files or sam")
+    if kind == "sam3":
+        return Sam3Masks(options.region_texts, options.sam_model or DEFAULT_SAM3, device, options.sam_precision)
     count = 256 if options.region_count is None else options.region_count
     if kind == "patches":
         raise InputError("patches are no regions that another encoder could look at; use make_source")
@@ -197,17 +200,16 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
 
 def _make_patches(options: SourceOptions, device: str) -> PatchFeatures:
     _refuse_sam(options, "patches")
+    _refuse(" ".join(options.region_texts) or None, "--region-texts", "patches", "sam3")
     _refuse(options.regions_dir, "--regions-dir", "patches", "files")
     _refuse(options.level, "--level", "patches", "files or sam")
-    if options.encoder != "open_clip":
-        raise InputError(f"--regions patches are those of --encoder open_clip; {options.encoder!r} has none")
-    return PatchFeatures(_make_clip(options, device), 1024 if options.region_count is None else options.region_count)
-
-
-def _make_clip(options: SourceOptions, device: str) -> OpenClipEncoder:
-    return OpenClipEncoder(
-        options.encoder_model, options.encoder_pretrained, options.crop_fill, device, options.text_template
-    )
+    encoder: Any = make_encoder(options, device)
+    if not hasattr(encoder, "patches"):
+        raise InputError(
+            f"--regions patches are for encoders that have features of patches; {options.encoder!r} has none. Take "
+            "--regions superpixel, or --encoder open_clip"
+        )
+    return PatchFeatures(encoder, 1024 if options.region_count is None else options.region_count)
 
 
 def _refuse_sam(options: SourceOptions, kind: str) -> None:

@@ -9,17 +9,20 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
 from normlift_ns.core.disk.tensors import load_tensors, save_tensors
-from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.encoders.sam.text_masks import Sam3Network, sam3_identity
 from normlift_ns.encoders.source import (
     Encoder,
     FeatureSource,
@@ -46,6 +49,54 @@ def cached(source: FeatureSource, folder: Path) -> FeatureSource:
         CachedEncoder(source.encoder, folder / "features"),
     )
     return replace(source, regions=regions, encoder=encoder)
+
+
+class NotKeptError(Exception):
+    """What was asked for is not in the cache."""
+
+
+def only_kept(source: FeatureSource, folder: Path) -> FeatureSource:
+    """The source with what is kept of it in a folder, which computes nothing that would be kept: `view` raises
+    `NotKeptError` for an image of which something is missing. Sources of which nothing is kept are as they were.
+    """
+    found: Any = cached(source, folder)
+    if isinstance(found, CachedPatches):
+        return replace(found, source=cast(Any, _AbsentPatches(found.source)))
+    if not isinstance(found, RegionFeatures):
+        return found
+    regions, encoder = cast(Any, found.regions), cast(Any, found.encoder)
+    return replace(
+        found,
+        regions=replace(regions, regions=_AbsentRegions(regions.regions)),
+        encoder=replace(encoder, encoder=_AbsentEncoder(encoder.encoder)),
+    )
+
+
+class _Absent:
+    """Something that says what it is, and computes nothing."""
+
+    def __init__(self, wanted: Any) -> None:
+        self._wanted = wanted
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._wanted, name)
+
+
+class _AbsentPatches(_Absent):
+    def features(self, image: Tensor, name: str) -> Tensor:
+        raise NotKeptError
+
+
+class _AbsentRegions(_Absent):
+    def labels(self, image: Tensor, name: str) -> Tensor:
+        raise NotKeptError
+
+
+class _AbsentEncoder(_Absent):
+    def encode_each(self, views: Iterable[Any]) -> Iterator[Tensor]:
+        for _ in views:
+            raise NotKeptError
+        yield from ()
 
 
 @dataclass(frozen=True)
@@ -162,6 +213,46 @@ class CachedPatches:
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.source.text(prompts)
+
+
+@dataclass(frozen=True)
+class KeptTextMasks:
+    """What SAM 3 finds in photographs: where a text was asked before, its network is not even loaded.
+
+    The key: the image, the text, and the network. Masks are kept as bits.
+    """
+
+    checkpoint: str
+    """A folder, or a name on the hub."""
+    device: str
+    folder: Path
+    """Holds one safetensors file per image and text; made if it does not exist. Where it cannot be written to, nothing
+    is kept."""
+
+    def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
+        """What is in any of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.find`."""
+        size = (image.shape[0], image.shape[1])
+        paths = {text: cache_path(self.folder, self._identity, text.encode(), *_parts(image)) for text in texts}
+        found = {text: _read(path, "bits", partial(_are_bits, size=size)) for text, path in paths.items()}
+        new = [text for text, bits in found.items() if bits is None]
+        for text, masks in zip(new, self._network.find(image, new) if len(new) > 0 else []):
+            found[text] = bits = torch.from_numpy(np.packbits(masks.union.cpu().numpy(), axis=1))
+            with suppress(OSError):
+                _write(paths[text], "bits", bits)
+        packed = np.stack([bits.numpy() for text in texts if (bits := found[text]) is not None])
+        return torch.from_numpy(np.unpackbits(packed, axis=2, count=size[1]).astype(bool))
+
+    @cached_property
+    def _identity(self) -> dict[str, Any]:
+        return sam3_identity(self.checkpoint, self.device)
+
+    @cached_property
+    def _network(self) -> Sam3Network:
+        return Sam3Network.load(self.checkpoint, self.device)
+
+
+def _are_bits(found: Tensor, size: tuple[int, int]) -> bool:
+    return found.dtype == torch.uint8 and found.shape == (size[0], -(-size[1] // 8))
 
 
 def _parts(tensor: Tensor) -> tuple[bytes, bytes]:

@@ -22,6 +22,8 @@ from typing import Any
 from safetensors import SafetensorError
 
 _PROBE_SECONDS = 10
+_HUB = "https://huggingface.co"
+_PATHS_ONLY = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 _LONGEST = 300
 _CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
 """Names that the hub's repositories give the weights of OpenCLIP models."""
@@ -111,7 +113,7 @@ def _argument(call: ast.AST, name: str) -> ast.expr:
     return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
     """The beginning of a foreign error, for a message of ours."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
     kept = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
@@ -127,3 +129,23 @@ def probe(address: str) -> None:
         pass
     except OSError as error:
         raise ConnectionError(f"{address} cannot be reached, {error}") from error
+
+
+def reach_hub() -> None:
+    """Raises OSError where nothing can be downloaded from the Hugging Face hub."""
+    if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
+        raise ConnectionError("HF_HUB_OFFLINE forbids to download")
+    probe(os.environ.get("HF_ENDPOINT", _HUB))
+
+
+def is_path(name: str, parts: int) -> bool:
+    """Whether a name can only be that of a file or folder here.
+
+    Args:
+        parts: of other names, at most.
+
+    >>> is_path("google/siglip2-base-patch16-224", 2), is_path("a/b/c", 2), is_path("clip.pt", 2)
+    (False, True, True)
+    """
+    path = Path(name)
+    return path.is_absolute() or len(path.parts) > parts or path.suffix in _PATHS_ONLY

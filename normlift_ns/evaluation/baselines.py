@@ -25,7 +25,7 @@ from normlift_ns.core.storage import StoredDirections, StoredEvidence
 from normlift_ns.encoders.build import recorded_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.observing import BLOCK, Block, observe_views, of_regions, region_levels, spread
+from normlift_ns.observing import Block, in_chunks, observe_views, of_regions, region_levels, spread
 from normlift_ns.options import LiftOptions
 from normlift_ns.raster.rasterize import rasterize_evidence
 
@@ -132,8 +132,8 @@ def seen_blocks(lifted: EvaluatedRun, device: str, *, most: int | None = None) -
     used = [used[i] for i in spread(len(used), most)]
     rendered = lifted.settings if options.get("image_source") == "render" else None
     how = {"rendered": rendered, "divisor": options.get("lift_downscale", 1), "done": lambda view: None}
-    for start in range(0, len(used), BLOCK):
-        yield observe_views(scene, used[start : start + BLOCK], source, **how)
+    for chunk in in_chunks(used):
+        yield observe_views(scene, chunk, source, **how)
 
 
 def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: Block, *, power: int = 1) -> Evidence:

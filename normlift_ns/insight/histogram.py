@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from normlift_ns.options import Rule
+from normlift_ns.options import RULES, Rule
 
 BINS = 32
 _TOP = 0.999
@@ -30,8 +30,8 @@ _ALIKE = 1e-3
 """Share of the range of relevancies within which the median is at the top."""
 _SAME = 1e-6
 """Relevancies that differ by less are the same; where all are, and above 0, this far below them is suggested."""
-_LEAST_LERF, _LEAST_COLOUR = 0.62, 0.9
-"""Top below which a text is probably not in the scene: of rule lerf, and of bare cosines of the colour encoder."""
+_LEAST_COLOUR = 0.9
+"""Top of bare cosines of the colour encoder below which a text is probably not in the scene."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -136,11 +136,7 @@ def top_limit(rule: Rule, encoder: str | None) -> float | None:
     >>> top_limit("lerf", "open_clip"), top_limit("cosine", "colour"), top_limit("cosine", "open_clip")
     (0.62, 0.9, None)
     """
-    if rule == "lerf":
-        return _LEAST_LERF
-    if rule == "margin":
-        return math.log(_LEAST_LERF / (1 - _LEAST_LERF)) / 10  # the same lead over the negatives
-    return _LEAST_COLOUR if encoder == "colour" else None
+    return _LEAST_COLOUR if rule == "cosine" and encoder == "colour" else RULES[rule].present
 
 
 def _between(median: float, top: float) -> float:

@@ -9,7 +9,7 @@ as the last one that was, the query is reported as uncertain.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 import triton
@@ -28,6 +28,24 @@ _SORTED_IN_A_BLOCK = 4096
 """Points that torch sorts with one block of a GPU, without passes over the memory."""
 _LEAVES = 2**14
 """Leaves at once: half a million points, 320 bytes each at K = 36."""
+
+
+class Sharing(Protocol):
+    """Some processes, of which `core.portions.Team` is one."""
+
+    @property
+    def rank(self) -> int:
+        """Of this one."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        ...
+
+    def join(self, rows: Tensor, /) -> Tensor:
+        """The rows of all, one behind the other, at every process."""
+        ...
 
 
 class Tree(NamedTuple):
@@ -52,8 +70,12 @@ class Found(NamedTuple):
     """False where the answer may be wrong."""
 
 
-def build_tree(points: Float32[Tensor, "n 3"]) -> Tree:
-    """Splits in the middle of the longest side, level by level; one sort per level, of small nodes each for itself."""
+def build_tree(points: Float32[Tensor, "n 3"], team: Sharing | None = None) -> Tree:
+    """Splits in the middle of the longest side, level by level; one sort per level, of small nodes each for itself.
+
+    Args:
+        team: processes that have the same points, of which each splits a part of the nodes; all get the same tree.
+    """
     n, device = len(points), points.device
     depth = max(0, (-(-n // LEAF) - 1).bit_length())
     size = LEAF << depth
@@ -61,17 +83,21 @@ def build_tree(points: Float32[Tensor, "n 3"]) -> Tree:
     index[:n] = torch.arange(n, device=device)
     padded = torch.full((size, 3), torch.inf, device=device)
     padded[:n] = points
-    for level in range(depth):
-        nodes = padded.view(1 << level, -1, 3)
-        low, high = _box(nodes)
-        axis = (high - low).nan_to_num(-1).argmax(dim=1)
-        along = nodes.gather(2, axis[:, None, None].expand(-1, nodes.shape[1], 1)).squeeze(2)
-        node, bits = torch.arange(1 << level, device=device)[:, None], _ascending_bits(along)
-        if nodes.shape[1] <= _SORTED_IN_A_BLOCK:
-            order = (bits.sort(dim=1, stable=True).indices + node * nodes.shape[1]).flatten()
-        else:
-            order = ((node << 32) + bits.long()).flatten().sort(stable=True).indices
-        index, padded = index[order], padded[order]
+    shared = 0 if team is None or team.size == 1 else min(depth, (team.size - 1).bit_length())
+    for level in range(shared):
+        index, padded = _split(index, padded, 1 << level)
+    if team is not None and shared > 0:
+        first, last = (rank * (1 << shared) // team.size for rank in (team.rank, team.rank + 1))
+        width = size >> shared
+        some = slice(first * width, last * width)
+        index, padded = index[some], padded[some]
+        for level in range(shared, depth):
+            if last > first:
+                index, padded = _split(index, padded, (last - first) << (level - shared))
+        index, padded = team.join(index), team.join(padded)
+    else:
+        for level in range(shared, depth):
+            index, padded = _split(index, padded, 1 << level)
     boxes = torch.full((2 << depth, 6), torch.inf, device=device)
     low, high = _box(padded.view(1 << depth, LEAF, 3))
     for level in range(depth, -1, -1):
@@ -80,6 +106,22 @@ def build_tree(points: Float32[Tensor, "n 3"]) -> Tree:
             low, high = low.view(-1, 2, 3).amin(dim=1), high.view(-1, 2, 3).amax(dim=1)
     boxes[boxes[:, 0] == torch.inf] = torch.inf
     return Tree(index, padded, boxes)
+
+
+def _split(
+    index: Int64[Tensor, " slots"], points: Float32[Tensor, "slots 3"], count: int
+) -> tuple[Int64[Tensor, " slots"], Float32[Tensor, "slots 3"]]:
+    """The points of so many nodes, the lower half of each along its longest side first."""
+    nodes = points.view(count, -1, 3)
+    low, high = _box(nodes)
+    axis = (high - low).nan_to_num(-1).argmax(dim=1)
+    along = nodes.gather(2, axis[:, None, None].expand(-1, nodes.shape[1], 1)).squeeze(2)
+    node, bits = torch.arange(count, device=points.device)[:, None], _ascending_bits(along)
+    if nodes.shape[1] <= _SORTED_IN_A_BLOCK:
+        order = (bits.sort(dim=1, stable=True).indices + node * nodes.shape[1]).flatten()
+    else:
+        order = ((node << 32) + bits.long()).flatten().sort(stable=True).indices
+    return index[order], points[order]
 
 
 def _box(nodes: Float32[Tensor, "nodes m 3"]) -> tuple[Float32[Tensor, "nodes 3"], Float32[Tensor, "nodes 3"]]:
@@ -93,11 +135,9 @@ def _ascending_bits(x: Tensor) -> Tensor:
 
 
 @triton.jit
-def _search(
-    points, boxes, index, candidates, first_leaf, leaves, stride, wanted, LEAF: tl.constexpr, SLOTS: tl.constexpr
-):
+def _search(points, boxes, index, candidates, asked, leaves, stride, wanted, LEAF: tl.constexpr, SLOTS: tl.constexpr):
     """Keeps the `wanted` nearest points of each point of a leaf: candidates[slot, point], float32 bits and position."""
-    leaf = first_leaf + tl.program_id(0)
+    leaf = tl.load(asked + tl.program_id(0))
     lane = tl.arange(0, LEAF)
     mine = leaf * LEAF + lane
     x, y, z = tl.load(points + 3 * mine), tl.load(points + 3 * mine + 1), tl.load(points + 3 * mine + 2)
@@ -157,12 +197,13 @@ def _search(
 
 @triton.jit
 def _rank(
-    points, index, candidates, out_index, out_distance, out_spacing, out_certain, first, stride, wanted, k,
-    SLOTS: tl.constexpr,
+    points, index, candidates, out_index, out_distance, out_spacing, out_certain, asked, row_of, stride, wanted, k,
+    LEAF: tl.constexpr, SLOTS: tl.constexpr,
 ):  # fmt: skip
     """Ranks the candidates of one point by float64 distance, then index."""
-    mine = first + tl.program_id(0)
-    me = tl.load(index + mine)
+    mine = tl.load(asked + tl.program_id(0) // LEAF) * LEAF + tl.program_id(0) % LEAF
+    name_of_mine = tl.load(index + mine)
+    me = tl.load(row_of + name_of_mine, mask=name_of_mine >= 0, other=-1).to(tl.int64)
     if me >= 0:
         slot = tl.arange(0, SLOTS)
         key = tl.load(candidates + slot.to(tl.int64) * stride + tl.program_id(0), mask=slot < wanted, other=-1)
@@ -192,35 +233,52 @@ def _rank(
         tl.store(out_certain + me, certain.to(tl.int8))
 
 
-def nearest(points: Float32[Tensor, "n 3"], k: int, *, done: Callable[[int], None] | None = None) -> Found:
-    """The K nearest other points of each point.
+def nearest(
+    points: Float32[Tensor, "n 3"],
+    k: int,
+    *,
+    of: Int64[Tensor, " m"] | None = None,
+    done: Callable[[int], None] | None = None,
+    team: Sharing | None = None,
+) -> Found:
+    """The K nearest other points of all or some points.
 
     Args:
         points: finite.
         k: 1..MOST_NEIGHBORS.
-        done: called with the number of points whose search has been launched.
+        of: the distinct points that are asked for, one row of the result each; None: all.
+        done: called with the number of rows whose search has been launched.
+        team: processes that ask at the same time, each for some of the same points, as in `build_tree`.
     """
-    tree, n, device = build_tree(points), len(points), points.device
-    leaves, wanted = len(tree.index) // LEAF, k + SPARE
+    tree, device, wanted = build_tree(points, team), points.device, k + SPARE
+    n, leaves = len(points) if of is None else len(of), len(tree.index) // LEAF
+    row_of = torch.arange(len(points), dtype=torch.int32, device=device)
+    asked = torch.arange(leaves, dtype=torch.int32, device=device)
+    if of is not None:
+        row_of = torch.full_like(row_of, -1).index_copy_(0, of, row_of[:n])
+        rows = torch.where(tree.index < 0, -1, row_of[tree.index.clamp(min=0)])
+        asked = asked[(rows.view(leaves, LEAF) >= 0).any(dim=1)]
     found = Found(
         torch.empty(n, k, dtype=torch.int32, device=device),
         torch.empty(n, k, device=device),
         torch.empty(n, dtype=torch.float64, device=device),
         torch.empty(n, dtype=torch.int8, device=device),
     )
-    most = min(leaves, _LEAVES)
-    candidates = torch.empty(wanted, most * LEAF, dtype=torch.int64, device=device)
-    for first in range(0, leaves, most):  # both are powers of two
-        stride = most * LEAF
-        _search[(most,)](
-            tree.points, tree.boxes, tree.index, candidates, first, leaves, stride, wanted,
+    stride = min(len(asked), _LEAVES) * LEAF
+    candidates = torch.empty(wanted, stride, dtype=torch.int64, device=device)
+    first = 0
+    for some in asked.split(_LEAVES) if len(asked) > 0 else ():
+        _search[(len(some),)](
+            tree.points, tree.boxes, tree.index, candidates, some, leaves, stride, wanted,
             LEAF=LEAF, SLOTS=SLOTS, num_warps=1,
         )  # fmt: skip
-        _rank[(stride,)](
-            tree.points, tree.index, candidates, *found, first * LEAF, stride, wanted, k, SLOTS=SLOTS, num_warps=1
-        )
+        _rank[(len(some) * LEAF,)](
+            tree.points, tree.index, candidates, *found, some, row_of, stride, wanted, k,
+            LEAF=LEAF, SLOTS=SLOTS, num_warps=1,
+        )  # fmt: skip
+        first += len(some)
         if done is not None:
-            done((first + most) * n // leaves)
+            done(first * n // len(asked))
     return found._replace(certain=found.certain.bool())
 
 

@@ -211,7 +211,7 @@ def _find_reliable(neighbors, reliability, found, n, k, ROWS: tl.constexpr, SLOT
     tl.store(found + row, tl.max(reliable.to(tl.int8), axis=1), mask=row < n)
 
 
-def any_reliable(neighbors: Int32[Tensor, "n k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+def any_reliable(neighbors: Int32[Tensor, "m k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """Whether a neighbour of each Gaussian has R > 0."""
     n, k = neighbors.shape
     found = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
@@ -232,9 +232,9 @@ def _mark(voters, neighbors, read, count, k, ROWS: tl.constexpr, SLOTS: tl.const
     tl.store(read + index, tl.full([ROWS, SLOTS], 1, tl.int8), mask=index >= 0)
 
 
-def members(voters: Int[Tensor, " v"], neighbors: Int32[Tensor, "n k"]) -> Int64[Tensor, " m"]:
-    """The voters and their neighbours, each once, ascending."""
-    n, k = neighbors.shape
+def members(voters: Int[Tensor, " v"], neighbors: Int32[Tensor, "r k"], n: int) -> Int64[Tensor, " m"]:
+    """The voters and their neighbours, of n Gaussians, each once, ascending."""
+    k = neighbors.shape[1]
     read = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
     if len(voters) > 0:
         _mark[(triton.cdiv(len(voters), _ROWS),)](

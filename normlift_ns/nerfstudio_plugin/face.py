@@ -13,7 +13,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from normlift_ns.asking import Answer
 from normlift_ns.colors import COLORMAPS, Colormap
-from normlift_ns.core.crash import explain
+from normlift_ns.crash import explain
 from normlift_ns.nerfstudio_plugin.insights import Rest
 from normlift_ns.nerfstudio_plugin.keeping import Host
 from normlift_ns.nerfstudio_plugin.said import drawable, found_table, said

@@ -14,8 +14,8 @@ from typing import Any, cast
 
 from torch import Tensor
 
-from normlift_ns.core.crash import explain
 from normlift_ns.core.field import SemanticField
+from normlift_ns.crash import explain
 from normlift_ns.errors import InputError
 from normlift_ns.insight.floaters import find_floaters
 from normlift_ns.nerfstudio_plugin.asker import Asker, stored
@@ -32,7 +32,7 @@ from normlift_ns.session.space import Space
 from normlift_ns.session.state import State
 from normlift_ns.session.turns import Turn
 from normlift_ns.session.verdicts import carried
-from normlift_ns.text_encoders import default_negatives
+from normlift_ns.text_encoders import default_rule
 from normlift_ns.viewer.reasons import Reasons
 from normlift_ns.viewer.rows import OBJECT_DEEDS
 
@@ -67,7 +67,7 @@ class Panel(Face):
             self._folder, state = folder, State(Space(field, means))
             if question is None:
                 with suppress(ValueError, OSError):  # a file of text vectors that is gone is told when it is needed
-                    self._negatives = join_prompts(default_negatives(field))
+                    self._negatives = join_prompts(default_rule(field).negatives)
             else:
                 state = actions.ask(state, prompts_of(question), question)
                 self._negatives = join_prompts(question.negatives)
@@ -123,7 +123,7 @@ class Panel(Face):
             self._cancel()
             self._write("")
             with suppress(ValueError, OSError):  # as in `open`
-                self._negatives = join_prompts(default_negatives(now.space.field))
+                self._negatives = join_prompts(default_rule(now.space.field).negatives)
             if self._widgets is not None:
                 self._widgets.forget(self._negatives)
             self._show(history.do(replace(actions.show_all(actions.clear(now)), did="Clear")))

@@ -16,8 +16,8 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from normlift_ns.asking import answer
-from normlift_ns.core.crash import explain
 from normlift_ns.core.files import write_text
+from normlift_ns.crash import explain
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.source import FeatureSource
 from normlift_ns.lifting import lift_scene
@@ -28,11 +28,11 @@ from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.question import make_question
 from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, digests_beside, sealed
 from normlift_ns.runs.question import save_question
-from normlift_ns.scenes.checkpoint import numpy_numbers
 from normlift_ns.scenes.nerfstudio.checks import check_options, check_parts
 from normlift_ns.scenes.nerfstudio.config import stored_data
 from normlift_ns.scenes.nerfstudio.load import load_scene
 from normlift_ns.scenes.nerfstudio.views import image_name
+from normlift_ns.scenes.unpickling import numpy_numbers
 from normlift_ns.text_encoders import encoder_settings
 
 if TYPE_CHECKING:
@@ -59,7 +59,8 @@ class NormLiftPipeline(VanillaPipeline):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        torch.serialization.add_safe_globals(numpy_numbers())  # nerfstudio loads its own checkpoints without, and fails
+        if hasattr(torch.serialization, "add_safe_globals"):  # torch 2.4, from which on nerfstudio's own loading fails
+            torch.serialization.add_safe_globals(numpy_numbers())
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -137,6 +138,7 @@ def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
 
 def _source_options(config: TrainerConfig) -> SourceOptions:
     options: SourceOptions = config.pipeline.source  # type: ignore[attr-defined]
+    options = options.looking_for(config.pipeline.queries)  # type: ignore[attr-defined]
     if options.features == "langsplat" and options.features_dir is None:
         return replace(options, features_dir=dataset_folder(config))
     return options
@@ -150,7 +152,7 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
     except Exception as error:  # whatever it is
         if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
-        CONSOLE.rule("Error", style="red")
+        CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
             f"The training is complete and saved, but lifting it at step {step} failed: {explain(error)[0]}\n"
             f"Lift it again with: ns-normlift --load-config {shlex.quote(str(config))}",

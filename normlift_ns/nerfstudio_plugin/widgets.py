@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from normlift_ns.colors import COLORMAPS
-from normlift_ns.options import THRESHOLDS
+from normlift_ns.options import RULES
 from normlift_ns.session.actions import HIGHEST, LOWEST, MOST_STEPS
 from normlift_ns.session.state import State
 from normlift_ns.viewer.legend import clipped
@@ -98,7 +98,7 @@ class Widgets:
                     "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Of relevancy.")
                 )
                 self.negatives = self._gui.add_text("Negatives", "", hint="What to compare with, separated by commas.")
-                rules = ("auto", *THRESHOLDS)
+                rules = ("auto", *RULES)
                 self.rule = self._gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
                 self.refined = self._input(
                     "refined", self._gui.add_checkbox("Refined", True, hint="Use refined features.")

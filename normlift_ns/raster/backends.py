@@ -33,7 +33,9 @@ def _gsplat() -> Backend:
 
 def _triton() -> Backend:
     if not has_triton():
-        raise InputError('backend "triton" needs Triton, which comes with PyTorch on Linux; leave the backend out')
+        raise InputError(
+            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; leave the backend out'
+        )
     from normlift_ns.raster import triton  # noqa: PLC0415
 
     return triton

@@ -50,7 +50,10 @@ def contributors(
     Args:
         scene: N Gaussians; those out of range (`GaussianScene.drawable`) contribute nothing.
         pixels: (column, row) from the upper left corner; one may be named twice.
-        backend, rasterize_mode, settings, dtype: as in `rasterize_evidence`.
+        backend: as in `rasterize_evidence`.
+        rasterize_mode: likewise.
+        settings: likewise.
+        dtype: likewise.
     Returns:
         One list per pixel, in the order of the pixels, on the device of the scene.
     Raises:

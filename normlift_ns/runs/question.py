@@ -17,7 +17,7 @@ import numpy as np
 from normlift_ns.core.disk.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.core.disk.manifest import MANIFEST, read_manifest
 from normlift_ns.errors import InputError
-from normlift_ns.options import Rule
+from normlift_ns.options import RULES, Rule
 from normlift_ns.question import Question
 from normlift_ns.text_encoders import encoder_digest
 
@@ -116,7 +116,7 @@ def _question(stored: str, arrays: dict[str, np.ndarray]) -> Question:
     negative = arrays.get("negative_vectors")
     if (negative is None) != (len(facts.negatives) == 0):
         raise InputError(f"{len(facts.negatives)} negatives, {'no' if negative is None else 'some'} vectors of them")
-    if facts.form != "cosine" and negative is None:
+    if RULES[facts.form].compares and negative is None:
         raise InputError(f"rule {facts.form!r} compares with negatives, and there are none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
     _check_vectors("vectors", arrays["vectors"], facts.texts, size)

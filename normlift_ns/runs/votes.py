@@ -23,14 +23,14 @@ from normlift_ns.core.scene import Scene, View
 from normlift_ns.core.storage import StoredEvidence
 from normlift_ns.encoders.build import recorded_source
 from normlift_ns.encoders.cache import cached
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.sam.masks import SamMasks
 from normlift_ns.encoders.source import FeatureSource, RegionFeatures
 from normlift_ns.errors import InputError
 from normlift_ns.insight.outline import outlined
 from normlift_ns.insight.why import ViewVote, Why, explain_selection
-from normlift_ns.observing import BLOCK, Block, kept_evidence, observe_views, region_levels
+from normlift_ns.observing import Block, in_chunks, kept_evidence, observe_views, region_levels
 from normlift_ns.raster.settings import RasterSettings
 
 _SAME = 1e-3
@@ -117,8 +117,8 @@ class Votes:
         if isinstance(store, StoredEvidence):
             return store.evidence, store.features
         parts, tables, levels = [], [], []
-        for start in range(0, len(self.names), BLOCK):
-            block, _ = self._observe(range(start, min(start + BLOCK, len(self.names))))
+        for chunk in in_chunks(range(len(self.names))):
+            block, _ = self._observe(chunk)
             parts.append(self._kept(block))
             tables.extend(block.features)
             levels.extend(region_levels(*x) for x in zip(block.regions, map(len, block.features)))
@@ -199,7 +199,7 @@ def _without_networks(source: FeatureSource, cache: Path) -> FeatureSource:
     """The source, which refuses to compute what only a network can."""
     if isinstance(source, RegionFeatures):
         regions: Any = _Kept(source.regions, cache) if isinstance(source.regions, SamMasks) else source.regions
-        encoder: Any = _Kept(source.encoder, cache) if isinstance(source.encoder, OpenClipEncoder) else source.encoder
+        encoder: Any = source.encoder if isinstance(source.encoder, ColourEncoder) else _Kept(source.encoder, cache)
         return replace(source, regions=regions, encoder=encoder)
     return _KeptPatches(source.encoder, source.count, cache) if isinstance(source, PatchFeatures) else source
 

@@ -19,6 +19,7 @@ from normlift_ns.question import Question
 from normlift_ns.runs.files import FIELD_FOLDER, TEXTS_FILE, digests_beside, refuse_existing_run, sealed, tidy
 from normlift_ns.runs.question import save_question
 from normlift_ns.runs.splat_config import splat_config
+from normlift_ns.scenes.added import ADDED_FILE
 from normlift_ns.scenes.checkpoint import Checkpoint
 from normlift_ns.scenes.nerfstudio.allowed import dump_config
 from normlift_ns.scenes.nerfstudio.classes import NormLiftModelConfig, TrainerConfig
@@ -26,6 +27,7 @@ from normlift_ns.scenes.nerfstudio.config import set_data, skip_seed_points
 from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
 from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, checkpoint_of, save_splat
+from normlift_ns.scenes.transforms import write_transforms
 
 
 def write_run(
@@ -69,6 +71,8 @@ def write_run(
             save_splat(folder, source)
             transform = {"transform": torch.eye(4)[:3].tolist(), "scale": 1.0}
         else:
+            if len(source.added) > 0:
+                write_transforms(folder / ADDED_FILE, source.added, ())
             transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
         write_text(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
         _write_tensors(folder, source, field, question, texts)

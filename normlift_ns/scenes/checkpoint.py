@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import codecs
 import pickle
 import re
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.splat import from_parameters
+from normlift_ns.scenes.unpickling import numbers_allowed
 
 GAUSSIAN_PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 _GAUSSIANS = "gauss_params."
@@ -123,17 +121,12 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}. Expected what torch.save writes; {advice}.")
-    if not zipfile.is_zipfile(path):
-        raise InputError(
-            f"{path} is truncated or no checkpoint: its {path.stat().st_size:,} bytes are not the zip archive that "
-            f"torch.save writes. Copy it again, or {advice}."
-        )
     _check_sums(path, advice)
     try:
-        with torch.serialization.safe_globals(numpy_numbers()):
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        with numbers_allowed():
+            return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL (\S+)", str(error))
+        found = re.search(r"(?:GLOBAL|Unsupported class) (\S+)", str(error))
         raise InputError(
             f"{path} is not read, because it holds Python objects{f' ({found[1]})' if found else ''}: only tensors and "
             f"numbers are expected, {writer}. {advice[0].upper()}{advice[1:]}."
@@ -146,9 +139,15 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
 
 def _check_sums(path: Path, advice: str) -> None:
     """The archive has a CRC-32 of every tensor, which torch.load does not look at; torch.save compresses nothing."""
+    size = path.stat().st_size
     try:
+        if not zipfile.is_zipfile(path):
+            raise InputError(
+                f"{path} is truncated or no checkpoint: its {size:,} bytes are not the zip archive that torch.save "
+                f"writes. Copy it again, or {advice}."
+            )
         with zipfile.ZipFile(path) as archive:
-            entries, size = archive.infolist(), path.stat().st_size
+            entries = archive.infolist()
             packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
             if packed or sum(entry.file_size for entry in entries) > size:
                 raise InputError(
@@ -204,33 +203,3 @@ def check_plain(value: Tensor, name: str, path: Path) -> None:
             f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on {value.device} that "
             "is not stored number by number. Expected plain tensors, as trainers save them; save it again with those."
         )
-
-
-def numpy_numbers() -> list[Any]:
-    """What unpickling numpy's scalars needs: learning rates in the state of nerfstudio's schedulers are such."""
-    rebuild: Any = np.float64(0).__reduce__()[0]
-    modules = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
-    dtypes = {type(np.dtype(code)) for code in "?bBhHiIlLqQefd"}
-    return [
-        np.dtype,
-        *dtypes,
-        _named(_latin1, "_codecs", "encode"),
-        *(_named(rebuild, module, "scalar") for module in modules),
-    ]
-
-
-def _latin1(text: str, encoding: str) -> bytes:
-    """How pickle writes bytes; other encodings than this one could make gigabytes of nothing."""
-    if encoding != "latin1":
-        raise pickle.UnpicklingError(f"bytes in the encoding {encoding}")
-    return codecs.latin_1_encode(text)[0]
-
-
-def _named(function: Callable[..., Any], module: str, name: str) -> Callable[..., Any]:
-    """The function under another name: torch's allow-list goes by names."""
-
-    def alias(*args: Any) -> Any:
-        return function(*args)
-
-    alias.__module__, alias.__name__, alias.__qualname__ = module, name, name
-    return alias

@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
@@ -199,11 +199,13 @@ def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
 
 
 def _share_in_view(scene: Scene, camera: Camera) -> float:
-    """Of the Gaussians, those whose centres lie in the image and before the camera."""
-    means = scene.gaussians.means
+    return float(in_view(scene.gaussians.means, camera).float().mean())
+
+
+def in_view(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
+    """Which centres of Gaussians lie in the image and before the camera."""
     pose = camera.world_to_camera.to(means)
     places = means @ pose[:3, :3].T + pose[:3, 3]
     pixels = places @ camera.K.to(means).T
     x, y, depth = (pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2], places[:, 2])
-    inside = (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return float(inside.float().mean())
+    return (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

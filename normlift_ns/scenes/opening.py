@@ -18,11 +18,11 @@ from normlift_ns.options import Background, RasterizeMode, SplatOptions
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.cameras import Cameras, read_camera_file
 from normlift_ns.scenes.colmap import read_points
+from normlift_ns.scenes.formats.gsplat_checkpoint import GsplatCheckpoint, read_gsplat
+from normlift_ns.scenes.formats.ply import PlySplat, read_ply
 from normlift_ns.scenes.frames import Frame, World, moved
-from normlift_ns.scenes.gsplat_checkpoint import GsplatCheckpoint, read_gsplat
 from normlift_ns.scenes.match import LEAST_PSNR, mean_psnr
 from normlift_ns.scenes.photographs import PhotographViews
-from normlift_ns.scenes.ply import read_ply
 from normlift_ns.scenes.similarity import gsplat_normalization
 from normlift_ns.scenes.splat import Splat
 from normlift_ns.scenes.split import held_out_names
@@ -107,8 +107,7 @@ def open_splat(
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     frames = cameras.frames
-    checkpoint = read_gsplat(path) if _is_checkpoint(path) else None
-    splat, mode = read_ply(path) if checkpoint is None else (checkpoint.splat, None)
+    (splat, mode), checkpoint = _read(path)
     held_out = cameras.held_out
     if options.test_every is not None or len(options.holdout) > 0:
         names = [frame.name for frame in frames]
@@ -137,13 +136,26 @@ def open_splat(
             step,
             Path("outputs").absolute(),
             cameras.base,
-            {"source_splat": str(path), "source_cameras": str(cameras.source), "source_step": step},
+            {
+                "source_splat": str(path),
+                "source_cameras": str(cameras.source),
+                "source_step": step,
+                "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+            },
             options.rasterize_mode or mode or "classic",
             options.background,
             train.check_files(),
         )
 
     return _best(placed, worlds, say)
+
+
+def _read(path: Path) -> tuple[PlySplat, GsplatCheckpoint | None]:
+    """The splat of a file, and the checkpoint that holds it, if one does."""
+    if _is_checkpoint(path):
+        checkpoint = read_gsplat(path)
+        return PlySplat(checkpoint.splat, None), checkpoint
+    return read_ply(path), None
 
 
 def _is_checkpoint(path: Path) -> bool:

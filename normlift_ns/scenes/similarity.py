@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,19 @@ def _dataparser(values: Any, path: Path) -> World:
             f"numbers and a positive scale: {_WRITTEN}."
         )
     return World(np.array(rows[:3]), found.scale)
+
+
+def capture_worlds(run_dir: Path, identity: Mapping[str, Any]) -> tuple[World, ...]:
+    """The steps from the world of the capture to that of the Gaussians of a lifted run, one after the other.
+
+    Args:
+        identity: of the scene: that of a splat without a nerfstudio run says how its cameras were moved to it.
+    Raises:
+        FileNotFoundError, ValueError: as `read_dataparser_transforms`, also for `source_world` of the identity.
+    """
+    trained = read_dataparser_transforms(run_dir / "dataparser_transforms.json")
+    moved = identity.get("source_world")
+    return (trained,) if moved is None else (_dataparser(moved, run_dir / "splat.json"), trained)
 
 
 def read_world_transform(

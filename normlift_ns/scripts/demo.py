@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from normlift_ns.core.files import new_file, write_text
-from normlift_ns.options import SourceOptions
+from normlift_ns.options import AskOptions, SourceOptions
 from normlift_ns.ranges import check_options
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
@@ -22,16 +22,19 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-TEXTS = ("red", "yellow", "sky blue", "dark green")
+TEXTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
+REGIONS = 700
+"""Superpixels of a view: small enough that the green star of a tomato has its own."""
+ASK = AskOptions(threshold="auto")
 
 
 @dataclass
 class Demo:
-    """Make a room of coloured solids and a trained run of it, lift it with ns-normlift and search it for colours."""
+    """Make a room and a trained run of it, lift it with ns-normlift and search it for things by their names."""
 
     folder: Path = Path("demo")
     """Where everything is written; what an earlier demo left there is replaced."""
-    num_gaussians: int = 40_000
+    num_gaussians: int = 45_000
     """Size of the room."""
     views: int = 24
     """Number of training views."""
@@ -51,15 +54,17 @@ class Demo:
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
 
         CONSOLE.rule("Lifting it")
-        _show("ns-normlift", "--load-config", config, "--encoder", "colour", "--queries", *TEXTS)
-        source = SourceOptions(encoder="colour")
+        flags = ("--encoder", "colour", "--region-count", REGIONS)
+        _show("ns-normlift", "--load-config", config, *flags, "--queries", *TEXTS)
+        source = SourceOptions(encoder="colour", region_count=REGIONS)
         run = NormLift(config, source=source, queries=TEXTS, timestamp="demo", overwrite=True).main()
+        assert run is not None  # there is one process
 
         CONSOLE.rule("Searching it")
         pictures, answers = self.folder / "pictures", self.folder / "answers.json"
-        flags = ("--render-dir", pictures, "--json", answers)
+        flags = ("--threshold", "auto", "--render-dir", pictures, "--json", answers)
         _show("ns-normlift-query", "--load-config", run.config, "--text", *TEXTS, *flags)
-        NormLiftQuery(run.config, TEXTS, render_dir=pictures, json=answers, overwrite=True).main()
+        NormLiftQuery(run.config, TEXTS, ask=ASK, render_dir=pictures, json=answers, overwrite=True).main()
         middle = f"{spread(self.views, 3)[1]:04d}"
         side_by_side(
             [pictures / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures

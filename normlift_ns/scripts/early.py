@@ -16,12 +16,17 @@ from normlift_ns.core.files import clean
 from normlift_ns.errors import InputError
 from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions
 from normlift_ns.ranges import check_texts, shown
-from normlift_ns.runs.files import FIELD_FOLDER, field_folder, refuse_existing_run, run_directory, texts_cache
-from normlift_ns.scripts.glance import glance
+from normlift_ns.runs.files import (
+    FIELD_FOLDER,
+    cache_folder,
+    field_folder,
+    refuse_existing_run,
+    run_directory,
+    texts_cache,
+)
+from normlift_ns.scripts.answers.glance import glance
 
 _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
-_PATHS_ONLY = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_HUB = "https://huggingface.co"
 
 
 def readable_file(path: Path | None, flag: str) -> None:
@@ -145,10 +150,23 @@ def check_lifted(config: Path, data: Path | None, ask: AskOptions | None = None)
         return
     readable_file(ask.text_vectors, "--text-vectors")
     stored = _encoder_of(folder)
-    if ask.text_vectors is None and stored.get("text_vectors") is None and stored.get("encoder") == "open_clip":
+    if ask.text_vectors is None and stored.get("text_vectors") is None:
         names = texts_cache(folder.parent)
         if not (names.is_dir() and any(names.iterdir())):  # perhaps the texts are there
-            _check_clip(stored.get("encoder_model"), stored.get("encoder_pretrained"))
+            _check_stored(stored)
+
+
+def _check_stored(stored: dict[str, Any]) -> None:
+    """The encoder of a manifest, where it is one that is known here."""
+    from normlift_ns.encoders.kinds import known_kind  # noqa: PLC0415 (--help does without)
+
+    kind = known_kind(stored.get("encoder"))
+    try:
+        options = SourceOptions(**stored)
+    except (TypeError, ValueError):  # which shows when the run is opened
+        return
+    if kind is not None:
+        kind.check(options)
 
 
 def _encoder_of(folder: Path) -> dict[str, Any]:
@@ -176,7 +194,7 @@ def check_new_run(
         return
     if timestamp is not None:
         refuse_existing_run(run_dir, overwrite)
-    writable_folder(run_dir.parent, "--output-dir")
+    writable_folder(cache_folder(run_dir), "--output-dir")
 
 
 def new_run_place(config: Path | None, splat: SplatOptions, output_dir: Path | None) -> tuple[str | None, Path | None]:
@@ -224,8 +242,13 @@ def check_effect(lift: LiftOptions) -> None:
 
 def check_source(source: SourceOptions, queries: Iterable[str], data: Path | None = None) -> None:
     """What the 2D features are made of: folders, weights, levels, texts."""
+    from normlift_ns.encoders.kinds import encoder_kind  # noqa: PLC0415 (--help does without)
+    from normlift_ns.encoders.weights import is_path  # noqa: PLC0415
+
     texts = tuple(queries)
     check_texts("queries", texts)
+    if source.regions == "sam3" and len(source.looking_for(texts).region_texts) == 0:
+        raise InputError('regions "sam3" are what texts find: name them with --queries, such as --queries mug plate')
     readable_folder(source.regions_dir, "--regions-dir")
     readable_folder(source.features_dir, "--features-dir")
     readable_file(source.text_vectors, "--text-vectors")
@@ -239,15 +262,16 @@ def check_source(source: SourceOptions, queries: Iterable[str], data: Path | Non
     if source.features != "none" and source.features_dir is None:
         raise InputError(f"features {source.features!r} need their folder: give it with --features-dir")
     _check_level(source.level, "langsplat" if source.features == "langsplat" else regions)
-    if source.sam_model is not None and _is_path(source.sam_model, 2):
+    if source.sam_model is not None and is_path(source.sam_model, 2):
         _mode(Path(source.sam_model), "--sam-model")
     if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
         raise InputError(
             f"--text-template {shown(source.text_template)} has no {{}}, which the text takes the place of"
         )
     asked = source.features == "none" or (len(texts) > 0 and source.text_vectors is None)
-    if source.encoder == "open_clip" and asked:
-        _check_clip(source.encoder_model, source.encoder_pretrained)
+    kind = encoder_kind(source.encoder)
+    if asked:
+        kind.check(source)
 
 
 def _check_level(level: str | None, kind: str) -> None:
@@ -262,32 +286,3 @@ def _check_level(level: str | None, kind: str) -> None:
         raise InputError(f'--level {shown(level)} is for --regions files or sam, not for "{kind}"; leave it out')
     if level not in known:
         raise InputError(f"--level must be one of {', '.join(known)} for {kind}, got {shown(level)}")
-
-
-def _is_path(name: str, parts: int) -> bool:
-    """Whether a name can only be that of a file or folder here."""
-    path = Path(name)
-    return path.is_absolute() or len(path.parts) > parts or path.suffix in _PATHS_ONLY
-
-
-def _check_clip(model: Any, pretrained: Any) -> None:
-    """Weights of OpenCLIP that are neither on this machine nor to be had."""
-    if not isinstance(model, str) or not isinstance(pretrained, str) or Path(pretrained).is_file():
-        return
-    remedy = (
-        "give a local weight file with --encoder-pretrained, or use the encoder that needs no weights: --encoder colour"
-    )
-    if _is_path(pretrained, 1):
-        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
-    from normlift_ns.encoders.weights import clip_weights_at_hand, probe  # noqa: PLC0415 (rarely needed)
-
-    if clip_weights_at_hand(model, pretrained) is False:
-        try:
-            if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-                raise ConnectionError("HF_HUB_OFFLINE forbids to download")
-            probe(os.environ.get("HF_ENDPOINT", _HUB))
-        except OSError as error:
-            raise FileNotFoundError(
-                f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine, and cannot be downloaded "
-                f"({error}); go online once, {remedy}"
-            ) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -10,9 +11,9 @@ from rich.table import Table
 
 from normlift_ns.core.files import refuse_existing
 from normlift_ns.errors import InputError
-from normlift_ns.options import FLOATER_LIMIT, MIN_SIZE, REACH, AskOptions
+from normlift_ns.options import ARRAY_FILES, FLOATER_LIMIT, MIN_SIZE, REACH, TRANSFER_DISTANCE, AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
-from normlift_ns.scripts.early import check_lifted, has_question, writable_file
+from normlift_ns.scripts.early import check_lifted, has_question, readable_file, writable_file, writable_folder
 from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say, say_opening
 
 
@@ -31,8 +32,23 @@ class NormLiftExport:
     without likely floaters, Gaussians that hang free before the cameras."""
     ask: AskOptions = field(default_factory=AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the PLY file. The number of each Gaussian in the run goes to <name>_rows.npy, the objects to
-    <name>_objects.json."""
+    """Name of the PLY file. The number of each Gaussian in the run goes to <name>_rows.npy, what class_id and
+    instance_id mean to <name>_names.json, the objects to <name>_objects.json."""
+    masks_dir: Path | None = None
+    """Write masks of every training photograph into this folder, as PNG: 255 where it shows what the texts select,
+    else 0. With --part rest the other way round. Lens distortion is taken out, as the scene was trained."""
+    arrays_dir: Path | None = None
+    """Write the Gaussians of the PLY file as arrays into this folder: coord.npy, segment.npy and instance.npy, in which
+    -1 is ignored, and names.json."""
+    transfer: Path | None = None
+    """Point cloud or mesh (PLY) to label: <name of the cloud>_labels.ply is the same with class_id, instance_id and
+    relevancies of the Gaussian whose centre is nearest, of those that are ever drawn; 0 where it is too far."""
+    transfer_distance: float = TRANSFER_DISTANCE
+    """For --transfer: how far a point may be from the centre of its Gaussian, in units of the median distance from a
+    Gaussian to the nearest one at another place."""
+    transfer_coordinates: Literal["capture", "scene"] = "capture"
+    """For --transfer: those of the cloud. capture: of the cameras before nerfstudio turned and scaled them. scene: of
+    the Gaussians, as in exported files."""
     reach: float = REACH
     """Gaussians of one object are at most this far apart, in units of the selection's median spacing."""
     min_size: int = MIN_SIZE
@@ -60,14 +76,20 @@ class NormLiftExport:
         if name == "":
             raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
         target = self.output_dir / name
-        files = (target, *(target.with_name(f"{target.stem}_{name}") for name in ("rows.npy", "objects.json")))
+        ends = ("rows.npy", "names.json", "objects.json")
+        files = (target, *(target.with_name(f"{target.stem}_{name}") for name in ends))
         refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
         for file in files:
             writable_file(file, "--output-dir")
+        self._check_beside(files)
         say_opening(self.load_config)
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.objects import find_objects  # noqa: PLC0415
+        from normlift_ns.objects.instances import tabulate  # noqa: PLC0415
+        from normlift_ns.runs.splats import instances_of  # noqa: PLC0415
+        from normlift_ns.runs.transfer import read_cloud  # noqa: PLC0415
+        from normlift_ns.scripts.answers import beside  # noqa: PLC0415
 
+        cloud = None if self.transfer is None else read_cloud(self.transfer)
         run = open_run(
             self.load_config,
             data=self.data,
@@ -83,23 +105,59 @@ class NormLiftExport:
             part = ~floaters
             say(f"{int(floaters.sum()):,} likely floaters are left out")
         objects: dict[str, Any] | None = None
+        instances = None
         if answer is not None:
             limits, question = {"reach": self.reach, "min_size": self.min_size}, answer.question
-            tables = [
-                {"text": found.text, **find_objects(run.field, answer.means, found.mask, **limits).to_json()}
-                for found in answer
-            ]
+            instances = instances_of(answer, **limits)
             objects = {
-                "queries": tables,
+                "queries": tabulate(run.field, answer.means, instances),
                 "relevancy": question.rule,
                 "threshold": question.threshold,
                 "min_reliability": question.min_reliability,
             }
-        rows = run.export(target, part, answer=answer, objects=objects, overwrite=self.overwrite)
+        rows = run.export(
+            target, part, answer=answer, objects=objects, reach=self.reach, min_size=self.min_size,
+            overwrite=self.overwrite,
+        )  # fmt: skip
         say(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}")
+        if answer is not None and instances is not None:
+            if self.masks_dir is not None:
+                beside.masks(run, answer.mask, self.masks_dir, rest=self.part == "rest", overwrite=self.overwrite)
+            if self.arrays_dir is not None:
+                beside.arrays(run, instances, rows, self.arrays_dir, overwrite=self.overwrite)
+            if cloud is not None:
+                reach, given = self.transfer_distance, self.transfer_coordinates
+                beside.transfer(run, answer, instances, cloud, self._labelled, reach, given, overwrite=self.overwrite)
         if objects is not None:
             CONSOLE.print(_table(objects["queries"]))
         return target
+
+    @property
+    def _labelled(self) -> Path:
+        """The cloud with its labels."""
+        return self.output_dir / f"{Path() if self.transfer is None else self.transfer.stem}_labels.ply"
+
+    def _check_beside(self, files: Sequence[Path]) -> None:
+        """Raises what can be told of masks, arrays and clouds before anything is loaded."""
+        for name in ("masks_dir", "arrays_dir", "transfer"):
+            if getattr(self, name) is None:
+                continue
+            flag = f"--{name.replace('_', '-')}"
+            if len(self.text) == 0 and not has_question(self.load_config):
+                raise InputError(f"{flag} needs something to look for: give --text, the run stores no queries.")
+            if name != "transfer":
+                writable_folder(getattr(self, name), flag)
+        if self.masks_dir is not None and self.part == "clean":
+            raise InputError("--masks-dir is of what the texts select, or with --part rest of all else; not of clean")
+        if self.arrays_dir is not None:
+            found = [self.arrays_dir / name for name in ARRAY_FILES]
+            refuse_existing(*found, overwrite=self.overwrite, instead="--arrays-dir")
+        if self.transfer is not None:
+            readable_file(self.transfer, "--transfer")
+            if self._labelled in files:
+                raise InputError(f"{self._labelled} would be the splat and the labelled cloud; --output-filename")
+            writable_file(self._labelled, "--output-dir")
+            refuse_existing(self._labelled, overwrite=self.overwrite, instead="--output-dir")
 
 
 def _table(tables: list[dict[str, Any]]) -> Table:
@@ -112,7 +170,7 @@ def _table(tables: list[dict[str, Any]]) -> Table:
             sides = (high - low for low, high in zip(box["min"], box["max"]))
             vectors = (" ".join(f"{x:.2f}" for x in row) for row in (found["centroid"], sides))
             numbers = (f"{found['size']:,}", *vectors, f"{found['mean_reliability']:.3f}")
-            table.add_row(plain(entry["text"] if i == 0 else ""), str(i), *numbers)
+            table.add_row(plain(entry["text"] if i == 0 else ""), str(found["instance_id"]), *numbers)
         table.add_row(
             plain("" if entry["objects"] else entry["text"]), "smaller", f"{entry['in_smaller_parts']:,}", "", "", ""
         )

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from normlift_ns.core.files import file_name, new_file, refuse_existing, write_text
 from normlift_ns.errors import InputError
-from normlift_ns.options import AskOptions
+from normlift_ns.options import DEFAULT_SAM3, OBJECT_FILES, AskOptions
 from normlift_ns.ranges import check_device, check_options, check_texts
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.scripts.early import check_lifted, different, writable_file, writable_folder
@@ -53,6 +53,26 @@ class NormLiftQuery:
     """Say which photographs and regions voted for what is selected, and how far they agree."""
     why_dir: Path | None = None
     """With --why: write those photographs, with the outlines of the regions that voted, into this folder."""
+    segment: Literal["sam3"] | None = None
+    """Ask SAM 3 for the texts too, in some training views, and lift its masks: relevancy, agreement between views and
+    reliability beside the answer of the run."""
+    segment_model: str | None = None
+    """Weights of SAM 3: a folder in the format of transformers, or a name to download. By default facebook/sam3."""
+    segment_views: int = 8
+    """Training views to ask SAM 3 in, at most, evenly spread."""
+    objects: bool = False
+    """List the objects of what is selected, connected parts of 20 Gaussians or more. id: number, the instance_id of
+    ns-normlift-export. text: the one of largest relevancy. Gaussians: how many. centroid: mean place, weighted by what
+    the views saw. box: lengths of the edges of the oriented box, the longest first. extent: size along x, y and z. Box
+    and extent reach from the 1st to the 99th percentile. R: mean reliability. views: training photographs that show at
+    least a tenth of what the best one does. best views: three that show it whole and large. In units of the
+    capture."""
+    objects_dir: Path | None = None
+    """With --objects: write the list into this folder, with the axes of the boxes, in the coordinates of the capture
+    and in those of the Gaussians: objects.json, objects.csv, and boxes as meshes, objects.ply and objects_scene.ply.
+    docs/objects.md explains every column."""
+    metres_per_unit: float | None = None
+    """With --objects: length of one unit of the capture, so that places and sizes in it are in metres."""
     overwrite: bool = False
     """Replace files of these names."""
     data: Path | None = None
@@ -68,7 +88,7 @@ class NormLiftQuery:
         self._check()
         say_opening(self.load_config)
         from normlift_ns.runs.question import save_question  # noqa: PLC0415 (--help should not wait for NumPy)
-        from normlift_ns.scripts.prompting import answer_lines, converse, show  # noqa: PLC0415
+        from normlift_ns.scripts.answers.prompting import answer_lines, converse, show  # noqa: PLC0415
 
         run = self._open()
         if self.stdin:
@@ -81,18 +101,25 @@ class NormLiftQuery:
         pictured = self._pictured(found.question) if self.render_dir is not None else None
         rows = found.summarize()
         tell = self._explain(found, rows) if self.why else None
+        segmented = self._segment(found, rows) if self.segment is not None else {}
+        tell_objects = self._list_objects(found.question) if self.objects else None
         if self.json is not None:
             _write_json(self.json, rows, found.question, self.overwrite)
         if self.output_path is not None:
-            _write_arrays(self.output_path, found, self.overwrite)
+            _write_arrays(self.output_path, found, segmented, self.overwrite)
         if pictured is not None:
             pictured()
         stored = save_question(run.folder / FIELD_FOLDER, found.question) if self.save else None
-        folders = (self.render_dir, self.why_dir)
+        folders = (self.render_dir, self.why_dir, self.objects_dir)
         written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
         show(rows, found.question)
-        if tell is not None:
-            tell()
+        if self.segment is not None:
+            from normlift_ns.scripts.answers.segmenting import show_segments  # noqa: PLC0415 (imported by now)
+
+            show_segments(self.text, [row["segment"] for row in rows])
+        for also in (tell, tell_objects):
+            if also is not None:
+                also()
         if len(written) > 0:
             say("Written: " + ", ".join(map(str, written)))
         return rows
@@ -131,7 +158,7 @@ class NormLiftQuery:
 
     def _explain(self, found: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
         """Adds to every row why it is selected, and writes the pictures; returns what prints it."""
-        from normlift_ns.scripts.reasons import find_reasons, save_pictures, show_reasons, to_json  # noqa: PLC0415
+        from normlift_ns.scripts.answers.reasons import find_reasons, save_pictures, show_reasons, to_json  # noqa: PLC0415
 
         run, reasons = find_reasons(self.load_config, self.data, found)
         for row, reason in zip(rows, reasons):
@@ -139,6 +166,26 @@ class NormLiftQuery:
         if self.why_dir is not None:
             save_pictures(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
         return lambda: show_reasons(run, self.text, reasons)
+
+    def _segment(self, found: QuickAnswer, rows: list[dict[str, Any]]) -> dict[str, Any]:
+        """Adds to every row what SAM 3 answers; returns its arrays."""
+        from normlift_ns.scripts.answers.segmenting import ask_sam3, segment_arrays  # noqa: PLC0415 (as above)
+
+        how = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
+        answered, numbers = ask_sam3(self.load_config, self.data, found, **how)
+        for row, of_text in zip(rows, numbers):
+            row["segment"] = of_text
+        return segment_arrays(answered)
+
+    def _list_objects(self, question: Question) -> Callable[[], None]:
+        """Finds objects, and writes their files; returns what prints them."""
+        from normlift_ns.objects.tables import write_catalogue  # noqa: PLC0415 (as above)
+        from normlift_ns.scripts.answers.catalogue import facts, find_catalogue, show_catalogue  # noqa: PLC0415
+
+        catalogue = find_catalogue(self.load_config, self.data, question, self.metres_per_unit)
+        if self.objects_dir is not None:
+            write_catalogue(catalogue, self.objects_dir, question=facts(question), overwrite=self.overwrite)
+        return lambda: show_catalogue(catalogue)
 
     def _check(self) -> None:
         """Raises what can be told before anything is loaded."""
@@ -152,6 +199,10 @@ class NormLiftQuery:
                 writable_file(path, flag)
         writable_folder(self.render_dir, "--render-dir")
         writable_folder(self.why_dir, "--why-dir")
+        if self.objects_dir is not None:
+            writable_folder(self.objects_dir, "--objects-dir")
+            files = [self.objects_dir / name for name in OBJECT_FILES]
+            refuse_existing(*files, overwrite=self.overwrite, instead="--objects-dir")
         refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
 
     def _check_texts(self) -> None:
@@ -163,13 +214,20 @@ class NormLiftQuery:
             )
         if len(ways) > 1:
             raise InputError(f"{ways[0]} and {ways[1]} are two ways to give texts; leave one of them out")
-        for name in ("json", "output_path", "render_dir", "save", "why", "why_dir"):
+        for name in ("json", "output_path", "render_dir", "save", "why", "why_dir", "segment", "objects"):
             if ways != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} stores the answer to --text; leave it out with {ways[0]}")
         if len(self.render_views) > 0 and self.render_dir is None:
             raise InputError("--render-views has no effect without --render-dir; give the folder for the pictures")
         if self.why_dir is not None and not self.why:
             raise InputError("--why-dir has no effect without --why True; add that flag")
+        for name in ("segment_model", "segment_views"):
+            if self.segment is None and getattr(self, name) != getattr(type(self), name):
+                raise InputError(f"--{name.replace('_', '-')} has no effect without --segment sam3; add that flag")
+        for name in ("objects_dir", "metres_per_unit"):
+            if getattr(self, name) is not None and not self.objects:
+                flag = f"--{name.replace('_', '-')}"
+                raise InputError(f"{flag} has no effect without --objects True; add that flag")
         if self.interactive and not sys.stdin.isatty():
             raise InputError(
                 "--interactive needs a terminal to read from; to ask the lines of a file, use --stdin True"
@@ -189,13 +247,14 @@ def _write_json(path: Path, rows: list[dict[str, Any]], question: Question, over
     write_text(path, json.dumps({"queries": rows, **facts}, indent=2) + "\n", overwrite=overwrite)
 
 
-def _write_arrays(path: Path, found: QuickAnswer, overwrite: bool) -> None:
+def _write_arrays(path: Path, found: QuickAnswer, more: dict[str, Any], overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
     arrays: dict[str, Any] = {
         "relevancy": found.relevancy,
         "reliability": found.field.arrays["reliability"],
         "valid": found.valid,
+        **more,
     }
     with new_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
         np.savez(file, names=np.array(found.question.texts), **arrays)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -21,9 +22,10 @@ from rich.console import Console
 from rich.text import Text
 
 import normlift_ns
-from normlift_ns.core.crash import USER, explain
-from normlift_ns.errors import OutputError, visible
+from normlift_ns.crash import USER, explain
+from normlift_ns.errors import InputError, OutputError, visible
 from normlift_ns.ranges import named_as_flags
+from normlift_ns.scripts import terminal
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
@@ -59,7 +61,12 @@ def run_command(command: type[Command]) -> None:
     for stream in streams:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a code page without the character
-    code = _ended(command)
+    try:
+        words, flags = terminal.terminal_flags(sys.argv[1:])
+        with terminal.talking(flags, shlex.join(sys.argv)):
+            code = _ended(command, words)
+    except InputError as error:
+        code = _explained(error)
     for stream in streams:
         code = _flushed(stream, tell=code == 0) or code
     if code != 0:
@@ -79,11 +86,11 @@ def run_process(command: type[Command]) -> NoReturn:
     os._exit(code)
 
 
-def _ended(command: type[Command]) -> int:
+def _ended(command: type[Command], words: list[str]) -> int:
     """Runs the command; the exit code."""
     try:
         with _terminable(), _plain_warnings(), _named_output(), named_as_flags():
-            _run(command)
+            _run(command, words)
     except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read; rich's, where nobody reads the output
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
         return USER if code == 2 else code
@@ -102,17 +109,17 @@ def _explained(error: Exception) -> int:
         return USER
     message, code = (str(error), USER) if isinstance(error, OutputError) else explain(error)
     with suppress(OSError):
-        ERRORS.rule("Error", style="red")
+        ERRORS.print(Text("Error", style="bold red"))
     say_error(message)
     return code
 
 
-def _run(command: type[Command]) -> None:
-    if "--version" in sys.argv[1:]:
+def _run(command: type[Command], words: list[str]) -> None:
+    if "--version" in words:
         say(f"normlift_ns {normlift_ns.__version__}")
         return
     tyro.extras.set_accent_color("bright_yellow")
-    read_flags(command, sys.argv[1:]).main()
+    read_flags(command, words).main()
 
 
 def read_flags(command: type[_Command], words: Sequence[str], name: str | None = None) -> _Command:
@@ -125,7 +132,7 @@ def read_flags(command: type[_Command], words: Sequence[str], name: str | None =
     """
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
     words = with_values(words, switches(command))
-    return tyro.cli(flags, prog=name, args=words, description=summary(command))
+    return tyro.cli(flags, prog=name, args=words, description=f"{summary(command)} {terminal.FLAGS}")
 
 
 def switches(options: Any) -> set[str]:
@@ -160,9 +167,16 @@ def say(text: str) -> None:
     CONSOLE.print(plain(text), soft_wrap=True)
 
 
+def say_progress(text: str) -> None:
+    """A line on standard output that tells of work, not of its results; nothing with --quiet."""
+    if not terminal.now[-1].quiet:
+        say(text)
+
+
 def say_opening(*paths: Path) -> None:
-    """The first sign of life, on standard error, which no program reads."""
-    say_error("Opening " + ", ".join(map(str, paths)))
+    """The first sign of life, on standard error, which no program reads; nothing with --quiet."""
+    if not terminal.now[-1].quiet:
+        say_error("Opening " + ", ".join(map(str, paths)))
 
 
 def say_error(text: str) -> None:
@@ -246,13 +260,16 @@ def _terminable() -> Iterator[None]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Warnings of ours are one line; those of other packages stay as they are."""
+    """Warnings of ours are one line. Of those of other packages, what concerns their programmers is for the log file
+    alone; the rest stays as it is."""
     with warnings.catch_warnings():
         others = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], filename: str, *rest: Any, **more: Any) -> None:
             if filename.startswith(_PACKAGE):
                 say_error(f"Warning: {message}")
+            elif issubclass(category, DeprecationWarning | PendingDeprecationWarning | FutureWarning):
+                terminal.log_line(warnings.formatwarning(message, category, filename, rest[0]))
             else:
                 others(message, category, filename, *rest, **more)
 
@@ -268,7 +285,10 @@ def with_help(options: Any, *, nested: bool = False) -> Any:
     the options of a command join their group.
     """
     hints = get_type_hints(options, include_extras=True)
-    texts = {found.arg_name: found.description or "" for found in docstring_parser.parse_from_object(options).params}
+    texts: dict[str, str] = {}
+    for part in filter(is_dataclass, reversed(options.__mro__)):  # a command may have the flags of another
+        found = docstring_parser.parse_from_object(part).params
+        texts |= {param.arg_name: param.description or "" for param in found}
     for field in fields(options):
         hint, text, name = hints[field.name], texts.get(field.name, ""), None
         if is_dataclass(hint):

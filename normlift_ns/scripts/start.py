@@ -44,3 +44,8 @@ def view() -> None:
 def batch() -> None:
     """ns-normlift-batch"""
     _start("batch")
+
+
+def check() -> None:
+    """ns-normlift-check"""
+    _start("check")

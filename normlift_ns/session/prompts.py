@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import Rule
+from normlift_ns.options import RULES, Rule
 from normlift_ns.question import Question, make_question
 from normlift_ns.text_encoders import Field
 
@@ -142,7 +142,7 @@ def pose(
         return tuple(prompts), question
     how |= {"negatives": negatives, "rule": rule, "threshold": threshold}
     question = _made(field, good, read, **how)
-    if question.rule == "cosine" or not any(prompt.clicked for prompt in good):
+    if not RULES[question.rule].compares or not any(prompt.clicked for prompt in good):
         return tuple(prompts), question
     ruled = tuple(replace(p, vector=None, problem=_RULED) if p.clicked and p.vector is not None else p for p in prompts)
     return ruled, _made(field, [prompt for prompt in ruled if prompt.vector is not None], read, **how)

@@ -13,12 +13,10 @@ from normlift_ns.asking import Answer, pixel_relevancy
 from normlift_ns.colors import COLORMAPS, OPAQUE, RELIABILITY_COLORS, Colormap, colors_of, heat, prompt_colors
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.files import file_name, numbered
-from normlift_ns.options import Rule
+from normlift_ns.options import RULES
 from normlift_ns.viewer.legend import with_bar, with_prompts
 
 _LEAST_SPAN = 0.05
-_LOWEST: dict[Rule, float] = {"cosine": 0.0, "lerf": 0.0, "margin": -0.1}
-"""Relevancy below which nothing has to be told apart."""
 SEGMENTED = 0.8
 """Opacity over the scene of the colours of prompts."""
 BY_HAND = prompt_colors([""])[0]
@@ -115,7 +113,8 @@ def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float
 def whole_scale(answer: Answer) -> tuple[float, float]:
     """From the least relevancy worth a colour to the largest of any prompt in the scene, the same for all pictures."""
     peak = color_scale(answer.relevancy[answer.valid].flatten(), answer.question.threshold)[1]
-    return _LOWEST[answer.question.rule], max(peak, _LOWEST[answer.question.rule] + _LEAST_SPAN)
+    low = RULES[answer.question.rule].faintest
+    return low, max(peak, low + _LEAST_SPAN)
 
 
 def output_names(texts: tuple[str, ...]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import torch
 
-from normlift_ns.core.crash import explain
+from normlift_ns.crash import explain
 from normlift_ns.session import actions
 from normlift_ns.session.found import FoundObject, found_objects
 from normlift_ns.session.history import History

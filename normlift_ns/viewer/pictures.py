@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
+from PIL import Image
 from torch import Tensor
 
 from normlift_ns.asking import Answer, pixel_relevancy
 from normlift_ns.colors import COLORMAPS
-from normlift_ns.core.files import file_name, new_file, numbered
+from normlift_ns.core.files import file_name, new_file, new_files, numbered
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
@@ -122,6 +123,45 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
             )
         chosen[called[found[0]]] = cameras[found[0]]
     return chosen
+
+
+def write_masks(
+    scene: Scene,
+    selected: Bool[Tensor, " n"],
+    folder: Path,
+    *,
+    rest: bool = False,
+    settings: RasterSettings | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Writes one PNG per training photograph, of its size, all or none: 255 where it shows the selection, else 0.
+
+    What stands before the selection hides it. Lens distortion is taken out of the photographs, as the scene was trained
+    on them.
+
+    Args:
+        rest: 255 where the photograph shows anything else, or nothing.
+        settings: constants of the rasterizer; those of gsplat 1.4 by default.
+        overwrite: replace files of these names.
+    Raises:
+        FileExistsError: there is one, and `overwrite` is False.
+        OSError: it cannot be written.
+    """
+    files = [folder / f"{name}.png" for name in picture_names(list(scene.train.names))]
+    with new_files(*files, overwrite=overwrite) as drafts:
+        for camera, draft in zip(scene.train.cameras, drafts):
+            shown = view_mask(scene, camera, selected, settings=settings) != rest
+            Image.fromarray((shown.to(torch.uint8) * 255).cpu().numpy()).save(draft, "PNG")
+    return files
+
+
+def view_mask(
+    scene: Scene, camera: Camera, selected: Bool[Tensor, " n"], *, settings: RasterSettings | None = None
+) -> Bool[Tensor, "h w"]:
+    """Pixels that are made of the selection for more than half."""
+    values = selected.to(scene.gaussians.means)[:, None]
+    image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
+    return pixel_relevancy(image, alpha)[:, :, 0] > 0.5
 
 
 def picture_names(images: Sequence[str]) -> list[str]:

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.captures import SHARED
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
+from benchmarks.plain_room import plain_room
+from normlift_ns.demo import write_capture, write_splatfacto_run
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.scripts.lift import NormLift
 
@@ -38,8 +39,8 @@ def demo_run(lifted_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def lifted_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo room, lifted with four queries into its folder outputs, as `make demo` leaves it but smaller."""
     folder = tmp_path_factory.mktemp("demo")
-    room = demo_room(12_000)
-    write_capture(room, folder / "room", views=12)
+    room = plain_room(12_000)
+    write_capture(room, folder / "room", views=12, width=320, height=240)
     config = write_splatfacto_run(room, folder / "room", folder / "outputs")
     NormLift(config, source=SourceOptions(encoder="colour"), queries=TEXTS, timestamp="demo").main()
     return folder

@@ -61,8 +61,11 @@ _STACKS = """
 Error.stackTraceLimit = 40;
 const told = console.error;
 console.error = (...words) => told(...words, new Error().stack);
+window.showSaveFilePicker = undefined;
 """
-"""So that errors on the console say where they come from."""
+"""So that errors on the console say where they come from, and no dialogue of the system opens, which can end a browser
+without a screen.
+"""
 FOREIGN = re.compile(
     r"ERR_NAME_NOT_RESOLVED|ERR_INTERNET_DISCONNECTED"  # viser's page calls Google's statistics
     r"|ERR_CONNECTION_RE(?:FUSED|SET)|WebSocket connection to|Failed to fetch"  # while the server is away

@@ -45,21 +45,22 @@ def of_dense(weight: torch.Tensor, counts: list[int]) -> Evidence:
 
 
 def oracle(evidence: Evidence, features: torch.Tensor, power: float, level: torch.Tensor) -> torch.Tensor:
-    """The formula, in loops; every view's median weight is taken over all of its Gaussians."""
+    """The formula, in loops; every view's median weight is taken over its Gaussians that any region holds."""
     n, size, view = evidence.num_gaussians, evidence.num_regions, evidence.region_view.tolist()
     whole, count = dense(evidence.view_weights(), evidence.num_views), len(level.unique())
     whole = (whole + dense(evidence.unlabeled, evidence.num_views)) / count  # of every level
     weight, out = dense(evidence.rows, size).double(), features.double().clone()
+    held = (weight > 0).any(dim=1)
     for number in level.unique().tolist():
         mine = [s for s in range(size) if level[s] == number]
         p, sees = torch.zeros(n, size, dtype=torch.float64), torch.zeros(n, evidence.num_views, dtype=torch.bool)
         for v in range(evidence.num_views):
             of_view = [s for s in mine if view[s] == v]
             total = torch.maximum(whole[:, v], weight[:, of_view].sum(1))
-            if not bool((total > 0).any()):
+            if not bool((held & (total > 0)).any()):
                 continue
-            median = total[total > 0].median()
-            for j in range(n):
+            median = total[held & (total > 0)].median()
+            for j in held.nonzero().flatten().tolist():
                 if total[j] > 0 and total[j] >= 0.5 * median:
                     kept = [s for s in of_view if weight[j, s] >= 0.02 * total[j]]
                     p[j, kept] = weight[j, kept] / total[j]

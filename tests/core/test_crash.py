@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from normlift_ns.core.crash import explain, log_traceback
+from normlift_ns.crash import explain, log_traceback
 from normlift_ns.errors import InputError, visible
 
 
@@ -42,8 +42,13 @@ def test_a_full_gpu_is_no_bug(monkeypatch, tmp_path):
     import torch  # noqa: PLC0415
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    message, code = explain(raised(torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 2 GiB")))
+    message, code = explain(raised(torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried to allocate 2 GiB")))
     assert code == 1 and "(CUDA out of memory.)" in message and "--device cpu" in message
+
+
+def test_a_torch_without_its_numpy_is_no_bug():
+    message, code = explain(raised(RuntimeError("Numpy is not available")))
+    assert code == 1 and "pip install 'numpy<2'" in message
 
 
 @pytest.mark.parametrize("error", [ValueError("wrong"), KeyError("x"), RecursionError("deep"), AssertionError()])
@@ -67,7 +72,7 @@ def test_without_a_state_folder_the_temporary_one_is_taken(monkeypatch, tmp_path
 
 
 def test_without_any_folder_the_traceback_is_printed(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("normlift_ns.core.crash._folders", lambda: [Path(os.devnull)])
+    monkeypatch.setattr("normlift_ns.crash._folders", lambda: [Path(os.devnull)])
     message, code = explain(raised(ValueError("x")))
     assert code == 70 and "The details are above" in message
     assert "Traceback" in capsys.readouterr().err

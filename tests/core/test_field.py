@@ -102,7 +102,9 @@ def views_of_clip(noise: float, seed: int = 0, views: int = 12, names: int = 15)
 
 
 @needs_shared
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2, 1.0])
+@pytest.mark.parametrize(
+    "noise", [0.0, pytest.param(0.05, marks=pytest.mark.slow), 0.2, pytest.param(1.0, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-2, 5e-2])
 def test_measured_error_never_exceeds_the_bound_on_real_clip_vectors(noise, tolerance):
     table = views_of_clip(noise)

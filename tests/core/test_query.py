@@ -37,7 +37,7 @@ def test_forms_that_compare_need_negatives():
 
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_rule():
-    with pytest.raises(ValueError, match='rule must be "cosine", "lerf" or "margin"'):
+    with pytest.raises(ValueError, match="rule must be one of cosine, lerf, margin; got"):
         relevancy(POSITIVE, NEGATIVE, rule="dot")
 
 

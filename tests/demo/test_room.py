@@ -6,10 +6,12 @@ from skimage.color import rgb2lab
 
 from normlift_ns import lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras, view_image, view_labels
+from normlift_ns.encoders.texts.colours import ColourTexts, shading_coordinates
 
 
 def own_colors(room: DemoRoom) -> np.ndarray:
-    return rgb2lab(np.array([to_rgb(f"xkcd:{name}") for name in room.names]))
+    """Of the classes, as the colour encoder compares them."""
+    return shading_coordinates(rgb2lab(np.array([to_rgb(f"xkcd:{name}") for name in room.names])))
 
 
 def test_same_arguments_same_room():
@@ -28,14 +30,14 @@ def test_contents(room: DemoRoom):
     counts = torch.bincount(room.labels + 1)
     assert len(counts) == len(room.names) + 1 == 14
     assert counts[0] == 400  # floaters
-    assert counts[1:].min() > 250
+    assert counts[1:].min() > 200
     assert room.colors.min() >= 0 and room.colors.max() <= 1
     never_drawn = (room.scene.opacities < 1 / 255).float().mean().item()
     assert 0.02 < never_drawn < 0.06
 
 
 def test_flat_gaussians_lie_along_the_surface(room: DemoRoom):
-    floor = (room.labels == room.names.index("light brown")) & (room.scene.opacities > 0.9)
+    floor = (room.labels == room.names.index("slate")) & (room.scene.opacities > 0.9) & (room.scene.means[:, 2] < 0.1)
     assert room.scene.means[floor, 2].abs().median() < 1e-4
     _, x, y, _ = room.scene.quats[floor].unbind(1)
     upright = (1 - 2 * (x * x + y * y)).abs()  # of the third axis
@@ -47,7 +49,7 @@ def test_names_are_distinct_colours_of_the_survey(room: DemoRoom):
     assert all(f"xkcd:{name}" in XKCD_COLORS for name in room.names)
     lab = own_colors(room)
     distance = np.linalg.norm(lab[:, None] - lab, axis=2) + np.diag(np.full(len(lab), np.inf))
-    assert distance.min() > 30
+    assert distance.min() > 25
 
 
 def test_surfaces_are_opaque(room: DemoRoom):
@@ -57,20 +59,32 @@ def test_surfaces_are_opaque(room: DemoRoom):
         assert alpha.min() > 0.7
 
 
-def test_every_solid_is_seen_in_its_own_colour(room: DemoRoom):
+def test_every_thing_is_seen_in_its_own_colour(room: DemoRoom):
     cameras = demo_cameras(8, 240, 180)
     pixels = np.concatenate([view_image(room, camera).reshape(-1, 3) for camera in cameras]) / 255
     truth = np.concatenate([view_labels(room, camera).flatten() for camera in cameras])
-    lab, own = rgb2lab(pixels), own_colors(room)
-    nearest = np.linalg.norm(lab[:, None] - own, axis=2).argmin(axis=1)
+    seen, own = shading_coordinates(rgb2lab(pixels)), own_colors(room)
+    nearest = np.linalg.norm(seen[:, None] - own, axis=2).argmin(axis=1)
     for index, name in enumerate(room.names):
         shown = truth == index + 1
-        mean = rgb2lab(pixels[shown].mean(axis=0))
-        assert np.linalg.norm(own - mean, axis=1).argmin() == index, name
-        assert np.linalg.norm(own[index] - mean) < 15, name
-        assert (nearest[shown] == index).mean() > 0.9, name
+        distance = np.linalg.norm(own - np.median(seen[shown], axis=0), axis=1)
+        assert distance.argmin() == index, name
+        assert distance[index] < 20, name
+        assert (nearest[shown] == index).mean() > 0.7, name
         per_view = shown.reshape(len(cameras), -1).sum(axis=1)
         assert (per_view > 100).sum() >= 3, name
+
+
+def test_things_have_texture_and_shadow(room: DemoRoom):
+    lightness = rgb2lab(room.colors.numpy())[:, 0]
+    for index, name in enumerate(room.names):
+        mine = lightness[(room.labels == index).numpy()]
+        assert np.quantile(mine, 0.9) - np.quantile(mine, 0.1) > 5, name
+
+
+def test_the_colour_encoder_tells_the_names_apart(room: DemoRoom):
+    vectors = ColourTexts().rows(room.names)
+    assert (vectors @ vectors.T - np.eye(len(vectors))).max() < 0.72
 
 
 def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
@@ -99,9 +113,10 @@ def test_lift_finds_the_classes_and_refinement_repairs(room: DemoRoom):
     own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
     source = refine(room.scene.means, directions, reliability, own=own, neighbors=neighbors).long()
     before, after = mean_iou(room, directions @ classes.T), mean_iou(room, directions[source] @ classes.T)
-    assert 0.88 < before < 0.94
+    print(f"mIoU {before:.3f}, refined {after:.3f}")
+    assert 0.8 < before < 0.9
     assert after > before + 0.005
-    assert after > 0.9
+    assert after > 0.84
     known = room.labels >= 0
     assert 0.02 < (lifted.scalars.norm[known] == 0).float().mean() < 0.08
 

@@ -10,7 +10,7 @@ import pytest
 from normlift_ns.encoders import SourceOptions, make_encoder, make_regions, make_source
 from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.encoders.sam.masks import SamMasks
 
@@ -79,16 +79,19 @@ def test_options_reach_sam_and_patches(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"regions": "patches"}, "--regions patches are those of --encoder open_clip; 'colour' has none"),
+        ({"regions": "patches"}, "--regions patches are for encoders that have features of patches; 'colour' has none"),
         ({"regions": "patches", "level": "l"}, '--level l is for --regions files or sam, not for "patches"'),
         ({"regions": "sam", "level": "2"}, "SAM has the levels default, s, m, l; got '2'"),
         ({"regions": "sam", "regions_dir": Path()}, '--regions-dir . is for --regions files, not for "sam"'),
         ({"regions": "grid", "sam_model": "x/y"}, '--sam-model x/y is for --regions sam, not for "grid"'),
         ({"regions": "patches", "sam_model": "x/y"}, '--sam-model x/y is for --regions sam, not for "patches"'),
-        ({"encoder": "clip"}, "encoder must be one of open_clip, colour; got 'clip'"),
+        (
+            {"encoder": "clip"},
+            "unknown encoder 'clip'; --encoder is one of colour, metaclip2, open_clip, siglip, siglip2",
+        ),
         (
             {"regions": "slic"},
-            "regions must be one of auto, sam, patches, superpixel, grid, files; got 'slic'",
+            "regions must be one of auto, sam, sam3, patches, superpixel, grid, files; got 'slic'",
         ),
         ({"regions": "files"}, 'regions "files" need a folder of label maps.*--regions-dir'),
         ({"regions": "grid", "level": "1"}, '--level 1 is for --regions files or sam, not for "grid"'),

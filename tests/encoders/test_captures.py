@@ -72,7 +72,7 @@ import sys
 from pathlib import Path
 from normlift_ns.encoders import RegionFeatures, cached, read_image
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.patches import PatchFeatures
+from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.stages import peak_gib
 from tests.encoders.tiny import write_clip, write_sam

@@ -9,8 +9,9 @@ import torch
 
 from benchmarks.captures import SHARED
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.patches import PatchFeatures, dense_tokens, patch_grid
+from normlift_ns.encoders.clip.patches import dense_tokens
 from normlift_ns.encoders.images import read_image
+from normlift_ns.encoders.patches import PatchFeatures, patch_grid
 from tests.captures import needs_shared
 from tests.encoders.tiny import CLIP, needs_cuda, write_clip
 

@@ -260,8 +260,8 @@ def damage(folder: Path, kind: str) -> Path:
         ({"model": {"image_encoder.trunk.pos_embed": torch.zeros(2)}}, "it is of SAM 2, as its .*trunk.pos_embed says"),
         ({"image_encoder.layers.0.x": torch.zeros(2)}, "it is of MobileSAM, as its parameter image_encoder.layers.0.x"),
         ("hq", "it is of HQ-SAM, as its parameter mask_decoder.hf_token.weight says"),
-        ("sam2", "config.json is of model type 'sam2', expected 'sam', the first SAM"),
-        ("sam2_video", "config.json is of model type 'sam2_video', expected 'sam', the first SAM"),
+        ("edgetam", "config.json is of model type 'edgetam', expected one of 'sam', 'sam2', 'sam2_video', 'sam_hq'"),
+        ("sam3", r"config.json is of model type 'sam3' \(SAM 3 answers texts: --regions sam3\), expected one of"),
         ({"weight": torch.zeros(2)}, "it has no image_encoder.pos_embed, which Meta's files of the first SAM"),
     ],
 )
@@ -271,15 +271,12 @@ def test_other_kinds_of_sam_are_named(weights, tmp_path, kind, message):
         kind = {**tiny_sam().state_dict(), "mask_decoder.hf_token.weight": torch.zeros(1, 8)}
     if isinstance(kind, dict):
         torch.save(kind, path)
-    elif kind == "sam2":
-        path = tmp_path
-        transformers.Sam2Config().save_pretrained(tmp_path)
     else:
         path = tmp_path
         (tmp_path / "config.json").write_text(json.dumps({"model_type": kind}))
     with pytest.raises(ValueError, match=message) as info:
         SamMasks(str(path)).masks(noise(30, 40))
-    for part in (str(path), "the first SAM, ViT-B, -L or -H", "facebook/sam-vit-huge", "sam_vit_h_4b8939.pth"):
+    for part in (str(path), "facebook/sam-vit-huge", "sam_vit_h_4b8939.pth"):
         assert part in str(info.value)
 
 
@@ -288,21 +285,21 @@ def test_weights_of_another_network_are_not_downloaded(monkeypatch, tmp_path):
 
     def download(name, allow_patterns):
         asked.append((name, allow_patterns))
-        (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2_video"}))
+        (tmp_path / "config.json").write_text(json.dumps({"model_type": "edgetam_video"}))
         return str(tmp_path)
 
     monkeypatch.setattr("normlift_ns.encoders.sam.weights.probe", lambda address: None)
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(ValueError, match="of model type 'sam2_video', expected 'sam', the first SAM"):
-        SamMasks("facebook/sam2-hiera-large").masks(noise(30, 40))
+    with pytest.raises(ValueError, match="of model type 'edgetam_video', expected one of 'sam', "):
+        SamMasks("someone/edgetam").masks(noise(30, 40))
     assert all(patterns == ["config.json"] for _, patterns in asked)
 
 
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("other network", "model type 'bert', expected 'sam'"),
+        ("other network", "model type 'bert', expected one of 'sam'"),
         ("truncated", "damaged or not of SAM"),
         ("no weights", r"the folder has no model\.safetensors"),
         ("no config", r"config\.json"),

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.captures import SHARED
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
+from benchmarks.plain_room import plain_room
+from normlift_ns.demo import write_capture, write_splatfacto_run
 from tests.captures import needs_shared
 from tests.golden.summary import compare, run_commands, summarize
 
@@ -22,8 +23,8 @@ def differences_from_golden(scene: str, config: Path, folder: Path) -> list[str]
 
 
 def test_the_demo_room(tmp_path: Path) -> None:
-    room = demo_room()
-    write_capture(room, tmp_path / "room")
+    room = plain_room()
+    write_capture(room, tmp_path / "room", width=320, height=240)
     config = write_splatfacto_run(room, tmp_path / "room", tmp_path / "outputs")
     assert differences_from_golden("demo", config, tmp_path / "lifted") == []
 

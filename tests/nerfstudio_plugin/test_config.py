@@ -161,3 +161,22 @@ def test_an_absolute_output_directory_tells_no_root_but_relative_data_is_found_b
     assert location.data == tmp_path / "data" / "scene"
     assert location.output_dir == tmp_path / "data" / "runs" / "all"
     assert location.portable(location.output_dir) == location.output_dir
+
+
+def test_runs_of_nerfstudios_main_branch_are_read_and_other_methods_refused_by_name(
+    stock: StockRun, tmp_path: Path
+) -> None:
+    text, path = stock.config.read_text(), tmp_path / "config.yml"
+    news = "    strategy: mcmc\n    max_gs_num: 1000000\n    noise_lr: 500000.0\n    mcmc_opacity_reg: 0.01\n"
+    named = re.sub(r"^method_name: .*$", "method_name: splatfacto-mcmc", text, flags=re.MULTILINE)
+    path.write_text(re.sub(r"^(  model: .*\n)", lambda found: found[1] + news, named, flags=re.MULTILINE))
+    assert "strategy: mcmc" in path.read_text()
+    assert read_config(path).pipeline == read_config(stock.config).pipeline
+    for method in ("splatfacto-w-light", "feature-splatting", "dn-splatter"):
+        path.write_text(named.replace("splatfacto-mcmc", method))
+        with pytest.raises(ValueError, match=f"a run of method '{method}'; only .* splatfacto-mcmc.* --load-ply"):
+            read_config(path)
+    named = named.replace("splatfacto-mcmc", "splatfacto")
+    path.write_text(named.replace("nerfstudio.models.splatfacto.SplatfactoModelConfig", "other.model.OtherModelConfig"))
+    with pytest.raises(ValueError, match=r"other\.model\.OtherModelConfig is no part of a configuration"):
+        read_config(path)

@@ -367,7 +367,7 @@ def test_damage_of_json_is_a_message(copied: Path, tmp_path: Path, which: str, *
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", ["transforms", "parser"])
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(**FUZZ)
 def test_damage_of_json_is_always_a_message(copied: Path, tmp_path: Path, which: str, **damage: Any) -> None:
     no_other_error(copied, tmp_path, which, **damage)

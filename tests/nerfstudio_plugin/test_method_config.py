@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -11,6 +12,7 @@ from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins import registry
 
+from normlift_ns.method_configs import entry
 from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.method_configs.scannet import scannet_method
@@ -63,3 +65,48 @@ def test_it_is_imported_in_any_order_and_pulls_in_no_encoder(first: str) -> None
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().endswith("[]")
+
+
+NOT_NERFSTUDIOS = ["open_clip", "numba", "safetensors", "xxhash", "plyfile", "docstring_parser", "prompt_toolkit"]
+NOT_NERFSTUDIOS += ["msgspec", "scipy", "skimage", "cv2", "transformers", "triton", "gsplat", "torchmetrics"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs fork")
+@pytest.mark.parametrize("missing", NOT_NERFSTUDIOS)
+def test_nerfstudio_lists_its_methods_whatever_is_missing(missing: str, tmp_path: Path) -> None:
+    """In a child of this process, where nerfstudio is imported: all of ours is imported anew without one package."""
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            for name in [name for name in sys.modules if name.split(".")[0] in ("normlift_ns", missing)]:
+                del sys.modules[name]
+            sys.modules[missing] = None  # type: ignore[assignment]  # importing it is an ImportError
+            sys.stderr = (tmp_path / "err").open("w")
+            group = "nerfstudio.method_configs"
+            declared = PROJECT["project"]["entry-points"][group]
+            points = EntryPoints(EntryPoint(name, value, group) for name, value in declared.items())
+            registry.entry_points = lambda group: points.select(group=group)  # type: ignore[attr-defined]
+            methods, _ = registry.discover_methods()
+            sys.stderr.flush()
+            told = (tmp_path / "err").read_text()
+            assert set(methods) == set(declared) or (methods == {} and told.count("cannot be used") == len(declared))
+            assert methods != {} or missing in told
+            (tmp_path / "methods").write_text(" ".join(methods))
+            code = 0
+        finally:
+            os._exit(code)
+    assert os.waitpid(pid, 0)[1] == 0
+    if missing in ("open_clip", "numba", "docstring_parser", "prompt_toolkit", "skimage", "transformers"):
+        assert "normlift" in (tmp_path / "methods").read_text()  # which they are not needed for
+
+
+def test_an_error_of_any_kind_is_told_and_leaves_other_methods(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(name: str) -> None:
+        raise OSError("libcuda.so: cannot open shared object file")
+
+    monkeypatch.setattr(entry, "import_module", broken)
+    assert entry._method("scannet") is None
+    assert "scannet cannot be used (OSError: libcuda.so: cannot" in capsys.readouterr().err

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from normlift_ns import Contributors, contributors, rasterize_evidence, render
+from normlift_ns import Contributors, GaussianScene, RasterSettings, contributors, rasterize_evidence, render
 from tests.raster.oracle import compositing_matrix
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
 
@@ -56,6 +56,54 @@ def test_a_picture_and_evidence_are_made_of_them(device):
     sums = dense(rasterize_evidence(scene, [camera], [labels], num_regions=[5]).rows, 5).double().cpu()
     onehot = torch.nn.functional.one_hot(labels.long().flatten() % 6, 6)[:, :5].double()
     assert (full.T @ onehot - sums).abs().max() < 1e-5 * sums.max()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("rules", ["1.4", "1.5", "1.6"])
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_weights_of_the_pixels_of_a_region_add_up_to_its_evidence(mode, rules, device):
+    """And those of a pixel to its alpha, in both precisions, with Gaussians among them that cannot be drawn."""
+    scene = random_scene(80, seed=8, size=0.4)
+    scene.means[3, 1], scene.opacities[4], scene.scales[5, 0], scene.quats[6] = torch.nan, torch.nan, torch.inf, 0
+    camera = orbit_camera(0.7, width=33, height=21)
+    labels = random_labels(camera, 4, seed=1)
+    y, x = torch.meshgrid(torch.arange(21), torch.arange(33), indexing="ij")
+    pixels = torch.stack([x, y], dim=2).view(-1, 2)
+    how = {"rasterize_mode": mode, "settings": RasterSettings.of_gsplat(rules)}
+    precisions = [(torch.float32, 3e-6), *([(torch.float64, 1e-12)] if device == "cpu" else [])]
+    for dtype, error in precisions:
+        here = GaussianScene(*(part.to(device, dtype) for part in vars(scene).values()))
+        full = matrix(contributors(here, camera, pixels, **how), 80)
+        with pytest.warns(UserWarning, match="4 of 80 Gaussians"):
+            rows = rasterize_evidence(here, [camera], [labels], num_regions=[4], **how).rows
+        expected = dense(rows, 4).cpu()
+        flat = labels.long().flatten()
+        found = torch.stack([full[flat == region].sum(dim=0) for region in range(4)], dim=1)
+        assert (found - expected).abs().max() < error * expected.max()
+        _, alpha = render(here, camera, here.means.nan_to_num(), **how)
+        assert (full.sum(dim=1) - alpha.double().cpu().flatten()).abs().max() < error
+        assert bool((full[:, 3:7] == 0).all()) and int((full > 0).sum()) > 500
+
+
+def test_weights_differ_between_modes_and_rules():
+    """So that the test above would notice if one of them were not passed on."""
+    scene, camera = random_scene(60, seed=2, size=0.3), orbit_camera(0.1, width=20, height=20)
+    scene.opacities.fill_(0.999)
+    pixels = some_pixels(100, 20, 20, seed=0)
+    plain = matrix(contributors(scene, camera, pixels), 60)
+    for how in ({"rasterize_mode": "antialiased"}, {"settings": RasterSettings.of_gsplat("1.6")}):
+        assert (matrix(contributors(scene, camera, pixels, **how), 60) - plain).abs().max() > 1e-3
+
+
+def test_no_pixels_have_no_contributors():
+    found = contributors(random_scene(5), orbit_camera(0.0, width=20, height=10), torch.zeros(0, 2, dtype=torch.long))
+    assert found.offsets.tolist() == [0] and len(found.gaussian) == len(found.weight) == 0
+
+
+def test_a_pixel_that_nothing_covers_has_none():
+    scene, camera = random_scene(60, seed=5, size=0.5), orbit_camera(0.2, width=20, height=20)
+    nothing = GaussianScene(scene.means + 1e4, scene.quats, scene.scales, scene.opacities)
+    assert contributors(nothing, camera, torch.tensor([[0, 0], [19, 19]])).offsets.tolist() == [0, 0, 0]
 
 
 def test_a_pixel_named_twice_is_answered_twice():

@@ -130,14 +130,14 @@ def test_a_full_gpu_is_answered_by_smaller_parts():
     def run(items):
         asked.append(len(items))
         if len(items) > 2:
-            raise torch.OutOfMemoryError("no room")
+            raise torch.cuda.OutOfMemoryError("no room")
         return sum(items)
 
     assert gpu.in_parts(run, [1, 2, 3, 4, 5], "buy memory") == [3, 3, 9]
     assert asked == [5, 2, 3, 1, 2]
 
     def never(items):
-        raise torch.OutOfMemoryError("no room")
+        raise torch.cuda.OutOfMemoryError("no room")
 
     with pytest.raises(MemoryError, match=r"memory is full \(no room\); buy memory"):
         gpu.in_parts(never, [1, 2], "buy memory")

@@ -182,7 +182,7 @@ def test_no_damage_gets_through_as_another_error(tmp_path_factory: pytest.TempPa
 
 
 @pytest.mark.slow
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(**DAMAGE)
 def test_no_damage_gets_through_as_another_error_ever(tmp_path_factory: pytest.TempPathFactory, **damage) -> None:
     _no_other_error(tmp_path_factory.mktemp("c"), **damage)

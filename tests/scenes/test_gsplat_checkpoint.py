@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns.scenes.gsplat_checkpoint import read_gsplat
+from normlift_ns.scenes.formats.gsplat_checkpoint import read_gsplat
 from tests.scenes.made import random_splat, rows_of, write_gsplat
 
 

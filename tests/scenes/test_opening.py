@@ -14,13 +14,13 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns import LiftOptions, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
-from normlift_ns.lifting import Export
 from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.scenes.similarity import gsplat_normalization, similarity
 from normlift_ns.scenes.splat import Splat
 from normlift_ns.scenes.transforms import read_transforms, write_transforms
+from normlift_ns.team.seen import Export
 from tests.captures import SHARED, needs_shared
 from tests.scenes.made import in_file_world, ply_columns, rows_of, write_colmap, write_gsplat, write_ply
 
@@ -176,6 +176,7 @@ def _before(frames: list[Frame], moves: torch.Tensor, kept: tuple[str, ...]) -> 
     return list(found.values())
 
 
+@pytest.mark.slow
 def test_gsplats_axes_are_turned_where_the_photographs_say_so(native, splat, frames, tmp_path: Path) -> None:
     """gsplat before 1.5 does not turn the world over, and signs of axes depend on the library that computes them."""
     points = splat.means.numpy()[::3]
@@ -246,7 +247,7 @@ def test_photographs_that_moved_are_found_by_data(native, splat, trained: Path, 
         open_run(moved_run / "config.yml", data=tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, *(pytest.param(degree, marks=pytest.mark.slow) for degree in (1, 2)), 3])
 def test_every_degree_is_lifted_and_drawn(native, splat, trained: Path, tmp_path: Path, degree: int) -> None:
     rest = 0.2 * torch.randn(len(splat), (degree + 1) ** 2 - 1, 3, generator=torch.Generator().manual_seed(0))
     path = write_ply(tmp_path / "s.ply", ply_columns(replace(splat, features_rest=rest)))
@@ -388,6 +389,7 @@ def test_a_ply_file_of_gsplats_trainer_lies_in_its_normalized_world(native, spla
     assert difference(native, scene) < ROUNDED
 
 
+@pytest.mark.slow
 def test_photographs_in_subfolders(native, splat, frames, tmp_path: Path, monkeypatch) -> None:
     """Two cameras with photographs of the same names, in copies outside the dataset, which are moved later."""
     monkeypatch.chdir(tmp_path)

@@ -11,7 +11,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from normlift_ns.scenes.ply import read_ply
+from normlift_ns.scenes.formats.ply import read_ply
 from tests.scenes.made import ply_columns, random_splat, write_ply
 
 
@@ -47,7 +47,7 @@ def test_every_kind_of_splat_is_read(tmp_path: Path, degree: int, kind: str) -> 
 
 
 def test_rows_of_several_blocks_keep_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("normlift_ns.scenes.ply._ROWS", 7)
+    monkeypatch.setattr("normlift_ns.scenes.formats.ply._ROWS", 7)
     splat = random_splat(50)
     assert _equal(read_ply(write_ply(tmp_path / "a.ply", ply_columns(splat))).splat, splat)
 
@@ -169,7 +169,7 @@ def test_no_damage_gets_through_as_another_error(tmp_path: Path, place: int, val
 _MEASURE = """
 import sys
 from pathlib import Path
-from normlift_ns.scenes.ply import read_ply
+from normlift_ns.scenes.formats.ply import read_ply
 from normlift_ns.stages import peak_gib
 before = peak_gib()
 splat = read_ply(Path(sys.argv[1])).splat

@@ -341,6 +341,7 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
     assert len(list(made.results.glob("*.jsonl"))) == 3
 
 
+@pytest.mark.slow
 def test_real_captures_one_of_them_damaged(trained, tmp_path, monkeypatch, capsys):
     """As a user types it: a table at the end, and the exit code of the one that failed."""
     monkeypatch.chdir(tmp_path)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import lifting, open_run, open_scene
+from normlift_ns import open_run, open_scene
 from normlift_ns.demo import DemoRoom
 from normlift_ns.encoders import RegionFeatures, write_langsplat
 from normlift_ns.encoders.colour import ColourEncoder
@@ -22,6 +22,7 @@ from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import export, lift, query
 from normlift_ns.scripts.demo import iou_per_class
+from normlift_ns.team import seen
 from tests.encoders.tiny import CLIP, write_clip, write_sam
 from tests.scripts.conftest import SMALL, run_entry, said
 
@@ -175,8 +176,8 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(trained, monkeypatch, caps
 
 
 def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(lifting, "BLOCK", 4)
-    rasterize = lifting.block_evidence
+    monkeypatch.setattr("normlift_ns.observing._LARGEST_CHUNK", 4)
+    rasterize = seen.block_evidence
     calls = []
 
     def interrupted(*args, **kwargs):
@@ -186,7 +187,7 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
         return rasterize(*args, **kwargs)
 
     flags = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--timestamp", "t")
-    monkeypatch.setattr(lifting, "block_evidence", interrupted)
+    monkeypatch.setattr(seen, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
     assert "rerun the command to resume" in capsys.readouterr().err
     written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
@@ -194,10 +195,10 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
     assert all(".cache" in p.parts for p in written)
 
     fresh = []
-    monkeypatch.setattr(lifting, "block_evidence", rasterize)
-    original = lifting.Evidence.save
+    monkeypatch.setattr(seen, "block_evidence", rasterize)
+    original = seen.Evidence.save
     monkeypatch.setattr(
-        lifting.Evidence, "save", lambda self, path, **rest: (fresh.append(path), original(self, path, **rest))[1]
+        seen.Evidence, "save", lambda self, path, **rest: (fresh.append(path), original(self, path, **rest))[1]
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
@@ -206,7 +207,7 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--encoder", "words"), "invalid choice"),
+        (("--encoder", "words"), "unknown encoder 'words'; --encoder is one of"),
         (("--encoder", "colour", "--queries", ""), "is empty"),
         (("--encoder", "colour", "--queries", "oragne"), "orange"),
         (("--encoder", "colour", "--max-views", "0"), "--max-views must be at least 1, got 0"),
@@ -307,7 +308,7 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
         assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
         shares.append(field.manifest["statistics"]["zero_evidence_share"])
         monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
-        monkeypatch.setattr("normlift_ns.encoders.sam.masks.SamNetwork", None)
+        monkeypatch.setattr("normlift_ns.encoders.sam.library.SamNetwork", None)
     assert shares[0] != shares[1] and max(shares) < 1
 
 
@@ -361,6 +362,7 @@ def test_selection_follows_threshold_and_reliability(lifted):
     assert (lead.relevancy[lead.selected] > 0.02).all()
 
 
+@pytest.mark.slow
 def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, tmp_path, monkeypatch, capsys):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
     output = ("--load-config", trained, "--k", "12", "--output-dir", tmp_path / "out")
@@ -422,6 +424,7 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     assert int(field.scalars.view_count.max()) <= 11
 
 
+@pytest.mark.slow
 def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, monkeypatch):
     flags = ("--load-config", trained, *SMALL, "--timestamp", "double", "--precision", "double")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0

@@ -15,8 +15,8 @@ from normlift_ns.encoders import weights
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
 from normlift_ns.scripts import evaluate, export, lift, query
+from normlift_ns.scripts.answers.glance import glance
 from normlift_ns.scripts.early import check_effect
-from normlift_ns.scripts.glance import glance
 from tests.scripts.conftest import run_entry, said
 
 CONFIG = """!!python/object:nerfstudio.engine.trainer.TrainerConfig
@@ -212,6 +212,13 @@ def test_a_folder_that_may_not_be_written_is_refused_early(config, tmp_path, mon
     flags = ("--output-dir", tmp_path / "locked" / "new")
     assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, *flags) == 1
     assert "may not be written" in said(capsys)
+
+
+def test_a_cache_that_is_a_file_is_refused_early(config, tmp_path, monkeypatch, capsys):
+    (tmp_path / "room" / "normlift").mkdir(parents=True)
+    (tmp_path / "room" / "normlift" / ".cache").touch()
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, "--output-dir", tmp_path) == 1
+    assert ".cache, named with --output-dir, is no folder; give another place" in said(capsys)
 
 
 @pytest.mark.parametrize("there", [False, True, None])

@@ -14,8 +14,9 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import normlift_ns as nl
+from benchmarks.plain_room import plain_room
 from normlift_ns.core.ablations import Variant
-from normlift_ns.demo import DemoRoom, demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo import DemoRoom, write_capture, write_splatfacto_run
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.evaluation import votes
 from normlift_ns.evaluation.baselines import BASELINES
@@ -28,7 +29,7 @@ from tests.scripts.conftest import run_entry, said
 
 @pytest.fixture(scope="module")
 def room() -> DemoRoom:
-    return demo_room(3000)
+    return plain_room(3000)
 
 
 @pytest.fixture(scope="module")

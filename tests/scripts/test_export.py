@@ -11,16 +11,20 @@ import pytest
 import torch
 import trimesh
 from nerfstudio.configs.method_configs import all_methods
-from plyfile import PlyData
+from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from normlift_ns import open_run
 from normlift_ns.demo import DemoRoom
 from normlift_ns.method_configs.normlift import normlift_method
 from normlift_ns.nerfstudio_plugin.config import rerooted
+from normlift_ns.objects import connected_components
+from normlift_ns.runs.splats import instances_of
 from normlift_ns.scripts import export
+from normlift_ns.viewer.pictures import view_mask
 from tests.scripts.conftest import run_entry, said
 
-EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "label"]
+EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "class_id", "instance_id"]
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +74,21 @@ def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> Non
     assert np.array_equal(vertices["reliability"], field.scalars.reliability.numpy()[rows])
     assert np.array_equal(vertices["n_eff"], field.scalars.n_eff.numpy()[rows])
     assert np.allclose(vertices["relevancy_1"], answer.relevancy[:, 1].numpy()[rows], atol=1e-6)
-    label = torch.where(answer.selected.any(1), answer.relevancy.where(answer.selected, -9.0).argmax(1), -1)
-    assert np.array_equal(vertices["label"], label.numpy()[rows])
+    class_id = torch.where(answer.selected.any(1), answer.relevancy.where(answer.selected, -9.0).argmax(1) + 1, 0)
+    assert vertices["class_id"].dtype == vertices["instance_id"].dtype == np.uint32
+    assert np.array_equal(vertices["class_id"], class_id.numpy()[rows])
+    names = json.loads(scene_ply.with_name("splat_names.json").read_text())
+    assert (names["none"], names["class_id"]) == (0, {"1": "red", "2": "yellow"})
+    instance_id = instances_of(answer).instance_id.numpy()
+    assert np.array_equal(vertices["instance_id"], instance_id[rows])
+    assert [str(i) for i in np.unique(instance_id)] == ["0", *names["instance_id"]]
+    for number, about in names["instance_id"].items():  # an object is of one class, and hangs together
+        of_object = instance_id == int(number)
+        assert set(class_id.numpy()[of_object]) == {about["class_id"]}
+        assert names["class_id"][str(about["class_id"])] == about["text"]
+        assert of_object.sum() == about["gaussians"]
+        parts = connected_components(run.scene.gaussians.means, class_id == about["class_id"])
+        assert len(parts[torch.from_numpy(of_object)].unique()) == 1
     assert 0.8 * len(run.scene.gaussians) < len(rows) <= len(run.scene.gaussians)
     assert (run.scene.gaussians.opacities[rows] > 0.0039).all()
 
@@ -118,6 +135,7 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     sizes = [found["size"] for found in red["objects"]]
     assert sizes == sorted(sizes, reverse=True)
     assert sum(sizes) + red["in_smaller_parts"] == red["gaussians"]
+    assert (red["class_id"], [found["instance_id"] for found in red["objects"]]) == (1, [*range(1, len(sizes) + 1)])
     ball, run = red["objects"][0], open_run(lifted)
     truth = run.scene.gaussians.means[room.labels == room.names.index("red")]
     assert ball["size"] > 0.6 * len(truth)
@@ -168,10 +186,67 @@ def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["splat.ply", "splat_rows.npy"]
 
 
-@pytest.mark.parametrize("existing", ["splat.ply", "splat_rows.npy", "splat_objects.json"])
+@pytest.mark.parametrize("existing", ["splat.ply", "splat_rows.npy", "splat_names.json", "splat_objects.json"])
 def test_no_part_of_an_export_is_replaced_unasked(existing, lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
     (tmp_path / existing).write_text("mine")
     assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path) == 1
     assert f"{existing} exists; give another --output-dir" in said(capsys)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_masks_arrays_and_labels_of_a_cloud(
+    scene_ply: Path, lifted: Path, room: DemoRoom, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    run = open_run(lifted)
+    answer, means = run.ask("red", "yellow"), run.scene.gaussians.means
+    points = np.concatenate([run.to_capture.points(means[:50].double().numpy()), [[1e6, 0, 0]]])
+    table = np.array([tuple(point) for point in points], [(axis, "f8") for axis in "xyz"])
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "cloud.ply"))
+    flags = ("--load-config", lifted, "--output-dir", tmp_path, "--transfer", tmp_path / "cloud.ply")
+    more = ("--masks-dir", tmp_path / "masks", "--arrays-dir", tmp_path / "arrays")
+    assert run_entry(monkeypatch, export.entrypoint, *flags, *more) == 0
+    assert "98.0% of them within" in said(capsys)
+    rows, splat = np.load(scene_ply.with_name("splat_rows.npy")), PlyData.read(scene_ply)["vertex"]
+    arrays = {name: np.load(tmp_path / "arrays" / f"{name}.npy") for name in ("coord", "segment", "instance")}
+    assert {name: array.dtype.str for name, array in arrays.items()} == {
+        "coord": "<f4", "segment": "<i4", "instance": "<i4",
+    }  # fmt: skip
+    assert np.array_equal(arrays["coord"], np.stack([splat[axis] for axis in "xyz"], 1))
+    assert np.array_equal(arrays["segment"], splat["class_id"].astype(int) - 1)
+    assert np.array_equal(arrays["instance"], splat["instance_id"].astype(int) - 1)
+    assert arrays["segment"].min() == -1
+    cloud = PlyData.read(tmp_path / "cloud_labels.ply")["vertex"]
+    own = np.isin(np.arange(50), rows)  # the others are never drawn, and take those of a neighbour
+    assert own.sum() > 30
+    place = np.searchsorted(rows, np.arange(50)[own])
+    for name in ("class_id", "instance_id", "relevancy_0", "relevancy_1"):
+        assert np.array_equal(np.asarray(cloud[name])[:50][own], splat[name][place]), name
+        assert cloud[name][50] == 0
+    camera = run.scene.train.cameras[3]
+    found = np.array(Image.open(tmp_path / "masks" / "0003.png"))
+    assert found.shape == (camera.height, camera.width)
+    assert set(np.unique(found)) == {0, 255}
+    true = torch.isin(room.labels, torch.tensor([room.names.index(name) for name in ("red", "yellow")]))
+    wanted = view_mask(run.scene, camera, true).numpy()
+    assert ((found > 0) & wanted).sum() / ((found > 0) | wanted).sum() > 0.6
+    rest = ("--part", "rest", "--masks-dir", tmp_path / "rest", "--output-filename", "rest.ply")
+    assert run_entry(monkeypatch, export.entrypoint, *flags[:4], *rest) == 0
+    assert np.array_equal(np.array(Image.open(tmp_path / "rest" / "0003.png")), 255 - found)
+    assert answer.mask.any()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--transfer", "none.ply"), "none.ply, given with --transfer, does not exist"),
+        (("--part", "clean", "--masks-dir", "m"), "--masks-dir is of what the texts select"),
+        (("--transfer-distance", "0"), "--transfer-distance must be positive"),
+    ],
+)
+def test_mistakes_beside_a_splat_are_told_first(flags, message, lifted, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
+    where = ("--load-config", lifted, "--output-dir", tmp_path / "x")
+    assert run_entry(monkeypatch, export.entrypoint, *where, *flags) == 1
+    assert message in said(capsys)
+    assert not (tmp_path / "x").exists()

@@ -26,6 +26,7 @@ COMMANDS = {
     "eval": "ns-normlift-eval",
     "view": "ns-normlift-view",
     "batch": "ns-normlift-batch",
+    "check": "ns-normlift-check",
 }
 SCRIPTS = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf8"))["project"]["scripts"]
 FOLDER = Path(__file__).with_name("help")

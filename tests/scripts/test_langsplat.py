@@ -17,8 +17,9 @@ from PIL import Image
 from scipy import ndimage
 
 from benchmarks.captures import SHARED
+from benchmarks.plain_room import plain_room
 from normlift_ns import open_run
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo import write_capture, write_splatfacto_run
 from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
@@ -117,10 +118,10 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
     What refinement cannot bring back is a thing whose masks are wrong in most views: in the first draw the cactus, in
     11 images at all, is merged with the wall in half of them.
     """
-    room = demo_room()
+    room = plain_room()
     names = json.loads((SHARED / "clip_vectors" / "lvis_v1_names.json").read_text())
     vectors = clip_vectors()[[names.index(THINGS[name]) for name in room.names]].numpy()
-    write_capture(room, tmp_path / "room", held_out=1)
+    write_capture(room, tmp_path / "room", held_out=1, width=320, height=240)
     trained = write_splatfacto_run(room, tmp_path / "room", tmp_path / "outputs")
     np.savez(tmp_path / "texts.npz", **dict(zip(THINGS.values(), vectors)))
     texts = TextVectors(tmp_path / "texts.npz").text([THINGS[name] for name in room.names])

@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.plain_room import plain_room
 from normlift_ns import open_scene
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
+from normlift_ns.demo import write_capture, write_splatfacto_run
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.scenes.splat import Splat
 from normlift_ns.scripts.lift import NormLift
@@ -38,7 +39,7 @@ SECONDS = 300
 def lifted(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """config.yml of a lifted run: of a splatfacto run, and of a PLY file, where no such run ever existed."""
     folder = tmp_path_factory.mktemp("stock")
-    room = demo_room(4000)
+    room = plain_room(4000)
     write_capture(room, folder / "room", views=4, held_out=2, width=80, height=60)
     trained = write_splatfacto_run(room, folder / "room", folder / "outputs")
     source = SourceOptions(encoder="colour", region_count=64)

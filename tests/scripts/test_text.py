@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +11,8 @@ import pytest
 from rich.console import Console
 
 from normlift_ns.errors import visible
-from normlift_ns.scripts import evaluate, export, lift, prompting, query, shared
+from normlift_ns.scripts import evaluate, export, lift, query, shared
+from normlift_ns.scripts.answers import prompting
 
 HOSTILE = [
     "[/red]",
@@ -34,7 +34,10 @@ NUMBERS = {
     "fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None,
     "suggested_threshold": None, "histogram": None,
 }  # fmt: skip
-OBJECT = {"size": 3, "centroid": [0.0] * 3, "box": {"min": [0.0] * 3, "max": [1.0] * 3}, "mean_reliability": 0.5}
+OBJECT = {
+    "instance_id": 1, "size": 3, "centroid": [0.0] * 3, "box": {"min": [0.0] * 3, "max": [1.0] * 3},
+    "mean_reliability": 0.5,
+}  # fmt: skip
 
 
 def summary(text: str) -> Any:
@@ -51,8 +54,8 @@ def summary(text: str) -> Any:
         "features": {"kind": "given"},
         "cost": {},
     }
-    run = SimpleNamespace(field=SimpleNamespace(manifest=manifest), seconds={}, folder=Path(text), config=Path(text))
-    return lift.summary(run, {}, 1.0, (text,))  # type: ignore[arg-type]
+    run = SimpleNamespace(field=SimpleNamespace(manifest=manifest), seconds={}, folder=text)
+    return lift.summary(run, {}, 1.0)  # type: ignore[arg-type]
 
 
 TABLES: dict[str, Callable[[str], Any]] = {

@@ -15,7 +15,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 INSTANTS = int(os.environ.get("NORMLIFT_TORTURE", "10"))
 """At which processes are killed, per command; make torture sets 40."""
-ROWS = pytest.StashKey[list[tuple[str, str, str]]]()
+ROW = "row of docs/reliability.md"
+"""Under which a test keeps its rows; they reach the table from any process that runs tests."""
 Record = Callable[[str, object, str], None]
 
 
@@ -68,12 +69,12 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 @pytest.fixture
 def record(request: pytest.FixtureRequest) -> Record:
     """Adds a row to the table: what was done, how often, and what came of it."""
-    rows = request.config.stash.setdefault(ROWS, [])
-    return lambda what, tried, outcome: rows.append((what, str(tried), outcome))
+    return lambda what, tried, outcome: request.node.user_properties.append((ROW, (what, str(tried), outcome)))
 
 
-def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    rows = config.stash.get(ROWS, [])
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    ended = [x for outcome in ("passed", "failed") for x in terminalreporter.getreports(outcome) if x.when == "call"]
+    rows = [row for report in ended for name, row in report.user_properties if name == ROW]
     if len(rows) > 0:
         terminalreporter.section("docs/reliability.md")
         for row in [("what", "tried", "outcome"), ("---", "---:", "---"), *rows]:

@@ -19,7 +19,8 @@ from typing import Any
 
 import torch
 
-from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run
+from benchmarks.plain_room import plain_room
+from normlift_ns.demo import write_capture, write_splatfacto_run
 from normlift_ns.scripts import export, lift, query
 from tests.torture import flips
 
@@ -46,7 +47,7 @@ class Job:
 
 def make_room(folder: Path) -> None:
     """A small capture and a run of stock splatfacto, room/ and outputs/."""
-    room = demo_room(4000)
+    room = plain_room(4000)
     write_capture(room, folder / "room", views=5, held_out=1, width=80, height=60)
     write_splatfacto_run(room, folder / "room", folder / "outputs")
 

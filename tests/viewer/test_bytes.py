@@ -59,6 +59,7 @@ def spent(client: Client, label: str, value: Any) -> tuple[int, int]:
     return count, client.bytes
 
 
+@pytest.mark.slow
 def test_an_answer_costs_32_bytes_per_drawn_gaussian(tmp_path, monkeypatch):
     rests = []
     for side in (4, 14):

@@ -95,6 +95,22 @@ def load_arrays(
     return ArrayFile(*read_safetensors(path, "np", array_digest, key, undigested, remedy))
 
 
+def read_facts(path: Path) -> dict[str, str]:
+    """The facts in the head of a file, which nothing has confirmed: the digest is of all that it holds.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no safetensors file.
+    """
+    try:
+        with safe_open(path, framework="np") as file:
+            return dict(file.metadata() or {})
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path} is damaged or no safetensors file ({error})") from error
+
+
 def read_safetensors(
     path: Path,
     framework: str,

@@ -17,8 +17,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.core.crash import state_folder
 from normlift_ns.core.disk.atomic import rename_new
+from normlift_ns.crash import state_folder
 
 SUFFIX = ".journal"
 _KEY, _KEY_BYTES, _LARGEST = "key", 32, 2**20

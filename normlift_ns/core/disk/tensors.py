@@ -94,6 +94,14 @@ def check_tensor(
     """
     if tensor.dtype != dtype or tuple(tensor.shape) != tuple(shape):
         raise InputError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {tuple(shape)}")
-    least, most = (x.item() for x in tensor.aminmax()) if tensor.numel() > 0 else (low, low)
+    least, most = (x.item() for x in _extremes(tensor)) if tensor.numel() > 0 else (low, low)
     if not low <= least <= most <= high:
         raise InputError(f"{name} has numbers in {least}..{most}, expected {low:g}..{high:g}")
+
+
+def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest number."""
+    try:
+        return tensor.aminmax()
+    except RuntimeError:  # torch before 2.2 has none for half precision on the CPU
+        return tensor.float().aminmax()

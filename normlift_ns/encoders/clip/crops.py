@@ -7,11 +7,69 @@ LangSplat's boxes, which come from SAM, leave out the last row and column of a m
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
+from operator import itemgetter
+from typing import NamedTuple
+
 import torch
-from jaxtyping import Float, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 
+from normlift_ns.encoders.batches import Batches
 from normlift_ns.options import Fill
+
+
+class CropNetwork(NamedTuple):
+    """What a network needs to see crops. The functions are called where there is something to see."""
+
+    size: Callable[[], tuple[int, int]]
+    """Height and width of the crops that it takes."""
+    rows: Callable[[Float[Tensor, "b 3 y x"]], Float32[Tensor, "b d"]]
+    """Crops, 0..255, on the device, to unit rows on the CPU."""
+    width: Callable[[], int]
+    """D."""
+
+
+def crop_features(
+    views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]],
+    network: CropNetwork,
+    batches: Batches,
+    fill: Fill,
+    device: str,
+) -> Iterator[Float32[Tensor, "r d"]]:
+    """One unit row per region of every view, as `Encoder.encode_each` gives them: crops of several views fill a batch.
+
+    Raises:
+        MemoryError: the memory of the device does not hold a single crop.
+    """
+    seen: dict[int, _Seen] = {}
+
+    def crops() -> Iterator[list[tuple[int, int]]]:
+        for number, (image, labels) in enumerate(views):
+            there = labels.to(device)
+            seen[number] = _Seen(image.to(device), there, region_boxes(there))
+            yield [(number, region) for region in range(len(seen[number].boxes))]
+
+    def encode(batch: Sequence[tuple[int, int]]) -> Tensor:
+        cut = []
+        for number, crops_of_view in groupby(batch, itemgetter(0)):
+            image, labels, boxes = seen[number]
+            regions = torch.tensor([region for _, region in crops_of_view], device=device)
+            cut.append(masked_crops(image, labels, regions, boxes[regions], network.size(), fill))
+        return network.rows(torch.cat(cut))
+
+    for number, rows in enumerate(batches.across(encode, crops())):
+        del seen[number]
+        yield torch.stack(rows) if len(rows) > 0 else torch.empty(0, network.width())
+
+
+class _Seen(NamedTuple):
+    """A view, on the device, whose regions wait for a batch."""
+
+    image: UInt8[Tensor, "h w 3"]
+    labels: Int32[Tensor, "depth h w"]
+    boxes: Int64[Tensor, "r 4"]
 
 
 def region_boxes(labels: Int32[Tensor, "depth h w"]) -> Int64[Tensor, "r 4"]:

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, cast, get_args
 
 import torch
-from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from normlift_ns.core.disk.digests import file_digest
 from normlift_ns.encoders.batches import Batches
-from normlift_ns.encoders.clip.architectures import model_config, open_clip_part
-from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
+from normlift_ns.encoders.clip.architectures import model_config
+from normlift_ns.encoders.clip.crops import CropNetwork, crop_features
 from normlift_ns.encoders.clip.network import ClipNetwork, load_clip
-from normlift_ns.encoders.clip.text_tower import ENSEMBLE
+from normlift_ns.encoders.clip.patches import dense_tokens, why_not_dense
 from normlift_ns.encoders.clip.weights import check_names
+from normlift_ns.encoders.patches import scaled
 from normlift_ns.encoders.texts.prompts import check_prompts
+from normlift_ns.encoders.texts.templates import check_template, templates_of
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
 
-_BATCH = {"cuda": 256, "cpu": 64}
+_BATCH = {"cuda": 128, "cpu": 8}
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,7 @@ class OpenClipEncoder:
     def __post_init__(self) -> None:
         if self.fill not in get_args(Fill):
             raise InputError(f"fill of crops must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
-        if self.template != ENSEMBLE and "{}" not in self.template:
-            raise InputError(
-                f"text template {self.template!r} has no {{}} where the text belongs; write it like "
-                f'"a photo of a {{}}", or {ENSEMBLE} for the mean of several'
-            )
+        check_template(self.template)
         check_names(self.model, self.pretrained)
 
     @property
@@ -80,34 +76,35 @@ class OpenClipEncoder:
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
         """As in `Encoder`: crops of several views fill a batch; raises as `encode`."""
-        seen: dict[int, _Seen] = {}
+        network = CropNetwork(lambda: self.network.size, self._image_rows, self._width)
+        return crop_features(views, network, self._crops, self.fill, self.device)
 
-        def crops() -> Iterator[list[tuple[int, int]]]:
-            for number, (image, labels) in enumerate(views):
-                there = labels.to(self.device)
-                seen[number] = _Seen(image.to(self.device), there, region_boxes(there))
-                yield [(number, region) for region in range(len(seen[number].boxes))]
+    @property
+    def why_not_dense(self) -> str | None:
+        reason = why_not_dense(self.model)
+        if reason is None:
+            return None
+        return (
+            f"--regions patches needs a vision transformer of open_clip; {self.model} is none: {reason}. "
+            f"Take --encoder-model {DEFAULT_MODEL}, or other regions"
+        )
 
-        def encode(batch: Sequence[tuple[int, int]]) -> Tensor:
-            cut = []
-            for number, crops_of_view in groupby(batch, itemgetter(0)):
-                image, labels, boxes = seen[number]
-                regions = torch.tensor([region for _, region in crops_of_view], device=self.device)
-                cut.append(masked_crops(image, labels, regions, boxes[regions], self.network.size, self.fill))
-            return self._image_rows(torch.cat(cut))
-
-        for number, rows in enumerate(self._crops.across(encode, crops())):
-            del seen[number]
-            none = torch.empty(0, cast(Any, model_config(self.model))["embed_dim"])
-            yield torch.stack(rows) if len(rows) > 0 else none
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        visual = self.network.model.visual
+        tall, wide = visual.patch_size
+        pixels = self.network.normalized(scaled(image.to(self.device), rows * tall, columns * wide))
+        return normalize(dense_tokens(visual, pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """One unit row per prompt; raises as `encode`, and ValueError for an empty prompt or none."""
         check_prompts(prompts)
-        templates = _templates(self.template)
+        templates = templates_of(self.template)
         tokens = self.network.tokenizer([template(prompt) for prompt in prompts for template in templates])
         rows = torch.cat(list(self._texts(self._text_rows, tokens.to(self.device))))
         return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
+
+    def _width(self) -> int:
+        return cast(Any, model_config(self.model))["embed_dim"]
 
     @torch.no_grad()
     def _image_rows(self, crops: Float[Tensor, "b 3 y x"]) -> Float32[Tensor, "b d"]:
@@ -134,17 +131,3 @@ class OpenClipEncoder:
     @cached_property
     def _texts(self) -> Batches:
         return Batches(_BATCH[torch.device(self.device).type])
-
-
-class _Seen(NamedTuple):
-    """A view, on the device, whose regions wait for a batch."""
-
-    image: UInt8[Tensor, "h w 3"]
-    labels: Int32[Tensor, "depth h w"]
-    boxes: Int64[Tensor, "r 4"]
-
-
-def _templates(template: str) -> Sequence[Callable[[str], str]]:
-    if template == ENSEMBLE:
-        return open_clip_part("zero_shot_metadata").SIMPLE_IMAGENET_TEMPLATES
-    return [lambda text: template.replace("{}", text)]

@@ -21,9 +21,9 @@ from torch.nn.functional import gelu, layer_norm, linear, normalize, scaled_dot_
 
 from normlift_ns.encoders.clip.architectures import model_config, open_clip_part
 from normlift_ns.encoders.texts.prompts import check_prompts
+from normlift_ns.encoders.texts.templates import check_template, templates_of
 from normlift_ns.encoders.weights import FOREIGN_ERRORS, hub_file
 
-ENSEMBLE = "ensemble"
 _PLAIN = {"context_length", "vocab_size", "width", "heads", "layers"}
 """What the configuration of a plain text tower says; any other key means another kind."""
 _BATCH = 64
@@ -91,12 +91,8 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
         path, published = found
         shapes = _shapes(config["embed_dim"], **sizes)
         weights = _read(path, shapes)
-        if template == ENSEMBLE:
-            templates = open_clip_part("zero_shot_metadata").SIMPLE_IMAGENET_TEMPLATES
-        elif "{}" in template:
-            templates = [lambda text: template.replace("{}", text)]
-        else:
-            return None
+        check_template(template)
+        templates = templates_of(template)
         tokenizer = open_clip_part("tokenizer").SimpleTokenizer(context_length=sizes["context_length"])
     except FOREIGN_ERRORS:
         return None
@@ -121,7 +117,7 @@ def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in names}
-    state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    state = torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
     state = state.get("state_dict", state)
     prefix = "module." if next(iter(state)).startswith("module.") else ""
     return {name: state[prefix + name] for name in names}

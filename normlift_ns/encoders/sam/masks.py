@@ -28,7 +28,8 @@ from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import pad
 
-from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
+from normlift_ns.encoders.sam.library import load_network
+from normlift_ns.encoders.sam.network import PromptedNetwork, resolve_precision
 from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from normlift_ns.encoders.sam.weights import check_sam, sam_identity
@@ -98,7 +99,7 @@ class SamMasks:
     """
 
     checkpoint: str = DEFAULT_SAM
-    """A folder or file with weights, or a name on the hub."""
+    """A folder or file with weights, or a name on the hub; of SAM, SAM 2, SAM 2.1 or HQ-SAM."""
     level: Level = "l"
     """s, m, l: SAM's subparts, parts, wholes. default: all three together."""
     device: str = "cpu"
@@ -142,7 +143,7 @@ class SamMasks:
 
         Raises:
             FileNotFoundError: the weights cannot be downloaded.
-            ValueError: a checkpoint that is damaged or not of SAM.
+            ValueError: a checkpoint that is damaged, of another network, or of one that the installed torch cannot run.
             MemoryError: the memory of the device does not hold a single image or prompt.
         """
         rules = self.rules
@@ -214,9 +215,9 @@ class SamMasks:
         return sam_identity(self.checkpoint)
 
     @cached_property
-    def network(self) -> SamNetwork:
+    def network(self) -> PromptedNetwork:
         """The network with its weights, loaded at the first use; raises as `masks`."""
-        return SamNetwork.load(self.checkpoint, self.device, self.precision)
+        return load_network(self.checkpoint, self.device, self.precision)
 
 
 def point_grid(side: int) -> Float[Tensor, "p 2"]:

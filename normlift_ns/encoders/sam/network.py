@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
@@ -31,38 +32,40 @@ def resolve_precision(precision: SamPrecision, device: str) -> SamPrecision:
     return _DEFAULT[torch.device(device).type] if precision == "auto" else precision
 
 
-class SamNetwork:
-    """A SAM on a device, in one precision: products of matrices in that, sums and normalisations in float32. In the
-    mask decoder what belongs to prompts, not to positions of the image, is float32 in any case."""
+class PromptedNetwork(ABC):
+    """A network that answers points on an image with three masks each, on a device and in one precision."""
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
+        """
+        Args:
+            model: of transformers, in float32.
+        """
         self._model = model.to(device)
         self._device = torch.device(device)
         self._dtype: torch.dtype = getattr(torch, resolve_precision(precision, device))
-        self._side: int = model.config.vision_config.image_size
+        self._side: int = model.config.prompt_encoder_config.image_size
         images, prompts, masks = _BATCHES["cuda" if self._device.type == "cuda" else "cpu"]
         self._images, self._prompts = Batches(images), Batches(prompts)
-        self._decoder = MaskDecoder(self._model, self._dtype)
         self.masks = Batches(masks)
         """For what is done with masks at the size of the image."""
 
-    @classmethod
-    def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> SamNetwork:
-        """The network of a checkpoint; raises as `load_sam`."""
-        return cls(load_sam(checkpoint), device, precision)
-
+    @abstractmethod
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
-        """Images as the network takes them: scaled so that the longer side fills the input, the rest of which is 0."""
-        return torch.stack([self._pixels(image.to(self._device)) for image in images])
+        """Images as the network takes them."""
 
-    def embed(self, pixels: Float[Tensor, "n 3 side side"]) -> list[Float[Tensor, "1 c y x"]]:
-        """Embeddings of images."""
-        batches = self._images(lambda batch: self._embed(batch.to(self._device)), pixels)
-        return list(torch.cat(list(batches)).split(1))
+    def embed(self, pixels: Float[Tensor, "n 3 side side"]) -> list[Any]:
+        """What `prompt` needs to know of each image."""
+        return [one for batch in self._images(lambda part: self._embed(part.to(self._device)), pixels) for one in batch]
 
-    def prompt(
-        self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "p 2"], size: tuple[int, int]
-    ) -> Iterator[Answers]:
+    @abstractmethod
+    def _embed(self, pixels: Tensor) -> list[Any]:
+        """The same of images that fit into memory."""
+
+    @abstractmethod
+    def decode(self, embedding: Any, points: Float[Tensor, "b 2"]) -> Answers:
+        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input."""
+
+    def prompt(self, embedding: Any, points: Float[Tensor, "p 2"], size: tuple[int, int]) -> Iterator[Answers]:
         """Logits and predicted IoU of the three masks of each point, in batches of points.
 
         Args:
@@ -72,18 +75,6 @@ class SamNetwork:
         height, width = self._scaled(size)
         scaled = (points * torch.tensor([width / size[1], height / size[0]])).float().to(self._device)
         return self._prompts(lambda batch: self.decode(embedding, batch), scaled)
-
-    def decode(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]) -> Answers:
-        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input. What is too large
-        for float16 is answered in float32."""
-        masks, ious = self._decoder(embedding, points.to(self._device))
-        if self._dtype == torch.float16 and not bool(ious.isfinite().all()):
-            return self._exact(embedding, points.to(self._device))
-        return masks, ious
-
-    @cached_property
-    def _exact(self) -> MaskDecoder:
-        return MaskDecoder(self._model, torch.float32)
 
     def enlarge(self, logits: Float[Tensor, "n y x"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
         """Logits at the size of the image, in float32, bilinear: first to the size of the input, then, without its
@@ -109,8 +100,39 @@ class SamNetwork:
         return first.to(self._device), weights.to(self._device)
 
     def _scaled(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Height and width that an image has in the input."""
         scale = self._side / max(size)
         return int(size[0] * scale + 0.5), int(size[1] * scale + 0.5)
+
+
+class SamNetwork(PromptedNetwork):
+    """The first SAM: products of matrices in the precision of the network, sums and normalisations in float32. In the
+    mask decoder what belongs to prompts, not to positions of the image, is float32 in any case."""
+
+    def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
+        super().__init__(model, device, precision)
+        self._decoder = MaskDecoder(self._model, self._dtype)
+
+    @classmethod
+    def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> SamNetwork:
+        """The network of a checkpoint; raises as `load_sam`."""
+        return cls(load_sam(checkpoint), device, precision)
+
+    def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
+        """Images as the network takes them: scaled so that the longer side fills the input, the rest of which is 0."""
+        return torch.stack([self._pixels(image.to(self._device)) for image in images])
+
+    def decode(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]) -> Answers:
+        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input. What is too large
+        for float16 is answered in float32."""
+        masks, ious = self._decoder(embedding, points.to(self._device))
+        if self._dtype == torch.float16 and not bool(ious.isfinite().all()):
+            return self._exact(embedding, points.to(self._device))
+        return masks, ious
+
+    @cached_property
+    def _exact(self) -> MaskDecoder:
+        return MaskDecoder(self._model, torch.float32)
 
     def _pixels(self, image: Tensor) -> Tensor:
         height, width = self._scaled((image.shape[0], image.shape[1]))
@@ -119,9 +141,9 @@ class SamNetwork:
         return pad(pixels, (0, self._side - width, 0, self._side - height))
 
     @torch.no_grad()
-    def _embed(self, pixels: Tensor) -> Tensor:
+    def _embed(self, pixels: Tensor) -> list[Any]:
         with torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32):
-            return self._model.get_image_embeddings(pixels).float()
+            return list(self._model.get_image_embeddings(pixels).float().split(1))
 
 
 @lru_cache(maxsize=64)

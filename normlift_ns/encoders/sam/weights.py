@@ -6,7 +6,8 @@ import importlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,16 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from normlift_ns.core.disk.digests import file_digest
+from normlift_ns.encoders.sam.folders import (
+    MASK_KINDS,
+    SAM,
+    WEIGHTS,
+    Kind,
+    check_sizes,
+    import_transformers,
+    kind_of,
+    load_folder,
+)
 from normlift_ns.encoders.weights import first_line, probe
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM
@@ -23,8 +34,9 @@ REMEDY = (
     f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
     "as sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
 )
-_FILES = ("model.safetensors", "pytorch_model.bin")
+_FILES = (WEIGHTS, "pytorch_model.bin")
 _FIRST = "the first SAM, ViT-B, -L or -H"
+_AS_FOLDER = ", or for SAM 2 and HQ-SAM a folder as transformers writes it"
 _OTHERS = {
     "image_encoder.trunk.": "SAM 2",
     "image_encoder.layers.": "MobileSAM",
@@ -32,8 +44,6 @@ _OTHERS = {
     "mask_decoder.compress_vit_feat": "HQ-SAM",
 }
 """What the parameters of other networks begin with."""
-_MOST_PARTS, _LARGEST_SIZE, _DEEPEST = 512, 2**16, 8
-"""Of layers, labels and entries; of every other number in a config; and of values within values."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {
@@ -61,31 +71,21 @@ _NAMES = {
 """Names of Meta's parameters, as patterns, and what transformers calls them."""
 
 
-def import_transformers() -> Any:
-    """transformers, imported at the first use because that takes seconds.
-
-    Raises:
-        ValueError: it is not installed.
-    """
-    try:
-        return importlib.import_module("transformers")
-    except ImportError as error:
-        raise InputError(
-            f"--regions sam needs the package transformers ({first_line(error)}); install it with: "
-            'pip install "normlift-ns[sam]", or cut the images without SAM: --regions patches or superpixel'
-        ) from None
-
-
-def check_sam(checkpoint: str) -> None:
+def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
     """Checks a checkpoint by name, without loading or downloading anything.
 
     Raises:
-        ValueError: transformers is not installed, or what is neither a path nor a name of the form OWNER/NAME.
+        ValueError: transformers is not installed; what is neither a path nor a name of the form OWNER/NAME; a folder of
+            another network, or of one that the installed torch cannot run.
         FileNotFoundError: what looks like a path does not exist.
     """
     import_transformers()
     path = Path(checkpoint)
     if os.path.isfile(path) or os.path.isdir(path):
+        folder = folder_of(path)
+        if folder is not None and (folder / "config.json").is_file():
+            with told_of(path):
+                kind_of(folder, kinds)
         return
     if os.path.lexists(path):
         raise InputError(f"SAM checkpoint {checkpoint} is neither a file nor a folder; {REMEDY}")
@@ -117,15 +117,52 @@ def sam_identity(checkpoint: str) -> str:
     return file_digest(*(file for file in (path, path / "config.json", *_weights(path)) if file.is_file()))
 
 
-def load_sam(checkpoint: str) -> Any:
-    """transformers' SamModel with the weights of a checkpoint, in float32 on the CPU.
+def load_model(checkpoint: str) -> tuple[Kind, Any]:
+    """transformers' model with the weights of a checkpoint, in float32 on the CPU, and what it is.
 
     Raises:
         FileNotFoundError: it is not on this machine and cannot be downloaded.
-        ValueError: it is damaged, or not of SAM.
+        ValueError: it is damaged, of no network that answers points, or of one that the installed torch cannot run.
     """
-    path = local_sam(checkpoint) or _download(checkpoint)
+    path = local_sam(checkpoint) or download(checkpoint, MASK_KINDS)
+    folder = folder_of(path)
+    if folder is None:
+        return SAM, load_sam(str(path))
+    with told_of(path):
+        kind = kind_of(folder, MASK_KINDS)
+        if kind is not SAM:
+            return kind, load_folder(folder, kind)
+    return kind, load_sam(str(path))
+
+
+def folder_of(path: Path) -> Path | None:
+    """The folder, as transformers writes it, that a checkpoint is or lies in; None: it is a file of Meta's."""
+    if path.is_dir():
+        return path
+    return path.parent if path.suffix == ".safetensors" and (path.parent / "config.json").is_file() else None
+
+
+@contextmanager
+def told_of(path: Path, what: str = "SAM") -> Iterator[None]:
+    """Errors of foreign libraries within become one of ours that names the checkpoint."""
     try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # the configs of transformers raise types of their own for a wrong value
+        reason = str(error) if isinstance(error, InputError) else first_line(error)
+        raise InputError(f"{what} checkpoint {path} is damaged or not of {what} ({reason}); {REMEDY}") from None
+
+
+def load_sam(checkpoint: str) -> Any:
+    """transformers' SamModel with the weights of a checkpoint of the first SAM, in float32 on the CPU.
+
+    Raises:
+        FileNotFoundError: it is not on this machine and cannot be downloaded.
+        ValueError: it is damaged, or not of the first SAM.
+    """
+    path = local_sam(checkpoint) or download(checkpoint, MASK_KINDS)
+    with told_of(path):
         config, state = _read_folder(path) if path.is_dir() else _read_file(path)
         for name, other in (_SHARED, _SHARED[::-1]):  # one tensor, of which a file may hold one copy
             if other in state:
@@ -133,19 +170,23 @@ def load_sam(checkpoint: str) -> Any:
         with torch.device("meta"):
             model = import_transformers().SamModel(config)
         model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
-    except MemoryError:
-        raise
-    except Exception as error:  # the configs of transformers raise types of their own for a wrong value
-        raise InputError(f"SAM checkpoint {path} is damaged or not of SAM ({first_line(error)}); {REMEDY}") from None
     return model.eval().requires_grad_(False)
 
 
-def _download(checkpoint: str) -> Path:
+def download(checkpoint: str, kinds: Mapping[str, Kind], more: Sequence[str] = ()) -> Path:
+    """The folder of a name on the hub: config.json first, and weights only if they are of one of some networks.
+
+    Args:
+        more: patterns of further files.
+    Raises:
+        FileNotFoundError: it cannot be downloaded.
+    """
     hub = importlib.import_module("huggingface_hub")
     try:
         probe(hub.constants.ENDPOINT)
         folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
-        wanted = ["config.json", _FILES[0]] if _model_type(folder) == "sam" else ["config.json"]
+        known = json.loads((folder / "config.json").read_text("utf8")).get("model_type") in kinds
+        wanted = ["config.json", WEIGHTS, *more] if known else ["config.json"]
         return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
     except Exception as error:  # a download's client raises types of its own, which have nothing in common
         raise FileNotFoundError(
@@ -155,34 +196,14 @@ def _download(checkpoint: str) -> Path:
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
-    if _model_type(folder) != "sam":
-        raise InputError(f"config.json is of model type {_model_type(folder)!r}, expected 'sam', {_FIRST}")
+    if kind_of(folder, MASK_KINDS) is not SAM:
+        raise InputError(f"the folder is not of {_FIRST}")
     found = _weights(folder)
     if len(found) == 0:
         raise InputError(f"the folder has no {_FILES[0]}")
     config = json.loads((folder / "config.json").read_text())
-    _check_sizes(config)
+    check_sizes(config)
     return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
-
-
-def _check_sizes(values: Any, name: str = "config.json", depth: int = 0) -> None:
-    """Raises InputError for numbers that no network has: transformers builds what a config says, however large."""
-    if depth > _DEEPEST or (isinstance(values, Mapping | list) and len(values) > _MOST_PARTS):
-        raise InputError(f"{name} is nested too deeply, or has more than {_MOST_PARTS} entries")
-    if isinstance(values, Mapping):
-        for key, value in values.items():
-            _check_sizes(value, str(key), depth + 1)
-    elif isinstance(values, list):
-        for value in values:
-            _check_sizes(value, name, depth + 1)
-    elif isinstance(values, int | float):
-        most = _MOST_PARTS if name.startswith("num_") or name.endswith("depth") else _LARGEST_SIZE
-        if not -1 <= values <= most:
-            raise InputError(f"{name} of config.json is {values!r:.40}, expected at most {most:,}")
-
-
-def _model_type(folder: Path) -> Any:
-    return json.loads((folder / "config.json").read_text()).get("model_type")
 
 
 def _weights(folder: Path) -> list[Path]:
@@ -194,7 +215,7 @@ def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
     for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
         for part, kind in _OTHERS.items():
             if str(name).startswith(part):
-                raise InputError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}")
+                raise InputError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}{_AS_FOLDER}")
     if "image_encoder.pos_embed" not in state:
         if (path.parent / "config.json").is_file():
             return _read_folder(path.parent)

@@ -1,4 +1,4 @@
-"""Texts that a network of OpenCLIP has read before: asked again, they need neither the network nor torch."""
+"""Texts that a network has read before: asked again, they need neither the network nor torch."""
 
 from __future__ import annotations
 
@@ -38,13 +38,11 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 
 
 @dataclass(frozen=True)
-class ClipTexts:
-    """Texts of an OpenCLIP model. The key of what is kept: the text, and the settings that change its vector."""
+class KeptTexts:
+    """Texts of a network. The key of what is kept: the text, and the settings that change its vector."""
 
-    model: str
-    pretrained: str
-    """A tag, or a weight file, which counts by its content."""
-    template: str
+    settings: Callable[[], dict[str, Any]]
+    """Every setting that changes `text`, ready for JSON; files of weights count by their content."""
     network: Callable[[], TextEncoder]
     """Makes the encoder, where a text is new."""
     folder: Path | None
@@ -61,7 +59,7 @@ class ClipTexts:
         """One unit row per prompt.
 
         Raises:
-            ValueError, FileNotFoundError, MemoryError: as `OpenClipEncoder` and its `text`.
+            ValueError, FileNotFoundError, MemoryError: as the network and its `text`.
         """
         check_prompts(prompts)
         found = {prompt: self._kept(prompt) for prompt in prompts}
@@ -83,7 +81,7 @@ class ClipTexts:
 
     @cached_property
     def _identity(self) -> dict[str, Any]:
-        return text_identity(self.model, self.pretrained, self.template)
+        return self.settings()
 
     def _path(self, prompt: str) -> Path | None:
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())

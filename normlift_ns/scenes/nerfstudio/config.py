@@ -15,7 +15,10 @@ from normlift_ns.scenes.nerfstudio.allowed import OBJECT_TAG, ConfigLoader
 from normlift_ns.scenes.nerfstudio.checks import check_config
 from normlift_ns.scenes.nerfstudio.classes import TrainerConfig
 
-SUPPORTED_METHODS = ("splatfacto", "splatfacto-big", "normlift", "normlift-lerf-ovs", "normlift-scannet")
+SUPPORTED_METHODS = (
+    *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # the last one is of nerfstudio's main branch
+    *("normlift", "normlift-lerf-ovs", "normlift-scannet"),
+)
 _LARGEST = 2**18
 """Bytes of a config.yml; nerfstudio's have 6,000."""
 _EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
@@ -52,7 +55,8 @@ def read_config(path: Path) -> TrainerConfig:
     if method not in SUPPORTED_METHODS:
         raise InputError(
             f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
-            "Train the capture with: ns-train splatfacto --data ..."
+            "Train the capture with: ns-train splatfacto --data ...; or, if its Gaussians are plain ones, write them "
+            "with ns-export gaussian-splat and lift that file with --load-ply"
         )
     try:
         config = yaml.load(text, Loader=ConfigLoader)

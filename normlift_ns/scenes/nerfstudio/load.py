@@ -18,6 +18,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RasterizeMode
 from normlift_ns.raster.colors import view_colors
 from normlift_ns.scenes.checkpoint import Checkpoint, find_checkpoint, read_checkpoint
+from normlift_ns.scenes.frames import Frame
 from normlift_ns.scenes.nerfstudio.appearance import COLORS, LOADED_STEP, background, shading_degree
 from normlift_ns.scenes.nerfstudio.classes import SplatfactoModelConfig, TrainerConfig
 from normlift_ns.scenes.nerfstudio.config import RunLocation, locate, read_config, rebased
@@ -66,6 +67,8 @@ class NerfstudioScene:
     """Config and step, for the manifest; of a lifted run also the rules that it was drawn by."""
     remarks: tuple[str, ...] = ()
     """What a person should know of the photographs, in whole sentences."""
+    added: tuple[Frame, ...] = ()
+    """The last of the training views, with which the run was not trained; in the world of the Gaussians."""
 
     renderer = None
     """normlift_ns draws as splatfacto does."""

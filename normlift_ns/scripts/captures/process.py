@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
+
+from normlift_ns.team.launch import TEAM, bound
 
 LIFT = (sys.executable, "-m", "normlift_ns.scripts.lift")
 """ns-normlift of this very installation."""
 _GRACE = 30.0
 """Seconds between asking a process to end and ending it."""
 _TAIL = 2**14
-_DIE_WITH_PARENT = 1
-"""PR_SET_PDEATHSIG of Linux."""
 
 
 def run_program(words: Sequence[str], log: Path, beat: Callable[[], bool], every: float) -> int | None:
@@ -30,7 +28,8 @@ def run_program(words: Sequence[str], log: Path, beat: Callable[[], bool], every
     Raises:
         OSError: the program cannot be started, or the file not be written.
     """
-    environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # its last line is its last word
+    alone = {name: value for name, value in os.environ.items() if name not in TEAM}
+    environment = alone | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # its last line is its last word
     with (
         log.open("wb") as output,
         subprocess.Popen(
@@ -39,7 +38,7 @@ def run_program(words: Sequence[str], log: Path, beat: Callable[[], bool], every
             stdout=output,
             stderr=subprocess.STDOUT,
             env=environment,
-            preexec_fn=_bound(),  # noqa: PLW1509 (workers have no threads)
+            preexec_fn=bound(),  # noqa: PLW1509 (workers have no threads)
         ) as process,
     ):
         try:
@@ -66,19 +65,6 @@ def why(code: int, log: Path) -> str:
         lines = file.read().decode("utf8", "replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip() != ""), "")
     return last or f"its process ended with exit code {code} and without a word"
-
-
-def _bound() -> Callable[[], None] | None:
-    """What a new process does first, so that it ends with this one; only Linux can."""
-    if sys.platform != "linux":
-        return None
-    return partial(_follow, ctypes.CDLL(None).prctl, os.getpid())
-
-
-def _follow(prctl: Callable[..., int], parent: int) -> None:
-    prctl(_DIE_WITH_PARENT, signal.SIGTERM)
-    if os.getppid() != parent:  # it has ended already
-        os._exit(128 + signal.SIGTERM)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from normlift_ns.core.crash import explain
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.crash import explain
 from normlift_ns.raster.rasterize import render
 from normlift_ns.session.state import State
 from normlift_ns.viewer.adapter import Page

@@ -36,6 +36,8 @@ def explain(error: BaseException) -> tuple[str, int]:
         return str(error) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale", USER
     if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for this
         return f"the GPU's memory is full ({_first_line(error)}); work on the CPU: --device cpu", USER
+    if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):
+        return "this torch was built for NumPy 1, and NumPy 2 is installed; type: pip install 'numpy<2'", USER
     return _bug(error), OURS
 
 

@@ -49,7 +49,7 @@ def read_ply(path: Path) -> PlySplat:
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
-    _check_header(path)
+    check_header(path)
     try:
         found = PlyData.read(str(path), mmap="c")
     except UnicodeDecodeError as error:
@@ -91,7 +91,7 @@ def read_ply(path: Path) -> PlySplat:
     return PlySplat(splat, _mode([*found.comments, *vertex.comments]))
 
 
-def _check_header(path: Path) -> None:
+def check_header(path: Path) -> None:
     """The rows that a header promises must fit into the file: they would be allocated before they are read."""
     size = path.stat().st_size
     with path.open("rb") as file:

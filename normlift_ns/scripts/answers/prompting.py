@@ -12,7 +12,7 @@ from typing import Any
 
 from rich.table import Table
 
-from normlift_ns.core.crash import state_folder
+from normlift_ns.crash import state_folder
 from normlift_ns.errors import InputError
 from normlift_ns.insight.histogram import bars
 from normlift_ns.question import Question

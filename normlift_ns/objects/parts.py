@@ -69,11 +69,12 @@ def find_objects(
     return Objects(
         gaussians=int(selected.sum()),
         in_smaller_parts=int(selected.sum() - sizes[:count].sum()),
-        objects=[_object(field, means, labels == i) for i in range(count)],
+        objects=[describe_object(field, means, labels == i) for i in range(count)],
     )
 
 
-def _object(field: SemanticField, means: Tensor, rows: Tensor) -> SceneObject:
+def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"]) -> SceneObject:
+    """What is known of some Gaussians as one object."""
     places = means[rows].double().cpu().numpy()
     weight = field.scalars.weight[rows].double().cpu().numpy() + 1e-12
     reliability = field.scalars.reliability[rows].double().cpu().numpy()

@@ -1,0 +1,77 @@
+"""docs/viewer_own.jpg, viewer_overlay.jpg and viewer_isolated.jpg: both viewers on the demo room, in Chromium.
+
+python -m benchmarks.draw_viewers [config.yml of the lifted demo room]      after make demo; nothing is saved in the run
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import Browser, Page
+
+from benchmarks.plots import DOCS
+from tests.browser.own_viewer import PANEL, Own, own_viewer
+from tests.browser.viewer import TITLE, Tab, chromium, ns_viewer
+
+CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
+OWN, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"
+"""Things that the first views of the two viewers show."""
+CLICKED = (0.35, 0.85)
+"""Where the pumpkin is in the picture of the first view, as fractions of its width and height."""
+
+
+def main(config: Path) -> None:
+    """Draws the three pictures."""
+    log = Path(tempfile.mkdtemp()) / "log"
+    with chromium() as browser:
+        with own_viewer(config, log) as address:
+            own(browser, address)
+        with ns_viewer(config, log, cwd=config.parents[4]) as address:
+            stock(browser, address)
+
+
+def own(browser: Browser, address: str) -> None:
+    """ns-normlift-view with an answer."""
+    page = Own(browser, address, size=(1200, 640))
+    page.ask(OWN)
+    page.until(lambda: page.selected() > 0, "an answer")
+    page.picture()
+    shot(page.page, "viewer_own")
+
+
+def stock(browser: Browser, address: str) -> None:
+    """ns-viewer with an answer, and with one thing alone."""
+    tab = Tab(browser, address, sharpness=1, size=(1300, 947))
+    tab.press("Hide Train Cams")
+    tab.type("Prompts", STOCK)
+    tab.press("Ask")
+    tab.until(lambda: tab.answered() == 2, "an answer")
+    tab.show("overlay")
+    tab.settle()
+    shot(tab.page, "viewer_overlay")
+    tab.press("Clear")
+    tab.show("rgb")
+    tab.press("More like this")
+    tab.says("Click on something in the scene")
+    tab.click((1300 - PANEL) * CLICKED[0], (947 - TITLE) * CLICKED[1])
+    tab.until(lambda: tab.selected() > 0, "clicked")
+    tab.press("Only")
+    tab.show("rgb")
+    tab.settle()
+    shot(tab.page, "viewer_isolated")
+
+
+def shot(page: Page, name: str) -> None:
+    """Keeps the page as a JPEG of the documentation, at most 1,200 pixels wide."""
+    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    image.thumbnail((1200, 1200))
+    image.save(DOCS / f"{name}.jpg", quality=88)
+    sys.stdout.write(f"Written: {DOCS / name}.jpg\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else CONFIG.resolve())

@@ -1,0 +1,67 @@
+"""What mkdocs.yml asks of the documentation: pages from outside of docs/, and examples in docstrings as code.
+
+README, CONTRIBUTING, SECURITY and CHANGELOG stay where people look for them, and are pages of the site as well.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import griffe
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+OUTSIDE = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "CHANGELOG.md": "changelog.md",
+}
+_SOURCE = "https://github.com/normlift-ns/normlift_ns/blob/main/"
+_LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
+_DOCTEST = re.compile(r"^(?P<block>(?:>>> .*)(?:\n(?!\s*\n|```).+)*)", re.MULTILINE)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Adds the pages from outside."""
+    for name, page in OUTSIDE.items():
+        files.append(File.generated(config, page, content=(ROOT / name).read_text("utf8")))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Links as they are right on the site; bars in code without the backslash that tables on GitHub need."""
+    outside = page.file.src_uri in OUTSIDE.values()
+    markdown = re.sub(r"`[^`\n]+`", lambda found: found[0].replace(r"\|", "|"), markdown)
+    markdown = markdown.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
+    return _LINK.sub(lambda found: f"]({_moved(found[1], outside)}{found[2] or ''})", markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Flags that stay in one line."""
+    return re.sub(r"<code>(--[a-z][\w-]*(?: [^<\s]{1,12})?)</code>", r'<code class="flag">\1</code>', html)
+
+
+def _moved(target: str, outside: bool) -> str:
+    """Where a link leads on the site, from a page of docs/ or from one outside of it."""
+    name = target.removeprefix("../") if target.startswith("../") else target if outside else ""
+    if name in OUTSIDE:
+        return OUTSIDE[name]
+    if outside and name.startswith("docs/"):
+        return name.removeprefix("docs/")
+    if target.startswith("../") or (outside and (ROOT / name).exists()):
+        return _SOURCE + name  # a file that is no page
+    return target
+
+
+class Doctests(griffe.Extension):
+    """Examples after >>> in docstrings become blocks of code."""
+
+    def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Rewrites the docstring of one object."""
+        if obj.docstring is not None:
+            text = re.sub(r"<(\w+)>", r"&lt;\1&gt;", obj.docstring.value)
+            text = re.sub(r"(?<!\n)\n(Args|Returns|Raises):$", r"\n\n\1:", text, flags=re.MULTILINE)
+            obj.docstring.value = _DOCTEST.sub(r"\n```pycon\n\g<block>\n```", text)

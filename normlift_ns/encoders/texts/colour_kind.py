@@ -1,0 +1,32 @@
+"""`--encoder colour`: what is known of it before anything is loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from normlift_ns.encoders.kinds import EncoderKind
+from normlift_ns.options import SourceOptions
+
+if TYPE_CHECKING:
+    from normlift_ns.encoders.source import Encoder
+    from normlift_ns.encoders.texts.colours import ColourTexts
+
+
+def _make(options: SourceOptions, device: str) -> Encoder:
+    from normlift_ns.encoders.colour import ColourEncoder  # noqa: PLC0415 (needs torch)
+
+    _texts(options, device, None, {})
+    return ColourEncoder()
+
+
+def _texts(options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]) -> ColourTexts:
+    from normlift_ns.encoders.texts.colours import ColourTexts, refuse_template  # noqa: PLC0415 (needs numpy)
+
+    refuse_template(options.text_template)
+    return ColourTexts()
+
+
+COLOUR = EncoderKind(_make, rule="cosine", negatives=(), texts=_texts, learned=False)
+"""Mean colours against colour names: a neighbouring shade has a cosine of 0.9, another colour less than 0.5."""

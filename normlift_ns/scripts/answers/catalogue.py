@@ -1,0 +1,52 @@
+"""ns-normlift-query --objects: a catalogue of what is selected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from normlift_ns.asking import answer
+from normlift_ns.front_door import open_run
+from normlift_ns.objects.catalogue import Catalogue
+from normlift_ns.question import Question
+from normlift_ns.scripts.shared import CONSOLE, plain, say
+
+
+def find_catalogue(config: Path, data: Path | None, question: Question, metres_per_unit: float | None) -> Catalogue:
+    """The objects of the answer to a question, of the run opened whole: only its scene knows cameras.
+
+    Raises:
+        FileNotFoundError, ValueError: as `open_run` and `LiftedRun.catalogue`.
+    """
+    run = open_run(config, data=data)
+    found = answer(run.field, run.scene.gaussians.means, question)
+    return run.catalogue(found, metres_per_unit=metres_per_unit)
+
+
+def facts(question: Question) -> dict[str, Any]:
+    """How objects were found, for the file."""
+    return {
+        "texts": list(question.texts),
+        "relevancy": question.rule,
+        "threshold": question.threshold,
+        "min_reliability": question.min_reliability,
+    }
+
+
+def show_catalogue(catalogue: Catalogue) -> None:
+    """Prints the table of objects, with places in the coordinates of the capture."""
+    table = Table("id", "text", title=f"Objects, in {catalogue.unit}s")
+    for name in ("Gaussians", "centroid", "box", "extent", "R", "views"):
+        table.add_column(name, justify="right")
+    table.add_column("best views")
+    for found in catalogue.objects:
+        place = found.capture
+        vectors = (" ".join(f"{x:.3g}" for x in row) for row in (place.centroid, place.box.size, place.extent))
+        numbers = (f"{found.gaussians:,}", *vectors, f"{found.reliability:.3f}", str(found.views))
+        best = plain(" ".join(Path(name).stem for name in found.best_views))
+        table.add_row(str(found.id), plain(found.text), *numbers, best)
+    CONSOLE.print(table)
+    if catalogue.in_smaller_parts > 0:
+        say(f"{catalogue.in_smaller_parts:,} selected Gaussians are in parts too small to be listed.")

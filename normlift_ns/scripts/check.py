@@ -1,0 +1,149 @@
+"""ns-normlift-check: whether a lift will work, and what it will take, before anything is paid for."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import tyro
+from rich.table import Table
+from rich.text import Text
+
+import normlift_ns
+from normlift_ns.core.files import refuse_existing, write_text
+from normlift_ns.crash import OURS, explain
+from normlift_ns.scripts.early import writable_file
+from normlift_ns.scripts.lift import NormLift
+from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process, say
+
+if TYPE_CHECKING:
+    from normlift_ns.planning.findings import Finding
+    from normlift_ns.planning.plan import Plan
+
+_Found = TypeVar("_Found")
+
+
+@dataclass
+class NormLiftCheck(NormLift):
+    """Check a capture and this machine before a lift: takes the options of ns-normlift, and lifts nothing. Looks at a
+    few photographs for real, and tells the seconds of every stage, memory and disk. Exit code 1: something is wrong."""
+
+    json: Path | None = None
+    """Write what was found, and the plan, into this file too."""
+    dry_run: tyro.conf.Suppress[bool] = True
+
+    def main(self) -> None:
+        """Checks, and shows what was found.
+
+        Raises:
+            SystemExit: something is wrong; with exit code 1.
+        """
+        begun = time.perf_counter()
+        if self.json is not None:
+            writable_file(self.json, "--json")
+            refuse_existing(self.json, overwrite=self.overwrite, instead="--json")
+        rows, plan = self._rows(begun)
+        _show(rows, plan)
+        if self.json is not None:
+            write_text(self.json, _to_json(rows, plan), overwrite=self.overwrite)
+        if any(row.state == "error" for row in rows):
+            raise SystemExit(1)
+
+    def _rows(self, begun: float) -> tuple[list[Finding], Plan | None]:
+        """Everything that was found, up to what could not be looked at because of an error, and the plan."""
+        rows: list[Finding] = []
+        if _tried(rows, "options", lambda: (self.check_early(),)) is None:
+            return rows, None
+        from normlift_ns.core.gpu import choose_device, wake  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.encoders.build import make_source  # noqa: PLC0415
+        from normlift_ns.planning import findings  # noqa: PLC0415
+        from normlift_ns.planning.findings import Finding  # noqa: PLC0415
+        from normlift_ns.scripts.planned import compared, open_capture, planned  # noqa: PLC0415
+
+        rows.append(findings.of_versions())
+        device = _tried(rows, "device", lambda: choose_device(self.device))
+        if device is None:
+            return rows, None
+        wake(device)
+        rows.append(findings.of_device(device))
+        source = _tried(rows, "2D features", lambda: make_source(self.source, device))
+        missing = [] if source is None else findings.missing_weights(self.source, device)
+        rows += [] if source is None else [findings.of_weights(missing)]
+        opened = _tried(rows, "capture", lambda: open_capture(self, begun))
+        if opened is None:
+            return rows, None
+        scene = opened.scene
+        count = f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, {len(scene.held_out)} held out"
+        rows.append(Finding("capture", "ok", count))
+        rows += [Finding("photographs", "warning", remark) for remark in scene.remarks]
+        rows.append(findings.of_views(scene))
+        if self.check:
+            warning = _tried(rows, "cameras", lambda: (compared(self, opened, device),))
+            if warning == (None,):
+                rows.append(Finding("cameras", "ok", "three photographs look like renders from their cameras"))
+            elif warning is not None:
+                rows.append(Finding("cameras", "warning", str(warning[0])))
+        if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
+            return rows, None
+        plan = _tried(rows, "plan", lambda: planned(self, opened, source, device))
+        if plan is not None:
+            rows += [*findings.of_memory(plan, device), findings.of_disk(plan, opened.run_dir)]
+        return rows, plan
+
+
+def _tried(rows: list[Finding], what: str, look: Callable[[], _Found]) -> _Found | None:
+    """What was found; None, with a row that says why, where there is an error of the user's.
+
+    Raises:
+        Exception: a mistake of ours.
+    """
+    from normlift_ns.planning.findings import Finding  # noqa: PLC0415
+
+    try:
+        return look()
+    except Exception as error:  # each is told in its row
+        if not isinstance(error, (ValueError, OSError, MemoryError)):
+            raise
+        message, code = explain(error)
+        if code == OURS:
+            raise
+        rows.append(Finding(what, "error", message))
+        return None
+
+
+def _show(rows: list[Finding], plan: Plan | None) -> None:
+    table = Table("", "", "found", "what to do")
+    colors = {"ok": "green", "warning": "yellow", "error": "red"}
+    for row in rows:
+        table.add_row(plain(row.what), Text(row.state, style=colors[row.state]), plain(row.found), plain(row.advice))
+    CONSOLE.print(table)
+    if plan is None:
+        say("The seconds of a lift cannot be told before that is mended.")
+        return
+    from normlift_ns.scripts.planned import needs, plan_table  # noqa: PLC0415
+
+    CONSOLE.print(plan_table(plan))
+    say(needs(plan))
+
+
+def _to_json(rows: list[Finding], plan: Plan | None) -> str:
+    content: dict[str, Any] = {
+        "version": normlift_ns.__version__,
+        "findings": [asdict(row) for row in rows],
+        "plan": None if plan is None else plan.to_json(),
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def entrypoint() -> None:
+    """ns-normlift-check, in a process that goes on."""
+    run_command(NormLiftCheck)
+
+
+def main() -> None:
+    """Entry point of ns-normlift-check."""
+    run_process(NormLiftCheck)

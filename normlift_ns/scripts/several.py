@@ -1,0 +1,36 @@
+"""A command whose process is one of several."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from normlift_ns.scripts.shared import CONSOLE, Terminated, say_error
+from normlift_ns.team.launch import OURS, LostError, joined, told
+
+if TYPE_CHECKING:
+    from normlift_ns.core.portions import Team
+
+
+@contextmanager
+def in_team(device: str) -> Iterator[Team]:
+    """The team that this process was started for, or none; of several processes the first one speaks."""
+    started_by_us = OURS in os.environ  # and whoever started it tells what becomes of it
+    try:
+        with joined(device, say_error) as team:
+            if team.rank > 0:
+                CONSOLE.quiet = True
+                warnings.simplefilter("ignore")
+            yield team
+    except LostError as error:
+        if not error.lost.failed:
+            say_error(told(error.lost))
+        sys.exit(1)
+    except (KeyboardInterrupt, Terminated):
+        if started_by_us:
+            sys.exit(1)
+        raise

@@ -1,0 +1,1 @@
+"""Several processes that lift one scene together."""

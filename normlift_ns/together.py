@@ -1,0 +1,169 @@
+"""Lifting into a new run, by one process or by several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.asking import answer
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gpu import choose_device, wake
+from normlift_ns.core.portions import Team
+from normlift_ns.core.scene import Scene
+from normlift_ns.encoders.build import make_source, source_settings
+from normlift_ns.encoders.given import GivenFeatures, given_features
+from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.errors import InputError
+from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.lifting import drawn_by, lift_together
+from normlift_ns.options import CANONICAL_NEGATIVES, LiftOptions, SourceOptions
+from normlift_ns.question import Question, make_question
+from normlift_ns.ranges import check_bool, check_path, check_texts
+from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.runs.files import (
+    FIELD_FOLDER,
+    TEXTS_FILE,
+    cache_folder,
+    refuse_existing_run,
+    run_directory,
+    tidy,
+    with_paths,
+)
+from normlift_ns.runs.write import write_run
+from normlift_ns.scenes.match import judge, match_photographs
+from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
+from normlift_ns.scenes.opening import SplatScene
+from normlift_ns.stages import Report, Stages
+from normlift_ns.team.seen import Export
+from normlift_ns.text_encoders import encoder_settings, given_settings
+
+
+def lift_run_together(
+    team: Team,
+    opened: Callable[[], Scene],
+    *,
+    source: SourceOptions | None,
+    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None,
+    texts: Mapping[str, Float[Tensor, " d"]] | None,
+    lift: LiftOptions | None,
+    queries: Sequence[str],
+    output_dir: str | Path | None,
+    timestamp: str | None,
+    overwrite: bool,
+    check: bool,
+    device: str,
+    export: Export | None,
+    report: Report,
+    say: Callable[[str], None],
+) -> LiftedRun | None:
+    """`lift_run` by the processes of a team, all with the same arguments; process 0 alone writes and returns the run.
+
+    Args:
+        opened: opens the trained scene; called once mistakes that show without it have been told.
+    """
+    if features is None and texts is not None:
+        raise InputError("texts are for features of your own; give features too, or leave texts out")
+    if features is not None and source is not None:
+        raise InputError("features of your own take the place of source; give one of the two")
+    check_texts("queries", queries)
+    check_bool("overwrite", overwrite)
+    check_bool("check", check)
+    target = None if output_dir is None else check_path("output_dir", output_dir)
+    if timestamp is not None:
+        run_directory(Path(), "run", timestamp)  # its name shows before the scene loads
+    for name, value, kind in (
+        ("source", source, SourceOptions),
+        ("lift", lift, LiftOptions),
+        ("export", export, Export),
+    ):
+        if value is not None and not isinstance(value, kind):
+            raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
+    device, options = choose_device(device), (source or SourceOptions()).looking_for(queries)
+    wake(device)
+    made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
+    if made is not None and len(queries) > 0:
+        made.text(queries)
+    scene = opened()
+    if not isinstance(scene, NerfstudioScene | SplatScene):
+        raise TypeError(
+            f"lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got {type(scene).__name__}"
+        )
+    run_dir = run_directory(target or scene.runs_dir, scene.name, timestamp)
+    run_dir = run_dir.with_name(team.tell(run_dir.name))  # clocks differ
+    if team.rank == 0:
+        tidy(run_dir)
+    if timestamp is not None and team.rank == 0:
+        refuse_existing_run(run_dir, overwrite)
+    say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
+    for remark in scene.remarks:
+        say(f"Warning: {remark}")
+    how, stages = lift or LiftOptions(), Stages(report)
+    if check and team.rank == 0:
+        with stages("check") as step:
+            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)), device=device)
+            warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
+            step()
+        if warning is not None:
+            say(f"Warning: {warning}")
+    if export is not None:
+        _refuse_equal_stems(scene.train.names)
+    settings = encoder_settings(options)
+    if made is None:
+        made = given_features(features, texts, scene.train.names)
+        texts = made.texts
+        settings = given_settings(TEXTS_FILE if texts else None)
+        if len(queries) > 0:
+            made.text(queries)
+    cache = cache_folder(run_dir)
+    with team.shares(cache):
+        result = lift_together(
+            team, scene, made, how, cache, device=device, encoder=settings, export=export, report=report
+        )
+    if result is None:
+        return None
+    field, seconds = result
+    if features is None:
+        field = replace(field, manifest={**field.manifest, "source": source_settings(options, device)})
+    seconds = {**stages.seconds, **seconds}
+    with stages("write") as step:
+        question = _question(field, scene.gaussians.means, made, queries)
+        run_dir = write_run(
+            scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
+        )
+        field = field.to("cpu")
+        step()
+    seconds["write"] = stages.seconds["write"]
+    return LiftedRun(run_dir, scene, with_paths(field, run_dir / FIELD_FOLDER), device, seconds)
+
+
+def _refuse_equal_stems(names: Sequence[str]) -> None:
+    """LangSplat's format names files by the stems of the images."""
+    stems = [Path(name).stem for name in names]
+    for i, stem in enumerate(stems):
+        if stem in stems[:i]:
+            raise InputError(
+                f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
+                "Give the images other names, or lift without --export-langsplat."
+            )
+
+
+def _question(
+    field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
+) -> Question | None:
+    if len(queries) == 0:
+        return None
+    length = source.text(queries).shape[1]
+    if length != field.dimension:
+        raise InputError(
+            f"the vectors of --queries have {length} numbers, the features {field.dimension}; name the model that made "
+            "the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
+        )
+    negatives = None
+    if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
+        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
+    return answer(field, means, make_question(field, source.text, queries, negatives=negatives)).question

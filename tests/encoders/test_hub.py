@@ -1,0 +1,132 @@
+"""SigLIP, SigLIP 2 and MetaCLIP 2: the same numbers as the library's own processor and model, in float64."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import transformers
+
+from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
+from normlift_ns.encoders.hub.encoder import HubEncoder
+from normlift_ns.encoders.patches import PatchFeatures, scaled
+from tests.encoders.tiny_hub import LENGTH, PATCH, SIDE, WRITERS
+
+IMAGE = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+LABELS = torch.full((1, 48, 64), -1, dtype=torch.int32)
+LABELS[0, :32, :32] = 0  # of the network's own size
+LABELS[0, 10:47, 30:41] = 1
+PROMPTS = ["a red mug", "A Red Mug!", "the table", "wine bottle on the table " * 9, "ÄÖ 漢"]
+
+
+class Both:
+    """An encoder of ours in float64, and the library's own model and processor."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        kind, write = WRITERS[name]
+        write(folder)
+        self.name, self.encoder = name, HubEncoder(kind, str(folder))
+        self.network = self.encoder.network
+        self.network.model.double()
+        self.network.mean, self.network.std = self.network.mean.double(), self.network.std.double()
+        self.model: Any = transformers.AutoModel.from_pretrained(folder).double().eval()
+        self.processor: Any = transformers.AutoProcessor.from_pretrained(folder)
+
+    @torch.no_grad()
+    def pooled(self, **inputs: torch.Tensor) -> torch.Tensor:
+        find = self.model.get_image_features if "pixel_values" in inputs else self.model.get_text_features
+        return find(**inputs).pooler_output
+
+    def prepared(self, pixels: torch.Tensor, **how: Any) -> dict[str, torch.Tensor]:
+        found = self.processor.image_processor(images=list(pixels), return_tensors="pt", **how)
+        return {key: value.double() if value.is_floating_point() else value for key, value in found.items()}
+
+
+@pytest.fixture(scope="module", params=WRITERS)
+def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Both:
+    return Both(request.param, tmp_path_factory.mktemp(request.param))
+
+
+def test_crops_are_seen_as_the_librarys_processor_prepares_them(both: Both) -> None:
+    boxes, size = region_boxes(LABELS), both.network.size
+    assert size == (SIDE, SIDE)
+    crops = masked_crops(IMAGE, LABELS, torch.arange(2), boxes, size, "black").round().to(torch.uint8)
+    expected = both.pooled(**both.prepared(crops))
+    torch.testing.assert_close(both.network.images(crops), expected, rtol=0, atol=1e-6)
+    assert (expected[0] - expected[1]).abs().max() > 1e-3  # which another preparation exceeds
+    rows = torch.nn.functional.normalize(expected[:1], dim=1)
+    torch.testing.assert_close(both.encoder.encode(IMAGE, LABELS)[:1].double(), rows, rtol=0, atol=1e-6)
+
+
+def test_texts_are_read_as_the_librarys_processor_reads_them(both: Both) -> None:
+    how = {"padding": "max_length", "max_length": LENGTH, "truncation": True, "return_tensors": "pt"}
+    prompts = [both.encoder.family.read(text) for text in PROMPTS] if both.name == "siglip" else PROMPTS
+    expected = both.pooled(**both.processor.tokenizer(prompts, **how))
+    found = both.network.texts([both.encoder.family.read(text) for text in PROMPTS])
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert (expected[0] - expected[2]).abs().max() > 1e-3
+    same = bool((found[0] - found[1]).abs().max() < 1e-12)
+    assert same == (both.name == "siglip")  # nothing else leaves punctuation out
+    lower = both.network.texts([both.encoder.family.read(text) for text in ("a red mug", "A RED MUG")])
+    assert bool((lower[0] - lower[1]).abs().max() < 1e-12) == (both.name != "metaclip2")
+    rows = torch.nn.functional.normalize(expected, dim=1)
+    torch.testing.assert_close(both.encoder.text(PROMPTS).double(), rows, rtol=0, atol=1e-6)
+
+
+def test_unpadded_texts_would_be_others(both: Both) -> None:
+    """The comparison above notices what SigLIP's users forget most often."""
+    short = both.pooled(**both.processor.tokenizer(["a red mug"], return_tensors="pt"))
+    found = both.network.texts([both.encoder.family.read("a red mug")])
+    assert bool((short - found).abs().max() > 1e-3) == (both.name != "metaclip2")  # which does not see what follows
+
+
+@torch.no_grad()
+def value_path(both: Both, pixels: torch.Tensor) -> torch.Tensor:
+    """The library's own modules, whose last attention looks at one patch alone, patch by patch."""
+    model, vision, inputs = both.model, both.model.vision_model, both.prepared(pixels, **_as_it_is(both))
+    if both.name == "metaclip2":
+        last, heard = vision.encoder.layers[-1], []
+        hook = last.register_forward_pre_hook(lambda _, given: heard.append(given[0]))
+        model.get_image_features(**inputs, interpolate_pos_encoding=True)
+        hook.remove()
+        tokens = last.layer_norm1(heard[0])[:, 1:]
+        alone = [last.self_attn(tokens[:, i : i + 1])[0] for i in range(tokens.shape[1])]
+        return model.visual_projection(vision.post_layernorm(torch.cat(alone, dim=1)))
+    more = {} if both.name == "naflex" else {"interpolate_pos_encoding": True}
+    tokens = vision(**inputs, **more).last_hidden_state
+    count = int(inputs["spatial_shapes"][0].prod()) if both.name == "naflex" else tokens.shape[1]
+    return torch.stack([vision.head(tokens[:, i : i + 1]) for i in range(count)], dim=1)
+
+
+def _as_it_is(both: Both) -> dict[str, Any]:
+    """Options of the processor that leave the size of an image."""
+    return {"do_resize": False, "max_num_patches": 40} if both.name == "naflex" else {
+        "do_resize": False, **({"do_center_crop": False} if both.name == "metaclip2" else {}),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("grid", [(4, 4), (3, 5), (6, 2)])
+def test_patches_are_those_of_the_value_path(both: Both, grid: tuple[int, int]) -> None:
+    pixels = scaled(IMAGE, grid[0] * PATCH, grid[1] * PATCH).round().to(torch.uint8)
+    expected = value_path(both, pixels)
+    assert expected.shape[:2] == (1, grid[0] * grid[1])
+    torch.testing.assert_close(both.network.patches(pixels), expected, rtol=0, atol=1e-6)
+    assert (expected[0, 0] - expected[0, 1]).abs().max() > 1e-3
+
+
+def test_patches_of_a_view(both: Both) -> None:
+    view = PatchFeatures(both.encoder, 12).view(IMAGE, "a.jpg")
+    assert view.features.shape == (12, both.network.width) and int(view.labels.max()) == 11
+    rows = both.network.patches(scaled(IMAGE, 3 * PATCH, 4 * PATCH))[0]
+    torch.testing.assert_close(view.features.double(), torch.nn.functional.normalize(rows, dim=1), rtol=0, atol=1e-6)
+
+
+def test_probabilities_rank_texts_as_cosines_do(both: Both) -> None:
+    """Why LERF's rule and its draw are the defaults: scale and bias change no order."""
+    images = torch.nn.functional.normalize(both.network.images(IMAGE[None, :SIDE, :SIDE].permute(0, 3, 1, 2)), dim=1)
+    cosines = images @ torch.nn.functional.normalize(both.network.texts(["red mug", "table"]), dim=1).T
+    bias = both.model.logit_bias if both.name != "metaclip2" else 0.0
+    logits = (both.model.logit_scale.exp() * cosines + bias).detach()
+    assert (logits.sigmoid().argsort() == cosines.argsort()).all() and float(both.model.logit_scale.exp()) > 0

@@ -1,0 +1,91 @@
+"""A run that SigLIP 2 lifted: asked through the commands' own code, again without its weights, and with others."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from normlift_ns.encoders import SourceOptions, make_source
+from normlift_ns.encoders.build import resolve_regions, source_settings
+from normlift_ns.encoders.cache import cached
+from normlift_ns.encoders.hub.encoder import HubEncoder
+from normlift_ns.encoders.patches import PatchFeatures
+from normlift_ns.errors import InputError
+from normlift_ns.text_encoders import default_rule, encoder_of, encoder_settings
+from tests.encoders.tiny_hub import write_siglip2
+
+IMAGE = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+class Field:
+    """What is known of a field."""
+
+    def __init__(self, manifest: dict[str, Any]) -> None:
+        self.manifest = manifest
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_siglip2(tmp_path / "net")
+    return tmp_path / "net"
+
+
+def lifted(folder: Path, regions: Any = "grid") -> Field:
+    options = SourceOptions(encoder="siglip2", encoder_model=str(folder), regions=regions, region_count=12)
+    return Field({"encoder": encoder_settings(options), "features": make_source(options).identity, "dimension": 32})
+
+
+def test_regions_are_patches_where_there_is_no_gpu(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = SourceOptions(encoder="siglip2", encoder_model=str(folder), region_count=12)
+    assert resolve_regions(options) == "patches"
+    assert make_source(options) == PatchFeatures(HubEncoder("siglip2", str(folder)), 12)
+    monkeypatch.chdir(folder.parent)
+    assert source_settings(SourceOptions(encoder="siglip2", encoder_model="net"))["encoder_model"] == str(folder)
+
+
+@pytest.mark.parametrize("regions", ["grid", "patches"])
+def test_texts_asked_before_need_no_weights(folder: Path, regions: str, tmp_path: Path) -> None:
+    field = lifted(folder, regions)
+    texts = encoder_of(field, cache=tmp_path / "texts")
+    assert default_rule(field) == ("lerf", ("object", "things", "stuff", "texture"), 0.5)
+    expected = texts.rows(["red mug", "table"])
+    assert torch.equal(torch.from_numpy(expected), HubEncoder("siglip2", str(folder)).text(["red mug", "table"]))
+    folder.rename(tmp_path / "gone")
+    (tmp_path / "manifest.json").write_text(json.dumps(field.manifest))
+    program = (
+        "import json, sys; from pathlib import Path; from normlift_ns.text_encoders import encoder_of\n"
+        "class Field: manifest = json.loads(Path(sys.argv[1]).read_text())\n"
+        "rows = encoder_of(Field, cache=Path(sys.argv[2])).rows(['table', 'red mug'])\n"
+        "assert not {'torch', 'transformers', 'tokenizers'} & set(sys.modules), sys.modules.keys()\n"
+        "print(json.dumps(rows.tolist()))"
+    )
+    words = [sys.executable, "-c", program, str(tmp_path / "manifest.json"), str(tmp_path / "texts")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == expected[::-1].tolist()
+    with pytest.raises(FileNotFoundError, match="net, given with --encoder-model, does not exist"):
+        encoder_of(field, cache=tmp_path / "texts").rows(["wine"])
+
+
+def test_other_weights_in_the_same_place_answer_nothing_new(folder: Path, tmp_path: Path) -> None:
+    field = lifted(folder)
+    kept = encoder_of(field, cache=tmp_path / "texts").rows(["red mug"])
+    write_siglip2(folder, seed=1)
+    again = encoder_of(field, cache=tmp_path / "texts")
+    assert (again.rows(["red mug"]) == kept).all()
+    with pytest.raises(InputError, match=r"the encoder siglip2 is not what the run was lifted with.*--text-vectors"):
+        again.rows(["table"])
+
+
+def test_features_of_regions_are_kept(folder: Path, tmp_path: Path) -> None:
+    options = SourceOptions(encoder="siglip2", encoder_model=str(folder), regions="grid", region_count=12)
+    expected = cached(make_source(options), tmp_path / "cache").view(IMAGE, "a.jpg")
+    again: Any = make_source(options)
+    vars(again.encoder)["network"] = None
+    assert torch.equal(cached(again, tmp_path / "cache").view(IMAGE, "a.jpg").features, expected.features)

@@ -1,0 +1,217 @@
+"""Encoders by entry point: how they are found, what a broken one does, the recipe of CONTRIBUTING.md as a package."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from normlift_ns.encoders import SourceOptions, make_encoder
+from normlift_ns.encoders.hub.families import FAMILIES
+from normlift_ns.encoders.hub.places import check_packages
+from normlift_ns.encoders.kinds import BUILT_IN, GROUP, encoder_kind, encoder_names, known_kind
+from normlift_ns.errors import InputError
+from normlift_ns.scripts.early import check_source
+from tests.scripts.test_help import tomllib
+
+ROOT = Path(__file__).parents[2]
+OURS = ["colour", "metaclip2", "open_clip", "siglip", "siglip2"]
+
+
+def install(folder: Path, package: str, points: str, code: str = "") -> None:
+    """A package as pip leaves it, in a folder of the path."""
+    info = folder / f"{package}-1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(points)
+    (folder / f"{package}.py").write_text(code)
+
+
+def points(**encoders: str) -> str:
+    return f"[{GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
+
+
+def test_ours_are_registered_in_pyproject() -> None:
+    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"][GROUP]
+    assert sorted(registered) == encoder_names() == OURS
+    for name in OURS:
+        kind = encoder_kind(name)
+        assert (kind.rule, kind.threshold) == (("cosine" if name == "colour" else "lerf"), 0.5)
+
+
+def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, "plug", points(other="plug:KIND"))
+    monkeypatch.syspath_prepend(tmp_path)
+    message = "unknown encoder 'clip'; --encoder is one of colour, metaclip2, open_clip, other, siglip, siglip2"
+    for refused in (encoder_kind, lambda name: check_source(SourceOptions(encoder=name), ())):
+        with pytest.raises(InputError, match=message):
+            refused("clip")
+    assert known_kind("clip") is None and known_kind(3) is None
+
+
+@pytest.mark.parametrize(
+    ("value", "code", "message"),
+    [
+        (
+            "nowhere:KIND",
+            "",
+            "encoder 'bad' of package plug cannot be loaded .ModuleNotFoundError: No module named",
+        ),
+        ("plug:KIND", "1 / 0", "cannot be loaded .ZeroDivisionError: division by zero.*--encoder open_clip"),
+        ("plug:KIND", "raise SystemExit(3)", "cannot be loaded .SystemExit: 3"),
+        ("plug:KIND", "KIND = 3", "is no encoder: plug:KIND is of type int, expected an EncoderKind"),
+        ("plug:", "", "cannot be loaded"),
+    ],
+)
+def test_a_broken_encoder_breaks_itself_only(
+    value: str, code: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "plug", points(bad=value, open_clip="plug:KIND"), code)
+    install(tmp_path, "worse", f"[{GROUP}]\nno value at all\n= = =\n[")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "plug", raising=False)
+    with pytest.raises(InputError, match=message):
+        encoder_kind("bad")
+    assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.clip.kind"
+    assert encoder_names() == ["bad", *OURS]
+
+
+def test_help_loads_no_encoder(tmp_path: Path) -> None:
+    install(tmp_path, "plug", points(bad="plug:KIND"), "raise SystemExit(3)")
+    program = "import sys; sys.argv[1:] = ['--help']; from normlift_ns.scripts.start import lift; lift()"
+    paths = os.environ | {"PYTHONPATH": str(tmp_path)}
+    words = [sys.executable, "-X", "importtime", "-c", program]
+    done = subprocess.run(words, env=paths, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "--encoder" in done.stdout
+    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert loaded.isdisjoint({"plug", "torch", "numpy", "transformers", "normlift_ns.encoders.clip.kind"})
+
+
+def test_two_packages_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, "one", points(same="one:KIND"))
+    install(tmp_path, "two", points(same="two:KIND"))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"encoder 'same' is claimed by package \w+ .*uninstall one of the two"):
+        encoder_kind("same")
+
+
+WRONG = """
+import torch
+from normlift_ns.encoders import EncoderKind
+class Wrong:
+    identity = {{}}
+    def encode(self, image, labels): return {rows}
+    def text(self, prompts): return {rows}
+KIND = EncoderKind(lambda options, device: {made})
+"""
+
+
+@pytest.mark.parametrize(
+    ("rows", "made", "message"),
+    [
+        ("torch.ones(2, 3)", "Wrong()", "gave regions vectors of other lengths than 1, such as 1.73; normalise them"),
+        ("torch.eye(3)", "Wrong()", r"gave torch.float32 \(3, 3\) for 2 regions, expected floats \[2, D\]"),
+        ("None", "Wrong()", "gave NoneType for 2 regions"),
+        ("torch.eye(2) / torch.zeros(1)", "Wrong()", "vectors of other lengths than 1"),
+        ("1 / 0", "Wrong()", "encoder 'wrong' of another package failed .ZeroDivisionError"),
+        ("0", "object()", "has no identity and no encode and no text"),
+        ("0", "missing", "encoder 'wrong' of another package failed .NameError"),
+    ],
+)
+def test_what_another_package_makes_is_checked(
+    rows: str, made: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "wrong_plug", points(wrong="wrong_plug:KIND"), WRONG.format(rows=rows, made=made))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "wrong_plug", raising=False)
+    labels = torch.arange(2).repeat(4, 1)[None].int()
+    with pytest.raises(InputError, match=message):
+        make_encoder(SourceOptions(encoder="wrong")).encode(torch.zeros(4, 2, 3, dtype=torch.uint8), labels)
+
+
+@pytest.mark.parametrize(
+    ("package", "found", "message"),
+    [
+        (
+            "torch",
+            "2.5.1",
+            "--encoder siglip2 needs torch 2.6 or later, found 2.5.1 .*--encoder open_clip works",
+        ),
+        ("transformers", "4.49.0", "needs transformers 4.56 or later, found 4.49.0"),
+    ],
+)
+def test_packages_that_are_too_old_are_refused(
+    package: str, found: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = {"torch": "2.6.0", "transformers": "5.0.0", package: found}
+    monkeypatch.setattr("normlift_ns.encoders.hub.places.version", versions.__getitem__)
+    for refused in (check_source, lambda options, _: make_encoder(options)):
+        with pytest.raises(InputError, match=message):
+            refused(SourceOptions(encoder="siglip2", encoder_model="/nowhere"), ())
+    versions[package] = "10.0"
+    check_packages(FAMILIES["siglip2"])
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"encoder_model": "/nowhere/x"}, FileNotFoundError, "/nowhere/x, given with --encoder-model, does not exist"),
+        ({"encoder_model": "siglip"}, InputError, "'siglip' is neither a folder nor a name of the hub; give a folder"),
+        ({"encoder_pretrained": "openai"}, InputError, "--encoder-pretrained openai is for --encoder open_clip"),
+        (
+            {},
+            FileNotFoundError,
+            "SigLIP 2 network google/siglip2-base-patch16-224 is neither on this machine nor",
+        ),
+    ],
+)
+def test_mistakes_are_told_before_torch_is_loaded(
+    options: dict[str, str], error: type[Exception], message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(error, match=message):
+        check_source(SourceOptions(encoder="siglip2", **options), ())
+
+
+@pytest.mark.slow
+def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
+    recipe = (ROOT / "CONTRIBUTING.md").read_text("utf8").split("## An encoder of your own")[1].split("## Dep")[0]
+    (project,), (code,) = (re.findall(f"```{kind}\n(.*?)```", recipe, re.DOTALL) for kind in ("toml", "python"))
+    source, installed = tmp_path / "source", tmp_path / "installed"
+    source.mkdir()
+    (source / "pyproject.toml").write_text(project)
+    (source / "normlift_mean_rgb.py").write_text(code)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--target", str(installed), str(source)], check=True)
+
+    def run(command: str, *words: object, here: bool = True) -> subprocess.CompletedProcess[str]:
+        paths = os.environ | {"CUDA_VISIBLE_DEVICES": ""} | ({"PYTHONPATH": str(installed)} if here else {})
+        program = [str(Path(sys.executable).with_name(command)), *map(str, words)]
+        return subprocess.run(program, env=paths, capture_output=True, text=True, check=False)
+
+    few = ("--max-views", 4, "--lift-downscale", 2, "--k", 6, "--region-count", 200, "--timestamp", "rgb")
+    lifted = trained.parents[2] / "normlift" / "rgb" / "config.yml"
+    done = run("ns-normlift", "--load-config", trained, "--encoder", "mean_rgb", *few)
+    assert done.returncode == 0, done.stdout + done.stderr
+    asked = ("--load-config", lifted, "--json", tmp_path / "a.json", "--overwrite", "True", "--text", "red", "yellow")
+    done = run("ns-normlift-query", *asked)
+    assert done.returncode == 0, done.stdout + done.stderr
+    red, yellow = json.loads((tmp_path / "a.json").read_text())["queries"]
+    assert red["peak"] > 0.9 and 0 < red["fraction"] < 0.5 and red["centroid"] != yellow["centroid"]
+    done = run("ns-normlift-query", *asked[:2], "--text", "purple")
+    assert done.returncode == 1 and "text 'purple' is none of red, green, blue, yellow" in done.stderr
+    done = run("ns-normlift-query", *asked[:2], "--text", "red", here=False)
+    assert done.returncode == 1 and "unknown encoder 'mean_rgb'" in done.stderr and "--text-vectors" in done.stderr
+
+
+def test_what_is_built_in_is_what_is_registered():
+    """Ours are found without metadata too, as in a source tree on PYTHONPATH."""
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert project["project"]["entry-points"]["normlift_ns.encoders"] == BUILT_IN

@@ -1,0 +1,60 @@
+"""What a plan tells of real captures against what their lifts take, in seconds of the CPU: other work on the machine
+changes those little. One thread, because threads that wait for each other count as busy."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.captures import SHARED
+from tests.captures import needs_shared
+
+PROGRAM = """
+import json, sys, time
+from pathlib import Path
+import torch
+from normlift_ns import LiftOptions, SourceOptions, open_scene
+from normlift_ns.encoders.build import make_source
+from normlift_ns.lifting import lift_scene
+from normlift_ns.planning.measure import load_kernels, measure
+from normlift_ns.planning.plan import make_plan
+torch.set_num_threads(1)
+scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
+source, options = make_source(SourceOptions(encoder="colour")), LiftOptions(max_views=9)
+load_kernels(scene, options)
+found = []
+for _ in range(2):
+    plan = make_plan(measure(scene, source, options, cache, clock=time.process_time))
+    start = time.process_time()
+    result = lift_scene(scene, source, options, cache, encoder={})
+    found.append({"told": plan.to_json(), "taken": time.process_time() - start, "stages": result.seconds,
+                  "gib": result.field.manifest["cost"].get("memory_gib")})
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+@needs_shared
+@pytest.mark.parametrize("capture", ["fox", "tabletop"])
+def test_the_seconds_are_within_a_factor_of_two(capture: str, tmp_path: Path) -> None:
+    config = SHARED / "captures" / "outputs" / capture / "splatfacto" / "run" / "config.yml"
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, str(config), str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=os.environ | threads)
+    assert done.returncode == 0, done.stderr
+    first, again = json.loads(done.stdout)
+    for state in (first, again):
+        told = state["told"]
+        print(capture, f"told {told['total_s']:.1f} s, taken {state['taken']:.1f} s", told["seconds"], state["stages"])
+        assert 0.5 < told["total_s"] / state["taken"] < 2
+    assert first["told"]["features_kept"] == first["told"]["evidence_kept"] == 0
+    assert again["told"]["features_kept"] == again["told"]["evidence_kept"] == 9
+    assert 0.5 < first["told"]["host_bytes"] / 2**30 / first["gib"] < 2
+    files = sum(path.stat().st_size for path in tmp_path.rglob("*.safetensors"))
+    written = first["told"]["disk_bytes"] - again["told"]["disk_bytes"]
+    assert 0.5 < written / files < 2

@@ -1,0 +1,62 @@
+"""The arithmetic of a plan: against sums by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from normlift_ns.planning.plan import Facts, Rate, make_plan
+
+FACTS = Facts(
+    device="cpu, 2 threads", views=40, gaussians=1000, dimension=8, regions=10, entries=500, entry_bytes=8,
+    before_s={"start": 1.0, "open": 2.0}, load_s=5.0, features_s=0.5, kept_features_s=0.1, features_kept=0.25,
+    evidence_s=0.2, kept_evidence_s=0.01, evidence_kept=0.5,
+    core_s={"lift": Rate(1.0, 0.001, 2000), "vote": Rate(0.5, 0.002, 1000)},
+    field_bytes=Rate(100, 10, 1000), run_bytes=900, write_bytes_s=1000, view_bytes=50,
+    host_bytes=10_000, device_bytes=None, looked_at=4,
+)  # fmt: skip
+
+
+def test_seconds_are_those_of_the_views_and_gaussians() -> None:
+    plan = make_plan(FACTS)
+    seconds = {stage.name: stage.seconds for stage in plan.stages}
+    assert seconds == pytest.approx({
+        "start": 1, "open": 2, "features": 5 + 30 * 0.5 + 10 * 0.1, "evidence": 20 * 0.2 + 20 * 0.01,
+        "lift": 3, "vote": 2.5, "write": 11,
+    })  # fmt: skip
+    assert plan.seconds == pytest.approx(sum(seconds.values()))
+    assert plan.to_json()["total_s"] == plan.seconds and plan.to_json()["seconds"] == seconds
+    remarks = {stage.name: stage.remark for stage in plan.stages}
+    assert remarks["features"] == "about 10 of 40 views cached" and remarks["start"] == ""
+
+
+def test_devices_share_views_and_gaussians_and_nothing_else() -> None:
+    seconds = {stage.name: stage.seconds for stage in make_plan(FACTS, num_devices=2).stages}
+    assert seconds["features"] == pytest.approx(5 + (30 * 0.5 + 10 * 0.1) / 2)
+    assert seconds["evidence"] == pytest.approx((20 * 0.2 + 20 * 0.01) / 2)
+    assert seconds["lift"] == pytest.approx(2) and seconds["vote"] == pytest.approx(1.5)
+    assert (seconds["start"], seconds["write"]) == (1, 11)
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        make_plan(FACTS, num_devices=0)
+
+
+def test_memory_holds_evidence_and_directions() -> None:
+    held = 3 * 500 * 40 * 8 + 2 * 1000 * 8 * 4
+    table = 10 * 40 * 8 * 4
+    assert make_plan(FACTS).host_bytes == 10_000 + held + 2 * table
+    assert make_plan(FACTS).device_bytes is None
+    on_gpu = make_plan(replace(FACTS, device_bytes=7000), num_devices=2)
+    assert on_gpu.device_bytes == 7000 + held / 2 + 2 * table
+    assert on_gpu.host_bytes == 10_000 + table
+
+
+def test_what_is_cached_costs_no_disk_and_no_network() -> None:
+    new = make_plan(replace(FACTS, features_kept=0.0, evidence_kept=0.0))
+    kept = make_plan(replace(FACTS, features_kept=1.0, evidence_kept=1.0, features_s=None))
+    run = 100 + 10 * 1000 + 900
+    assert kept.disk_bytes == run
+    assert new.disk_bytes == run + 40 * 50 + 500 * 40 * 8 + 1000 * 16 * 40 // 16
+    seconds = {stage.name: stage for stage in kept.stages}
+    assert seconds["features"].seconds == pytest.approx(4.0) and seconds["features"].remark == "cached"
+    assert (kept.features_kept, kept.evidence_kept, new.features_kept) == (40, 40, 0)

@@ -1,0 +1,81 @@
+"""Labels of point clouds: the rule against loops, and the file against what it was."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from normlift_ns import InputError
+from normlift_ns.runs.transfer import nearest_rows, places, read_cloud, write_cloud
+
+
+@given(st.integers(0, 2**16), st.floats(0.01, 2))
+@settings(max_examples=25, deadline=None)
+def test_nearest_rows_are_those_of_loops(seed, most):
+    g = np.random.default_rng(seed)
+    points, means = g.normal(size=(20, 3)), g.normal(size=(15, 3))
+    points[3] = [np.nan, 0, np.inf]
+    found = nearest_rows(points, means, most)
+    for i, point in enumerate(points):
+        distances = [float(np.sqrt(((point - mean) ** 2).sum())) for mean in means]
+        if i == 3:
+            assert not found.near[i]
+            continue
+        assert found.row[i] == int(np.argmin(distances))
+        assert found.near[i] == (min(distances) <= most)
+
+
+def cloud(path: Path, *, text: bool = False, order: str = "<") -> np.ndarray:
+    table = np.zeros(5, [("x", "f8"), ("quality", "i2"), ("y", "f4"), ("z", "f4"), ("red", "u1")])
+    table["x"], table["y"], table["z"], table["quality"], table["red"] = range(5), 2, 3, -7, 250
+    faces = np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))])
+    elements = [PlyElement.describe(table, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, text=text, byte_order="=" if text else order, comments=["made by hand"]).write(str(path))
+    return table
+
+
+@pytest.mark.parametrize("how", [{"text": True}, {"order": "<"}, {"order": ">"}])
+def test_all_else_of_a_cloud_stays(how, tmp_path):
+    table = cloud(tmp_path / "a.ply", **how)
+    read = read_cloud(tmp_path / "a.ply")
+    assert places(read)[2].tolist() == [2, 2, 3]
+    columns = {"relevancy_0": np.arange(5, dtype=np.float32), "class_id": np.arange(5).astype(np.uint32)}
+    write_cloud(tmp_path / "b.ply", read, columns)
+    again = PlyData.read(tmp_path / "b.ply")
+    assert [p.name for p in again["vertex"].properties] == [*(table.dtype.names or ()), *columns]
+    for name in table.dtype.names or ():
+        assert np.array_equal(again["vertex"][name], table[name])
+        assert again["vertex"][name].dtype.str[1:] == table[name].dtype.str[1:]
+    assert again["vertex"]["class_id"].dtype == np.uint32
+    assert np.array_equal(np.stack(again["face"]["vertex_indices"]), [[0, 1, 2], [2, 3, 4]])
+    assert again.comments == ["made by hand"]
+    with pytest.raises(InputError, match="have class_id, relevancy_0 already"):
+        write_cloud(tmp_path / "c.ply", read_cloud(tmp_path / "b.ply"), columns)
+    with pytest.raises(FileExistsError):
+        write_cloud(tmp_path / "b.ply", read, columns)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "cannot be read"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "1 vertices with x"),
+        (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", "truncated"),
+        (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "0 vertices"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+            b"property list uchar int n\nend_header\n1 2 3 1 4\n",
+            "has lists at its vertices",
+        ),
+        (b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n", "cannot be read"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(content, message, tmp_path):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_cloud(tmp_path / "a.ply")
+    with pytest.raises(FileNotFoundError, match="given with --transfer"):
+        read_cloud(tmp_path / "none.ply")

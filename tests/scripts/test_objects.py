@@ -1,0 +1,150 @@
+"""ns-normlift-query --objects, and the catalogue of a run."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from normlift_ns import Camera, InputError, open_run
+from normlift_ns.demo import DemoRoom
+from normlift_ns.objects.catalogue import Similarity, view_shares
+from normlift_ns.objects.tables import columns
+from normlift_ns.raster.rasterize import render
+from normlift_ns.runs.splats import instances_of
+from normlift_ns.scripts import query
+from tests.scripts.conftest import run_entry, said
+
+DOCS = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
+
+
+@pytest.fixture(scope="module")
+def written(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("objects")
+    flags = ("--load-config", lifted, "--text", "red", "yellow", "--objects", "--objects-dir", folder)
+    with pytest.MonkeyPatch.context() as patch:
+        assert run_entry(patch, query.entrypoint, *flags, "--metres-per-unit", 0.5) == 0
+    return folder
+
+
+def test_places_are_those_of_the_capture(written: Path, lifted: Path, room: DemoRoom) -> None:
+    document = json.loads((written / "objects.json").read_text())
+    assert (document["unit"], document["metres_per_unit"], document["texts"]) == ("metre", 0.5, ["red", "yellow"])
+    ball = document["objects"][0]
+    truth = room.scene.means[room.labels == room.names.index("red")].double().numpy()  # the room as it was captured
+    assert (ball["id"], ball["text"], ball["class_id"]) == (1, "red", 1)
+    assert np.allclose(ball["capture"]["centroid"], 0.5 * truth.mean(0), atol=0.03)
+    extent = np.quantile(truth, 0.99, axis=0) - np.quantile(truth, 0.01, axis=0)
+    assert np.allclose(ball["capture"]["extent"], 0.5 * extent, atol=0.06)
+    transform = json.loads(lifted.with_name("dataparser_transforms.json").read_text())
+    there = np.array(ball["capture"]["centroid"]) / 0.5
+    back = transform["scale"] * (np.array(transform["transform"]) @ [*there, 1])
+    assert np.allclose(back, ball["scene"]["centroid"], atol=1e-5)
+    ratio = np.array(ball["scene"]["box"]["size"]) / ball["capture"]["box"]["size"]
+    assert ratio == pytest.approx(np.full(3, transform["scale"] / 0.5))
+
+
+def test_table_boxes_and_document_say_the_same(written: Path) -> None:
+    document = json.loads((written / "objects.json").read_text())
+    with (written / "objects.csv").open(newline="", encoding="utf8") as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == len(document["objects"]) >= 2
+    for row, found in zip(table, document["objects"]):
+        assert (int(row["id"]), row["text"], int(row["gaussians"])) == (found["id"], found["text"], found["gaussians"])
+        assert [row[f"best_view_{i}"] for i in (1, 2, 3)] == found["best_views"]
+        for prefix, place in (("", found["capture"]), ("scene_", found["scene"])):
+            assert [float(row[prefix + axis]) for axis in "xyz"] == place["centroid"]
+            assert [float(row[f"{prefix}box_size_{i}"]) for i in (1, 2, 3)] == place["box"]["size"]
+            axes = [[float(row[f"{prefix}box_axis_{i}_{axis}"]) for axis in "xyz"] for i in (1, 2, 3)]
+            assert axes == place["box"]["axes"]
+    for name, place in (("objects.ply", "capture"), ("objects_scene.ply", "scene")):
+        mesh = PlyData.read(written / name)
+        corners = np.stack([mesh["vertex"][axis] for axis in "xyz"], 1).reshape(-1, 8, 3)
+        faces = np.stack(mesh["face"]["vertex_indices"])
+        assert (len(corners), len(faces)) == (len(table), 6 * len(table))
+        assert mesh["vertex"]["instance_id"].tolist() == [
+            found["id"] for found in document["objects"] for _ in range(8)
+        ]
+        for found, eight in zip(document["objects"], corners):
+            box = found[place]["box"]
+            along = (eight - box["center"]) @ np.array(box["axes"]).T
+            assert np.allclose(np.abs(along), np.array(box["size"]) / 2, atol=1e-4)
+        first = corners[0]
+        for a, b, c, _ in faces[:6]:  # counter-clockwise from outside
+            outwards = np.cross(first[b] - first[a], first[c] - first[b])
+            assert outwards @ (first[a] - first.mean(0)) > 0
+
+
+def share_inside(means: torch.Tensor, camera: Camera) -> float:
+    """Of the points that project into the picture."""
+    x, y, z = (camera.K @ (camera.world_to_camera[:3, :3] @ means.T + camera.world_to_camera[:3, 3:])).unbind()
+    return ((z > 0) & (x >= 0) & (y >= 0) & (x <= z * camera.width) & (y <= z * camera.height)).float().mean().item()
+
+
+def test_views_are_those_that_show_it(lifted: Path) -> None:
+    run = open_run(lifted)
+    answer = run.ask("red", "yellow")
+    found, instances = run.catalogue(answer), instances_of(answer)
+    how = {"rasterize_mode": run.scene.rasterize_mode}
+    shares = view_shares(run.scene.gaussians, run.scene.train.cameras, instances, **how)
+    for number, thing in enumerate(found.objects, 1):
+        mask = (instances.instance_id == number).float()[:, None]
+        drawn = [render(run.scene.gaussians, camera, mask)[0].mean() for camera in run.scene.train.cameras]
+        assert np.allclose(shares[number - 1], drawn, atol=1e-6)
+        shows = [x >= 0.1 * max(drawn) for x in drawn]
+        inside = [share_inside(run.scene.gaussians.means[mask[:, 0] > 0], c) for c in run.scene.train.cameras]
+        enough = 0.95 * max(x for x, y in zip(inside, shows) if y)
+        best = sorted(range(len(drawn)), key=lambda i: (not shows[i], inside[i] < enough, -drawn[i]))[:3]
+        assert thing.best_views == tuple(run.scene.train.names[i] for i in best)
+        assert thing.views == sum(shows)
+    alone = run.catalogue(answer["yellow"])
+    assert {thing.text for thing in alone.objects} == {"yellow"}
+    (unnamed, *_) = run.catalogue(answer["red"].mask).objects
+    assert (unnamed.text, unnamed.gaussians) == ("", found.objects[0].gaussians)
+    assert run.catalogue(answer.mask & False).objects == ()
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="metres_per_unit must be positive"):
+            run.catalogue(answer, metres_per_unit=wrong)
+
+
+def test_similarities_undo_what_they_should() -> None:
+    g = np.random.default_rng(0)
+    rotation = np.linalg.qr(g.normal(size=(3, 3)))[0]
+    transform, scale, points = np.column_stack([rotation, g.normal(size=3)]), 3.0, g.normal(size=(9, 3))
+    there = scale * (points @ rotation.T + transform[:, 3])
+    back = Similarity.undoing(transform, scale)
+    assert np.allclose(back.points(there), points)
+    assert np.allclose(back.times(2.0).points(there), 2 * points)
+    assert np.allclose(back.then(back).points(there), back.points(back.points(there)))
+
+
+def test_the_page_explains_every_column() -> None:
+    explained = set(re.findall(r"`([a-z0-9_]+)`", DOCS))
+    assert set(columns()) <= explained | {f"scene_{name}" for name in explained}
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--objects-dir", "x"), "--objects-dir has no effect without --objects True"),
+        (("--metres-per-unit", "2"), "--metres-per-unit has no effect without --objects True"),
+        (("--objects", "--metres-per-unit", "-2"), "--metres-per-unit must be positive"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_opened(flags, message, lifted, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("normlift_ns.quick.open_quick", None)
+    assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red", *flags) == 1
+    assert message in said(capsys)
+
+
+def test_a_catalogue_is_not_overwritten_unasked(written: Path, lifted: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("normlift_ns.quick.open_quick", None)
+    flags = ("--load-config", lifted, "--text", "red", "--objects", "--objects-dir", written)
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
+    assert "objects.json exists; give another --objects-dir" in said(capsys)

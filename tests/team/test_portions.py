@@ -1,0 +1,120 @@
+"""What a team finds is what one process finds, bit for bit, however many there are."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from normlift_ns import Evidence, RefineConfig, consensus, lift, nearest_neighbors
+from normlift_ns.core import portions
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.lift import Scalars
+from normlift_ns.core.portions import ALONE, Portion, Team
+from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.lifting import vote_together
+from normlift_ns.options import Storage
+from normlift_ns.stages import Stages
+from normlift_ns.team.exchange import Piece, share_evidence
+from tests.scenes import generator, random_evidence, unit_rows
+from tests.team.threads import together
+
+N, VIEWS, REGIONS, D = 150, (3, 0, 2, 4, 1), 10, 24
+
+
+@pytest.fixture(autouse=True)
+def small_grains(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portions, "GRAIN", 16)
+    monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (32, 32))
+
+
+def world(seed: int) -> tuple[torch.Tensor, Evidence, torch.Tensor]:
+    means = torch.randn(N, 3, generator=generator(seed))
+    means[:5] = means[5]  # coincident
+    means[7] = torch.nan
+    return means, random_evidence(N, VIEWS, seed), unit_rows(REGIONS, D, seed, torch.float32)
+
+
+@given(n=st.integers(0, 70), size=st.integers(1, 5), seed=st.integers(0, 9))
+@settings(max_examples=40, deadline=None)
+def test_everybody_is_of_one_portion(n: int, size: int, seed: int) -> None:
+    means = torch.randn(n, 3, generator=generator(seed))
+
+    def work(team: Team) -> tuple[torch.Tensor, torch.Tensor]:
+        portion = Portion.of(team, means)
+        assert torch.equal(portion.gaussians, portion.gaussians.sort().values)
+        assert torch.equal(torch.cat([*portion.blocks(), portion.along[:0]]).sort().values, torch.arange(len(portion)))
+        return portion.gaussians, portion.join(means[portion.gaussians])
+
+    found = together(size, work)
+    assert torch.equal(torch.cat([mine for mine, _ in found]).sort().values, torch.arange(n))
+    assert all(torch.equal(joined, means) for _, joined in found)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_evidence_changes_hands(seed: int, size: int) -> None:
+    means, evidence, _ = world(seed)
+    chunks = [[0], [1, 2], [3], [4]]
+
+    def work(team: Team) -> tuple[Evidence, torch.Tensor]:
+        portion = Portion.of(team, means)
+        pieces = {c: Piece.of(evidence.select_views(chunks[c]), portion) for c in team.chunks(len(chunks))}
+        return share_evidence(pieces, portion, len(chunks)), portion.gaussians
+
+    for found, gaussians in together(size, work):
+        expected = evidence.select_gaussians(gaussians)
+        assert torch.equal(found.region_view, expected.region_view)
+        assert found.num_views == expected.num_views
+        for a, b in ((found.rows, expected.rows), (found.unlabeled, expected.unlabeled)):
+            assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("offsets", "column", "weight"))
+
+
+def lifted_by(team: Team, seed: int, vote: str, storage: Storage) -> SemanticField | None:
+    """All that follows from evidence, by the process of a team."""
+    means, evidence, features = world(seed)
+    portion = Portion.of(team, means)
+    mine = evidence.select_gaussians(portion.gaussians)
+    table = consensus(mine, features, portion=portion, sample=5).features
+    lifted = lift(mine, table)
+    config, stages = RefineConfig(vote=vote, k=9), Stages(lambda stage, done, total: None)  # type: ignore[arg-type]
+    copied, shares = vote_together(means, lifted, lifted.scalars.own_evidence, config, portion, stages)
+    how = {"tolerance": 0.3, "storage": storage, "provenance": shares}
+    return SemanticField.build_together(lifted, means, copied, portion, **how)
+
+
+@pytest.mark.parametrize(
+    ("vote", "storage", "seed"),
+    [("posterior", "low_rank", 0), ("paper", "float16", 1), ("posterior", "evidence", 2), ("posterior", "auto", 3)],
+)
+def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
+    expected = lifted_by(ALONE, seed, vote, storage)
+    assert expected is not None
+    assert float((expected.source != torch.arange(N)).float().mean()) > 0.1
+    for size in (2, 3, 13):  # of which some have nothing
+        found, *others = together(size, lambda team: lifted_by(team, seed, vote, storage))
+        assert others == [None] * (size - 1)
+        assert found is not None
+        assert found.manifest == expected.manifest
+        assert torch.equal(found.source, expected.source)
+        for field in fields(Scalars):
+            assert torch.equal(getattr(found.scalars, field.name), getattr(expected.scalars, field.name)), field.name
+        if isinstance(expected.store, StoredEvidence):
+            assert isinstance(found.store, StoredEvidence)
+            for name in ("offsets", "column", "weight"):
+                a, b = (getattr(x.store.evidence.rows, name) for x in (found, expected))  # type: ignore[union-attr]
+                assert torch.equal(a, b)
+        else:
+            assert torch.equal(found.store.coordinates, expected.store.coordinates)  # type: ignore[union-attr]
+
+
+def test_neighbours_of_some_are_those_of_all() -> None:
+    means, _, _ = world(4)
+    every = nearest_neighbors(means, 9)
+    some = torch.randperm(N, generator=generator(0))[:40]
+    for a, b in zip(nearest_neighbors(means, 9, of=some), every):
+        assert torch.equal(a, b[some])
+    assert len(nearest_neighbors(means, 9, of=some[:0]).index) == 0

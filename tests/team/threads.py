@@ -1,0 +1,81 @@
+"""A team of threads: what processes exchange, without any processes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from normlift_ns.core.portions import Team
+
+T = TypeVar("T")
+
+
+class Threads(Team):
+    """One of some threads."""
+
+    def __init__(self, rank: int, size: int, board: list[Any], barrier: threading.Barrier) -> None:
+        self.rank, self.size, self._board, self._barrier = rank, size, board, barrier
+        self.taken: list[int] = []
+
+    def _all(self, value: Any) -> list[Any]:
+        self._board[self.rank] = value
+        self._barrier.wait(60)
+        found = list(self._board)
+        self._barrier.wait(60)
+        return found
+
+    def join(self, rows: Tensor) -> Tensor:
+        return torch.cat(self._all(rows))
+
+    def deliver(self, rows: Tensor) -> list[Tensor] | None:
+        found = self._all(rows)
+        return found if self.rank == 0 else None
+
+    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        return [given[self.rank] for given in self._all(list(parts))]
+
+    def add(self, values: Tensor) -> Tensor:
+        return torch.stack(self._all(values)).sum(dim=0)
+
+    def spread(self, values: Tensor) -> Tensor:
+        return self._all(values)[0]
+
+    def tell(self, facts: Any) -> Any:
+        return self._all(facts)[0]
+
+    def tell_all(self, facts: Any) -> list[Any]:
+        return self._all(facts)
+
+    @contextmanager
+    def shares(self, folder: Any) -> Iterator[None]:
+        yield
+
+    def chunks(self, count: int) -> Iterator[int]:
+        return iter(range(count)[::-1][self.rank :: self.size])  # in an order that nobody expects
+
+
+def together(size: int, work: Callable[[Team], T]) -> list[T]:
+    """What every thread of a team makes of the same work."""
+    board, barrier, found = [None] * size, threading.Barrier(size), [None] * size
+    errors: list[BaseException] = []
+
+    def run(rank: int) -> None:
+        try:
+            found[rank] = work(Threads(rank, size, board, barrier))  # type: ignore[call-overload]
+        except BaseException as error:
+            errors.append(error)
+            barrier.abort()
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(size)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if len(errors) > 0:
+        raise errors[0]
+    return found  # type: ignore[return-value]

@@ -1,0 +1,126 @@
+"""A lift with more views encodes and rasterizes the new ones only, and finds what a lift of all at once finds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from normlift_ns import Camera, LiftOptions, View, observing
+from normlift_ns.core.field import SemanticField
+from normlift_ns.encoders import RegionFeatures
+from normlift_ns.encoders.colour import ColourEncoder
+from normlift_ns.encoders.regions import Superpixels
+from normlift_ns.lifting import lift_scene
+from tests.scenes import generator, orbit_camera, random_scene
+
+ALL = tuple(range(11))
+OLD = (0, 2, 3, 5, 6, 7, 9, 10)
+"""New views stand before, between and behind old ones, so that no block of the second lift is one of the first."""
+
+
+@dataclass
+class Orbit:
+    """Photographs of noise around a scene."""
+
+    numbers: Sequence[int]
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{number:02}.png" for number in self.numbers]
+
+    @property
+    def cameras(self) -> list[Camera]:
+        return [orbit_camera(0.3 * number) for number in self.numbers]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: int) -> View:
+        camera, number = self.cameras[index], self.numbers[index]
+        shape = (camera.height, camera.width, 3)
+        image = torch.randint(0, 256, shape, generator=generator(number), dtype=torch.uint8)
+        return View(camera, image, None, self.names[index])
+
+
+@pytest.fixture
+def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """How many views were cut, encoded and rasterized."""
+    counts = dict.fromkeys(("cut", "encoded", "rasterized"), 0)
+    cut, encode, rasterize = Superpixels.labels, ColourEncoder.encode_each, observing.rasterize_evidence
+
+    def counting_cut(self: Any, image: Any, name: str) -> Any:
+        counts["cut"] += 1
+        return cut(self, image, name)
+
+    def counting_encode(self: Any, views: Any) -> Iterator[Any]:
+        def each() -> Iterator[Any]:
+            for view in views:
+                counts["encoded"] += 1
+                yield view
+
+        return encode(self, each())
+
+    def counting_rasterize(gaussians: Any, cameras: Any, *arguments: Any, **options: Any) -> Any:
+        counts["rasterized"] += len(cameras)
+        return rasterize(gaussians, cameras, *arguments, **options)
+
+    monkeypatch.setattr(Superpixels, "labels", counting_cut)
+    monkeypatch.setattr(ColourEncoder, "encode_each", counting_encode)
+    monkeypatch.setattr(observing, "rasterize_evidence", counting_rasterize)
+    monkeypatch.setattr(observing, "_LARGEST_CHUNK", 4)
+    return counts
+
+
+def lifted(numbers: Sequence[int], cache: Path, mode: str = "classic") -> SemanticField:
+    scene: Any = SimpleNamespace(
+        gaussians=random_scene(60, dtype=torch.float32), train=Orbit(numbers), held_out=Orbit(()), rasterize_mode=mode,
+        identity={}, name="made",
+    )  # fmt: skip
+    options = LiftOptions(refine=False, storage="evidence", consensus=False)
+    source = RegionFeatures(Superpixels(9), ColourEncoder())
+    return lift_scene(scene, source, options, cache, encoder={}).field
+
+
+def test_more_views_cost_only_the_new_ones(worked: dict[str, int], tmp_path: Path) -> None:
+    lifted(OLD, tmp_path / "cache")
+    assert worked == dict.fromkeys(worked, len(OLD))
+    more = lifted(ALL, tmp_path / "cache")
+    assert worked["rasterized"] == len(ALL)
+    assert worked["cut"] == worked["encoded"] == len(ALL)
+    again = lifted(ALL, tmp_path / "cache")
+    fewer = lifted(OLD[::2], tmp_path / "cache")
+    assert worked == dict.fromkeys(worked, len(ALL))
+    for found, numbers in ((more, ALL), (again, ALL), (fewer, OLD[::2])):
+        expected = lifted(numbers, tmp_path / f"fresh{len(numbers)}").store.evidence
+        evidence = found.store.evidence
+        for part in ("rows", "unlabeled"):
+            ours, theirs = getattr(evidence, part), getattr(expected, part)
+            for name in ("offsets", "column", "weight"):
+                assert torch.equal(getattr(ours, name), getattr(theirs, name))
+        assert torch.equal(evidence.region_view, expected.region_view)
+        assert evidence.nnz > 50 * len(numbers)
+
+
+def test_a_damaged_file_costs_its_views(worked: dict[str, int], tmp_path: Path) -> None:
+    lifted(OLD, tmp_path)
+    first, _ = sorted((tmp_path / "evidence").iterdir())
+    first.write_bytes(first.read_bytes()[:-40] + bytes(40))
+    lifted(ALL, tmp_path)
+    assert worked["rasterized"] == len(ALL) + 4
+    lifted(ALL, tmp_path, "antialiased")
+    assert worked["rasterized"] == 2 * len(ALL) + 4
+    assert worked["encoded"] == len(ALL)
+
+
+def test_a_photograph_given_twice_counts_twice(worked: dict[str, int], tmp_path: Path) -> None:
+    lifted((1, 1, 2), tmp_path / "cache")
+    found = lifted((2, 1, 3, 1), tmp_path / "cache").store.evidence
+    assert worked["rasterized"] == 4
+    expected = lifted((2, 1, 3, 1), tmp_path / "fresh").store.evidence
+    assert torch.equal(found.rows.column, expected.rows.column) and torch.equal(found.rows.weight, expected.rows.weight)

@@ -1,0 +1,146 @@
+"""What another system or an environment without nerfstudio lacks is not needed to load anything."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import normlift_ns
+from normlift_ns import open_scene
+from normlift_ns.scenes.splat import Splat
+from tests.scenes.made import ply_columns, write_ply
+from tests.scripts.conftest import SMALL
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = Path(normlift_ns.__file__).parent
+UNIX_ONLY = ("resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton")
+NEEDS_THEM = ("normlift_ns.kernels", "normlift_ns.raster.triton", "normlift_ns.raster.gsplat")
+"""Loaded on a GPU alone."""
+KNOW_NERFSTUDIO = ("normlift_ns.nerfstudio_plugin", "normlift_ns.method_configs", "normlift_ns.plugin")
+
+PROGRAM = """
+import sys, signal
+from importlib import import_module
+for name in sys.argv[1].split():
+    sys.modules[name] = None
+for name in ("SIGKILL", "SIGHUP", "SIGALRM", "SIGUSR1"):
+    if hasattr(signal, name):
+        delattr(signal, name)  # Windows has none of them
+failed = []
+for name in sys.argv[2].split():
+    try:
+        import_module(name)
+    except Exception as error:
+        failed.append(f"{name}: {error!r}")
+print("\\n".join(failed))
+"""
+
+
+def modules(but: tuple[str, ...]) -> list[str]:
+    """All modules of the package, but for those below some names."""
+    names = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in PACKAGE.rglob("*.py")]
+    return sorted(name.removesuffix(".__init__") for name in names if not name.startswith(but))
+
+
+def failures(blocked: tuple[str, ...], but: tuple[str, ...]) -> list[str]:
+    """Modules that cannot be imported where some packages are not to be had."""
+    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, " ".join(blocked), " ".join(modules(but))]
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252", "PYTHONPATH": str(PACKAGE.parent)}
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split("\n")[:-1] if done.stdout.strip() else []
+
+
+def short_list() -> list[str]:
+    """Names of the packages that docs/install.md gives to people without nerfstudio."""
+    lines = (ROOT / "docs" / "without_nerfstudio.txt").read_text("utf8").splitlines()
+    return [re.split(r"[<>=!~; ]", line)[0] for line in lines if line and not line.startswith("#")]
+
+
+def test_nothing_of_unix_alone_is_imported_when_modules_load():
+    """Nor nerfstudio outside of its folder, nor Triton outside of what only a GPU loads."""
+    blocked = (*UNIX_ONLY, "nerfstudio", "gsplat")
+    assert failures(blocked, (*NEEDS_THEM, *KNOW_NERFSTUDIO, "normlift_ns.demo.run")) == []
+
+
+def test_the_short_list_is_that_of_the_page_and_of_the_project():
+    page = (ROOT / "docs" / "install.md").read_text("utf8")
+    assert "pip install --no-deps" in page and "-r docs/without_nerfstudio.txt" in page
+    project = (ROOT / "pyproject.toml").read_text("utf8").split("[project.urls]")[0]
+    lines = [
+        line for line in (ROOT / "docs" / "without_nerfstudio.txt").read_text("utf8").splitlines() if "#" not in line
+    ]
+    for line in filter(None, lines):
+        assert f'"{line}"' in project, f"{line} is not what pyproject.toml says"
+    assert not {"nerfstudio", "viser"} & set(short_list())
+
+
+def typed(folder: Path, *words: object) -> str:
+    """What a command prints that must succeed."""
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_a_short_list_of_packages_suffices_without_nerfstudio(trained, tmp_path):
+    """In an environment of its own that holds the list and nothing else, a splat of a PLY file is lifted and asked."""
+    run = (sys.executable, "-m", "uv", "pip", "install", "--quiet", "--python", tmp_path / "v" / "bin" / "python")
+    listed = ROOT / "docs" / "without_nerfstudio.txt"
+    typed(tmp_path, sys.executable, "-m", "venv", "--without-pip", tmp_path / "v")
+    typed(tmp_path, *run, "-r", listed)
+    typed(tmp_path, *run, "--no-deps", ROOT)
+    python = tmp_path / "v" / "bin" / "python"
+    code = "import importlib.util as u; print([n for n in ('nerfstudio', 'viser') if u.find_spec(n)])"
+    assert typed(tmp_path, python, "-c", code).strip() == "[]"
+    write_ply(tmp_path / "scene.ply", ply_columns(Splat(**open_scene(trained).parameters)))
+    room, world = trained.parents[4] / "room", trained.parent / "dataparser_transforms.json"
+    places = ("--load-ply", "scene.ply", "--transforms", room / "transforms.json", "--world-transform", world)
+    lift = python.with_name("ns-normlift")
+    last = typed(tmp_path, lift, *places, *SMALL, "--queries", "red", "--quiet").splitlines()[-1]
+    ask = shlex.split(last)
+    assert ask[0] == "ns-normlift-query"
+    typed(tmp_path, python.with_name(ask[0]), *ask[1:], "--json", "answers.json")
+    assert json.loads((tmp_path / "answers.json").read_text())
+    typed(tmp_path, python.with_name("ns-normlift-export"), *ask[1:3], "--output-dir", "exported")
+
+
+@pytest.mark.parametrize(("version", "fits"), [((3, 9), False), ((3, 10), True), ((3, 12), True), ((3, 13), False)])
+def test_make_refuses_other_versions_of_python(version, fits, tmp_path):
+    """By a stub that says it was of that version."""
+    found = re.search(r"-c '(import sys; v = .*)'\n", (ROOT / "Makefile").read_text("utf8"))
+    assert found is not None
+    check = found[1].replace("sys.version_info[:2]", repr(version)).replace("$(MAKECMDGOALS)", "demo")
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == fits
+    if not fits:
+        wanted = f"Python 3.10 to 3.12 is needed, this is {version[0]}.{version[1]}; try: make PYTHON=python3.11 demo"
+        assert wanted in done.stderr
+
+
+def test_the_metadata_name_the_versions_of_python_and_torch():
+    project = (ROOT / "pyproject.toml").read_text("utf8")
+    assert 'requires-python = ">=3.10,<3.13"' in project
+    assert '"torch>=2.1"' in project and '"torchvision>=0.16"' in project
+    assert '"setuptools>=77"' in project  # the licence is an SPDX expression
+
+
+@pytest.mark.parametrize(
+    "files", [".github/workflows/*.yml", ".github/ISSUE_TEMPLATE/[!c]*.yml", ".github/ISSUE_TEMPLATE/c*.yml"]
+)
+def test_files_for_github_are_valid(files):
+    kind = "workflows" if "workflows" in files else "issue-config" if "/c" in files else "issue-forms"
+    checker = Path(sys.executable).with_name("check-jsonschema")
+    if not checker.exists():
+        pytest.skip("needs check-jsonschema, which make installs")
+    words = [checker, "--builtin-schema", f"vendor.github-{kind}", *ROOT.glob(files)]
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert len(words) > 3

@@ -1,0 +1,102 @@
+"""The recipes of CONTRIBUTING.md for a rule, an output and a scene source, applied to a copy of the package."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text("utf8")
+PARTS = dict(part.partition(" of your own\n")[::2] for part in re.split(r"^## ", TEXT, flags=re.MULTILINE))
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package with all three."""
+    copy = tmp_path_factory.mktemp("copy")
+    shutil.copytree(ROOT / "normlift_ns", copy / "normlift_ns", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("A rule", "An output", "A scene source"):
+        (recipe,) = re.findall("```diff\n(.*?)```", PARTS[name], re.DOTALL)
+        words = ["git", "apply", "--verbose", "-"]
+        outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(copy.parent)}
+        done = subprocess.run(words, input=recipe, cwd=copy, env=outside, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{name}: {done.stderr}"
+    return copy
+
+
+def python(extended: Path, *words: object, code: int = 0) -> str:
+    paths = os.environ | {"PYTHONPATH": str(extended), "CUDA_VISIBLE_DEVICES": ""}
+    command = [sys.executable, *map(str, words)]
+    done = subprocess.run(command, cwd=extended, env=paths, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+RULE = """
+import sys, numpy as np, normlift_ns as nl
+from pathlib import Path
+from normlift_ns.quick import open_quick
+how = {"rule": "mean", "negatives": ["blue", "yellow"]}
+run = nl.open_run(sys.argv[1])
+ours = run.ask("red", **how).relevancy.numpy()
+text, *negatives = (run.ask(text, rule="cosine").relevancy.numpy() for text in ("red", "blue", "yellow"))
+by_hand = 1 / (1 + np.exp(-10 * (text - sum(negatives) / 2)))
+valid = run.field.valid().numpy()
+np.testing.assert_allclose(ours[valid], by_hand[valid], atol=2e-6)
+np.testing.assert_allclose(open_quick(Path(sys.argv[1])).ask(["red"], **how).relevancy, ours, atol=2e-6)
+assert ours.max() > 0.9 and ours.min() < 0.4, (ours.max(), ours.min())
+"""
+
+
+@pytest.mark.slow
+def test_a_rule(extended: Path, lifted: Path, tmp_path: Path) -> None:
+    python(extended, "-c", RULE, lifted)
+    asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
+    python(extended, "-m", "normlift_ns.scripts.query", *asked, "--json", tmp_path / "a.json")
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
+
+
+@pytest.mark.slow
+def test_an_output(extended: Path, lifted: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    words = ("-m", "normlift_ns.scripts.export", "--load-config", lifted, "--output-dir", tmp_path, "--table", table)
+    python(extended, *words, "--text", "red", "--threshold", "0.9")
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    code = "import sys, normlift_ns as nl; print(nl.open_run(sys.argv[1]).ask('red', threshold=0.9).mask.sum().item())"
+    assert len(rows) == int(python(extended, "-W", "ignore", "-c", code, lifted).split()[-1]) > 20
+    assert all(0 <= float(row["reliability"]) <= 1 for row in rows)
+    other = ("--output-filename", "other.ply")
+    assert f"{table.name} exists" in " ".join(python(extended, *words, *other, "--text", "red", code=1).split())
+
+
+SOURCE = """
+import sys, numpy as np, torch, normlift_ns as nl
+from pathlib import Path
+run, folder = nl.open_run(sys.argv[1]), Path(sys.argv[2])
+np.savez(folder / "scene.npz", **{name: value.numpy() for name, value in run.scene.parameters.items()})
+np.save(folder / "none.npy", np.zeros(3))
+(folder / "none.npy").rename(folder / "none.npz")
+cameras = run.scene.location.folder / "transforms.json"
+options = nl.SplatOptions(transforms=cameras, world_transform=run.folder / "dataparser_transforms.json")
+scene = nl.open_splat(folder / "scene.npz", options)
+assert torch.equal(scene.gaussians.means, run.scene.gaussians.means) and len(scene.train) == len(run.scene.train)
+try:
+    nl.open_splat(folder / "none.npz", options)
+except nl.InputError as error:
+    assert "is no splat" in str(error), error
+else:
+    sys.exit("accepted")
+"""
+
+
+@pytest.mark.slow
+def test_a_scene_source(extended: Path, lifted: Path, tmp_path: Path) -> None:
+    python(extended, "-c", SOURCE, lifted, tmp_path)
