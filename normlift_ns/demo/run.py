@@ -43,9 +43,13 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     config.pipeline.model.num_random = len(room.scene)
     config.set_timestamp()
     config.save_config()
+    config.vis = "none"  # nothing is trained: no log, whose thread would write as long as the process lives
     trainer = config.setup()
-    # The metric would download its weights.
-    with patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()):
+    with (
+        # The metric would download its weights.
+        patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()),
+        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # of the whole process; another training has its own
+    ):
         trainer.setup()
     dataset = trainer.pipeline.datamanager.train_dataparser_outputs
     dataset.save_dataparser_transform(trainer.base_dir / "dataparser_transforms.json")

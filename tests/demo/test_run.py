@@ -53,6 +53,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoRoom, Path]:
 
 
 @pytest.mark.slow
+def test_it_leaves_no_log_that_writes_on(run: tuple[DemoRoom, Path]):
+    """A thread of tensorboard would write into the run's folder as long as the process lives, also when it is gone."""
+    from nerfstudio.utils import writer  # noqa: PLC0415
+
+    assert writer.EVENT_WRITERS == []
+    assert not list(run[1].parent.glob("events.out.*"))
+
+
+@pytest.mark.slow
 def test_run_is_complete(run: tuple[DemoRoom, Path]):
     room, config_path = run
     assert config_path.parts[-4:-2] == ("room", "splatfacto")
