@@ -51,10 +51,10 @@ LIFT = """
 import json, os
 from normlift_ns.scripts import lift
 shown = lift.summary
-def summary(run, before, total, queries):
+def summary(run, before, total):
     with open(os.environ["SECONDS_FILE"], "w") as file:
         json.dump({**before, **run.seconds, "total": total}, file)
-    return shown(run, before, total, queries)
+    return shown(run, before, total)
 lift.summary = summary
 lift.main()
 """

@@ -63,7 +63,7 @@ def core_rates(
     longer = views / (times * evidence.num_views)
     most = min(len(gaussians), _SAMPLE.get(gaussians.means.device.type, _SAMPLE["cpu"]))
     costs = []
-    for count in (most // _SMALLER, most // _SMALLER, most):  # what is loaded at the first use counts for nobody
+    for count in 2 * (most // _SMALLER, most):  # the first two load or compile what these sizes need: not counted
         rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
         rows = rows.to(gaussians.means.device)
         parts = {"rows": evidence.rows.select_rows(rows), "unlabeled": evidence.unlabeled.select_rows(rows)}
@@ -73,7 +73,7 @@ def core_rates(
     counts = {name: value * (longer if name != "neighbors" else 1.0) for name, value in whole.items()}
     counts |= {name: float(len(gaussians)) for name in ("vote", "store")}
     counts["consensus"] *= longer
-    _, small, large = costs
+    small, large = costs[2:]
     rates = {
         name: _rate((small.items[name], seconds), (large.items[name], large.seconds[name]), counts[name])
         for name, seconds in small.seconds.items()
