@@ -1,5 +1,4 @@
-"""Refreshes the tables of docs/accuracy.md, numerics.md, reliability.md, speed_and_error.md and front_ends.md, and the
-plots, from benchmarks/results/*.json.
+"""Refreshes the tables of the pages in docs/ that `PAGES` names, and the plots, from benchmarks/results/*.json.
 
     python -m benchmarks.pages            writes tables and plots
     python -m benchmarks.pages --check    writes nothing; fails and names the tables that are out of date, if any are
@@ -21,7 +20,7 @@ from benchmarks.documents import documents
 from benchmarks.plots import DOCS, plots
 from benchmarks.tables import tables
 
-PAGES = ("accuracy.md", "speed_and_error.md", "numerics.md", "reliability.md", "front_ends.md")
+PAGES = ("accuracy.md", "speed_and_error.md", "numerics.md", "reliability.md", "front_ends.md", "check.md")
 MARKER = re.compile(r"<!-- (?:table: (?P<name>[\w-]+)|end) -->")
 LIKE_A_MARKER = re.compile(r"<!--\s*(table|end)\b", re.IGNORECASE)
 

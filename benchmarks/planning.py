@@ -5,7 +5,8 @@
     python -m benchmarks.planning --quick                          colours, and 8 views
 
 Each front end is planned and lifted twice: from nothing, and with everything cached. Superpixels are told by colours;
-patches by CLIP's ViT-B-16 with random weights, which take as long as trained ones. Nothing is downloaded.
+patches by CLIP's ViT-B-16 with random weights, which take as long as trained ones. Nothing is downloaded. The results
+of the two kinds of machine have a file each.
 """
 
 from __future__ import annotations
@@ -41,13 +42,19 @@ def add_case(report: Report, trained: Path, folder: Path, name: str, *flags: obj
     """A plan and a lift from nothing, and again with everything cached."""
     for state in ("first", "cached"):
         told, taken = planned(trained, folder, name, *flags), lifted(trained, folder, name, *flags)
+        newest = max((folder / name).rglob("manifest.json"), key=lambda path: path.stat().st_mtime)
+        cost = json.loads(newest.read_text())["cost"]
         case = f"{name}.{state}"
         report.add(f"{case}.ratio", told["total"] / taken["total"], "told total over measured total")
         report.add(f"{case}.told_s", told["total"], "s")
         report.add(f"{case}.taken_s", taken["total"], "s")
+        report.add(f"{case}.wall_s", taken["wall"], "s, of the whole process")
         report.add(f"{case}.check_s", told["wall"], "s, of the check itself")
         report.add(f"{case}.told_gib", told["gib"], "GiB")
-        report.add(f"{case}.told_gpu_gib", told["gpu_gib"], "GiB")
+        report.add(f"{case}.taken_gib", cost["memory_gib"], "GiB")
+        if "gpu_memory_gib" in cost:
+            report.add(f"{case}.told_gpu_gib", told["gpu_gib"], "GiB")
+            report.add(f"{case}.taken_gpu_gib", cost["gpu_memory_gib"], "GiB")
         for stage in taken:
             if stage in told and stage not in ("total", "wall"):
                 report.add(f"{case}.{stage}.told_s", told[stage], "s")
@@ -55,7 +62,7 @@ def add_case(report: Report, trained: Path, folder: Path, name: str, *flags: obj
 
 
 def main(runs: dict[str, Path], device: str, quick: bool, output: Path) -> None:
-    report = Report("planning")
+    report = Report(f"planning_{'cpu' if device == 'cpu' else 'gpu'}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         ends: dict[str, tuple[object, ...]] = {"colour": ("--encoder", "colour", "--regions", "superpixel")}

@@ -1,4 +1,4 @@
-"""The tables of docs/accuracy.md, numerics.md, reliability.md and speed_and_error.md, from the results files."""
+"""The tables of the pages that `benchmarks.pages` refreshes, from the results files."""
 
 from __future__ import annotations
 
@@ -50,6 +50,7 @@ def tables(found: Documents) -> dict[str, str]:
         "grid-columns": columns(found["grid"]),
         "segments": segments(found["segments"]),
         "segments-objects": segments_objects(found["segments"]),
+        **{f"plans-{kind}": plans(found[f"planning_{kind}"]) for kind in ("gpu", "cpu")},
     }
 
 
@@ -211,6 +212,20 @@ def growth(h100: Document) -> str:
         label = {"scale": "side of the image", "n": "Gaussians"}.get(what, what)
         rows.append((label, ", ".join(f"{size}: {1e3 * time:.0f}" for size, time in mine)))
     return table(("quantity", "milliseconds"), rows)
+
+
+def plans(document: Document) -> str:
+    """What a plan told of whole lifts, and what they took."""
+    v, rows = document.values, []
+    for case in (key.removesuffix(".ratio") for key in v if key.endswith(".ratio")):
+        capture, front_end, state = case.split(".")
+        seconds = (f"{v[f'{case}.{x}']:.1f} s" for x in ("told_s", "taken_s", "wall_s"))
+        memory = (f"{v[f'{case}.told_{x}']:.1f}, {v[f'{case}.taken_{x}']:.1f} GiB" for x in ("gib", "gpu_gib")
+                  if f"{case}.told_{x}" in v)  # fmt: skip
+        rows.append((f"{capture}, {front_end}, {state}", *seconds, f"{v[f'{case}.ratio']:.2f}", *memory))
+    header = ("", "plan", "lift", "whole process", "plan / lift", "memory: plan, lift")
+    on_gpu = any(key.endswith("gpu_gib") for key in v)
+    return table((*header, "GPU memory: plan, lift") if on_gpu else header, rows)
 
 
 def overhead(document: Document) -> str:

@@ -37,7 +37,7 @@ LOOKED_AT = 4
 _LOADED = 3.0
 """Seconds that kernels take at most to be loaded; longer, they were compiled, which is done once."""
 _ENOUGH = 20.0
-"""Seconds of the first view from which on no other is looked at."""
+"""Seconds of the first view from which on only one other is looked at: how many of them were loading is not known."""
 _LOOKED_UP = 16
 """Views that are looked up in the cache, at most."""
 
@@ -112,6 +112,7 @@ def measure(
         saved_s, _ = timed(lambda: evidence.save(Path(folder) / "again.safetensors"))
         saved = (Path(folder) / "again.safetensors").stat().st_size
     count = len(some.cameras)
+    held = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
     rates, field_bytes = core_rates(gaussians, evidence, torch.cat(some.features), options, len(used), timed)
     entries = evidence.nnz + evidence.unlabeled.weight.numel()
     maps = sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(some.labels, some.features))
@@ -137,7 +138,7 @@ def measure(
         write_bytes_s=saved / max(saved_s, 1e-6),
         view_bytes=maps / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
-        device_bytes=torch.cuda.max_memory_allocated(device) if cuda else None,
+        device_bytes=held,
         looked_at=count,
     )
 
@@ -147,11 +148,12 @@ def _seen(indices: Sequence[int], look: Callable[[Sequence[int]], _Look]) -> tup
     if len(indices) == 0:
         return _Look(Block([], [], [], []), 0.0), 0.0
     first = look(indices[:1])
-    if len(indices) == 1 or first.seconds > _ENOUGH:
+    if len(indices) == 1:
         return first, 0.0
-    rest = look(indices[1:])
-    each = rest.seconds / (len(indices) - 1)
-    return _Look(_joined([first.block, rest.block]), each * len(indices)), max(0.0, first.seconds - each)
+    others = indices[1 : 2 if first.seconds > _ENOUGH else None]
+    rest = look(others)
+    each = rest.seconds / len(others)
+    return _Look(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)
 
 
 def _joined(blocks: Sequence[Block]) -> Block:

@@ -77,7 +77,7 @@ class Facts:
     host_bytes: int
     """The most that this process has held so far."""
     device_bytes: int | None
-    """The most that it has held on the GPU; None: there is none."""
+    """The most that it has held on the GPU until the evidence was there; None: there is none."""
     looked_at: int = 0
     """Views that were looked at for this."""
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
+from normlift_ns.observing import Block
+from normlift_ns.planning.measure import _Look, _seen
 from normlift_ns.planning.plan import Facts, Rate, make_plan
 
 FACTS = Facts(
@@ -60,3 +63,19 @@ def test_what_is_cached_costs_no_disk_and_no_network() -> None:
     seconds = {stage.name: stage for stage in kept.stages}
     assert seconds["features"].seconds == pytest.approx(4.0) and seconds["features"].remark == "cached"
     assert (kept.features_kept, kept.evidence_kept, new.features_kept) == (40, 40, 0)
+
+
+@pytest.mark.parametrize(("first_s", "looked_at"), [(5.0, 4), (60.0, 2)])
+def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, looked_at: int) -> None:
+    """Loading took a minute on a cold disk, and a photograph half a second."""
+    seen: list[int] = []
+
+    def look(indices: Sequence[int]) -> _Look:
+        seconds = sum(0.5 if seen or i > 0 else first_s for i in range(len(indices)))
+        seen.extend(indices)
+        return _Look(Block([], [], [], []), seconds)
+
+    found, load_s = _seen([3, 5, 7, 9], look)
+    assert seen == [3, 5, 7, 9][:looked_at]
+    assert found.seconds == pytest.approx(0.5 * looked_at)
+    assert load_s == pytest.approx(first_s - 0.5)
