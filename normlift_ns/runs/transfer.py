@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +48,8 @@ def nearest_rows(points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, 
     """
     finite = np.asarray(np.isfinite(points).all(axis=1))
     distance, row = (np.asarray(found) for found in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
-    return Nearest(row, finite & (distance <= most))
+    reached = np.isfinite(distance)  # from further away than squares of distances can say, there is no row
+    return Nearest(np.where(reached, row, 0), finite & (distance <= most))
 
 
 def read_cloud(path: Path) -> PlyData:
@@ -74,6 +76,13 @@ def read_cloud(path: Path) -> PlyData:
     if len(lists) > 0:
         raise InputError(f"{path} has lists at its vertices ({', '.join(lists)}); remove them. {expected}")
     return found
+
+
+def check_free(cloud: PlyData, names: Iterable[str]) -> None:
+    """Raises ValueError where vertices of a cloud have properties of these names."""
+    taken = sorted(set(cloud["vertex"].data.dtype.names or ()) & set(names))
+    if len(taken) > 0:
+        raise InputError(f"the vertices of the cloud have {', '.join(taken)} already; remove that from it first")
 
 
 def places(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
@@ -118,10 +127,8 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
         FileExistsError: the file is there, and `overwrite` is False.
         OSError: it cannot be written.
     """
+    check_free(cloud, columns)
     vertex = cloud["vertex"].data
-    taken = sorted(set(vertex.dtype.names or ()) & set(columns))
-    if len(taken) > 0:
-        raise InputError(f"the vertices of the cloud have {', '.join(taken)} already; remove that from it first")
     kinds = [(name, vertex.dtype[name].newbyteorder("<")) for name in vertex.dtype.names or ()]
     table = np.empty(len(vertex), [*kinds, *((name, column.dtype) for name, column in columns.items())])
     for name, _ in kinds:

@@ -70,8 +70,9 @@ class NormLiftCheck(NormLift):
             return rows, None
         wake(device)
         rows.append(findings.of_device(device))
-        source = _tried(rows, "2D features", lambda: make_source(self.source, device))
-        missing = [] if source is None else findings.missing_weights(self.source, device)
+        asked = self.source.looking_for(self.queries)
+        source = _tried(rows, "2D features", lambda: make_source(asked, device))
+        missing = [] if source is None else findings.missing_weights(asked, device)
         rows += [] if source is None else [findings.of_weights(missing)]
         opened = _tried(rows, "capture", lambda: open_capture(self, begun))
         if opened is None:

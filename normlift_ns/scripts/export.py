@@ -86,7 +86,7 @@ class NormLiftExport:
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.objects.instances import tabulate  # noqa: PLC0415
         from normlift_ns.runs.splats import instances_of  # noqa: PLC0415
-        from normlift_ns.runs.transfer import read_cloud  # noqa: PLC0415
+        from normlift_ns.runs.transfer import check_free, read_cloud  # noqa: PLC0415
         from normlift_ns.scripts.answers import beside  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)
@@ -115,6 +115,9 @@ class NormLiftExport:
                 "threshold": question.threshold,
                 "min_reliability": question.min_reliability,
             }
+            if cloud is not None:  # before anything is written
+                texts = range(len(objects["queries"]))
+                check_free(cloud, ("class_id", "instance_id", *(f"relevancy_{i}" for i in texts)))
         rows = run.export(
             target, part, answer=answer, objects=objects, reach=self.reach, min_size=self.min_size,
             overwrite=self.overwrite,

@@ -35,6 +35,7 @@ class Command(Protocol):
     check: bool
     device: str
     num_devices: int
+    queries: tuple[str, ...]
     source: SourceOptions
     lift: LiftOptions
 
@@ -98,8 +99,9 @@ def dry_run(command: Command, begun: float) -> Plan:
     """
     device = choose_device(command.device)
     wake(device)
-    source = make_source(command.source, device)
-    missing = missing_weights(command.source, device)
+    asked = command.source.looking_for(command.queries)
+    source = make_source(asked, device)
+    missing = missing_weights(asked, device)
     if len(missing) > 0:
         raise FileNotFoundError(
             f"A plan looks at a few photographs for real, but weights are not on this machine: {'; '.join(missing)}. "

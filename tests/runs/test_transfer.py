@@ -28,6 +28,12 @@ def test_nearest_rows_are_those_of_loops(seed, most):
         assert found.near[i] == (min(distances) <= most)
 
 
+@pytest.mark.parametrize("far", [1e150, 1e200, 1e300, np.finfo(np.float64).max])
+def test_points_however_far_away_have_no_label(far):
+    found = nearest_rows(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
+    assert found.near.tolist() == [False, True] and set(found.row) <= {0, 1, 2}
+
+
 def cloud(path: Path, *, text: bool = False, order: str = "<") -> np.ndarray:
     table = np.zeros(5, [("x", "f8"), ("quality", "i2"), ("y", "f4"), ("z", "f4"), ("red", "u1")])
     table["x"], table["y"], table["z"], table["quality"], table["red"] = range(5), 2, 3, -7, 250

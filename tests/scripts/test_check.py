@@ -85,6 +85,20 @@ def test_weights_that_would_be_downloaded_are_a_warning_and_no_plan(
     assert "weights are not on this machine" in said(capsys)
 
 
+@pytest.mark.parametrize("texts", [("--queries", "mug"), ("--region-texts", "mug")])
+def test_texts_of_sam3_are_those_of_the_lift(texts, checked, monkeypatch, trained, tmp_path, capsys) -> None:
+    folder = tmp_path / "sam3"
+    folder.mkdir()
+    flags = ("--regions", "sam3", "--sam-model", folder, *texts)
+    code, found = checked(*flags)
+    assert code == 1 and states(found)["weights"] == "ok" and states(found)["plan"] == "error"
+    (told,) = (row["found"] for row in found["findings"] if row["what"] == "plan")
+    assert "--segment-model" in told and "sam-vit" not in told
+    given = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--device", "cpu", *flags)
+    assert run_entry(monkeypatch, lift.entrypoint, *given, "--dry-run", "True") == 1
+    assert "SAM 3 checkpoint" in said(capsys)
+
+
 def test_what_exists_is_not_replaced_unasked(trained: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     file = tmp_path / "check.json"
     file.write_text("mine")

@@ -28,11 +28,15 @@ from normlift_ns.encoders.sam.folders import (
 )
 from normlift_ns.encoders.weights import first_line, probe
 from normlift_ns.errors import InputError
-from normlift_ns.options import DEFAULT_SAM
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 
 REMEDY = (
     f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
     "as sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
+)
+REMEDY_SAM3 = (
+    f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, with "
+    "--sam-model in a lift, with --segment-model in a query; or do without it: another --regions, no --segment"
 )
 _FILES = (WEIGHTS, "pytorch_model.bin")
 _FIRST = "the first SAM, ViT-B, -L or -H"
@@ -80,20 +84,21 @@ def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
         FileNotFoundError: what looks like a path does not exist.
     """
     import_transformers()
+    what, remedy, known = ("SAM", REMEDY, DEFAULT_SAM) if kinds is MASK_KINDS else ("SAM 3", REMEDY_SAM3, DEFAULT_SAM3)
     path = Path(checkpoint)
     if os.path.isfile(path) or os.path.isdir(path):
         folder = folder_of(path)
         if folder is not None and (folder / "config.json").is_file():
-            with told_of(path):
+            with told_of(path, what):
                 kind_of(folder, kinds)
         return
     if os.path.lexists(path):
-        raise InputError(f"SAM checkpoint {checkpoint} is neither a file nor a folder; {REMEDY}")
+        raise InputError(f"{what} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
     if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
-        raise FileNotFoundError(f"SAM checkpoint {checkpoint} does not exist; check the path, or {REMEDY}")
+        raise FileNotFoundError(f"{what} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
     if len(path.parts) != 2:
         raise InputError(
-            f"SAM checkpoint {checkpoint!r} is neither a path nor a name of the hub such as {DEFAULT_SAM}; {REMEDY}"
+            f"{what} checkpoint {checkpoint!r} is neither a path nor a name of the hub such as {known}; {remedy}"
         )
 
 
@@ -150,8 +155,9 @@ def told_of(path: Path, what: str = "SAM") -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:  # the configs of transformers raise types of their own for a wrong value
+        remedy = REMEDY if what == "SAM" else REMEDY_SAM3
         reason = str(error) if isinstance(error, InputError) else first_line(error)
-        raise InputError(f"{what} checkpoint {path} is damaged or not of {what} ({reason}); {REMEDY}") from None
+        raise InputError(f"{what} checkpoint {path} is damaged or not of {what} ({reason}); {remedy}") from None
 
 
 def load_sam(checkpoint: str) -> Any:
@@ -189,9 +195,10 @@ def download(checkpoint: str, kinds: Mapping[str, Kind], more: Sequence[str] = (
         wanted = ["config.json", WEIGHTS, *more] if known else ["config.json"]
         return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
     except Exception as error:  # a download's client raises types of its own, which have nothing in common
+        what, remedy = ("SAM", REMEDY) if kinds is MASK_KINDS else ("SAM 3", REMEDY_SAM3)
         raise FileNotFoundError(
-            f"SAM checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
-            f"({first_line(error)}); go online once, or {REMEDY}"
+            f"{what} checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
+            f"({first_line(error)}); go online once, or {remedy}"
         ) from None
 
 
