@@ -88,6 +88,7 @@ class NormLiftExport:
         from normlift_ns.runs.splats import instances_of  # noqa: PLC0415
         from normlift_ns.runs.transfer import check_free, read_cloud  # noqa: PLC0415
         from normlift_ns.scripts.answers import beside  # noqa: PLC0415
+        from normlift_ns.viewer.pictures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)
         run = open_run(
@@ -97,6 +98,8 @@ class NormLiftExport:
             text_vectors=self.ask.text_vectors,
             text_template=self.ask.text_template,
         )
+        if self.masks_dir is not None:
+            refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, instead="--masks-dir")
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
         part = None if answer is None or self.part == "scene" else answer.mask
         part = ~part if part is not None and self.part == "rest" else part

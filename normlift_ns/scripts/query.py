@@ -216,7 +216,7 @@ class NormLiftQuery:
             raise InputError(f"{ways[0]} and {ways[1]} are two ways to give texts; leave one of them out")
         for name in ("json", "output_path", "render_dir", "save", "why", "why_dir", "segment", "objects"):
             if ways != ["--text"] and getattr(self, name):
-                raise InputError(f"--{name.replace('_', '-')} stores the answer to --text; leave it out with {ways[0]}")
+                raise InputError(f"--{name.replace('_', '-')} goes with --text only; leave it out with {ways[0]}")
         if len(self.render_views) > 0 and self.render_dir is None:
             raise InputError("--render-views has no effect without --render-dir; give the folder for the pictures")
         if self.why_dir is not None and not self.why:

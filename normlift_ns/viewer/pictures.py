@@ -147,12 +147,17 @@ def write_masks(
         FileExistsError: there is one, and `overwrite` is False.
         OSError: it cannot be written.
     """
-    files = [folder / f"{name}.png" for name in picture_names(list(scene.train.names))]
+    files = mask_files(scene, folder)
     with new_files(*files, overwrite=overwrite) as drafts:
         for camera, draft in zip(scene.train.cameras, drafts):
             shown = view_mask(scene, camera, selected, settings=settings) != rest
             Image.fromarray((shown.to(torch.uint8) * 255).cpu().numpy()).save(draft, "PNG")
     return files
+
+
+def mask_files(scene: Scene, folder: Path) -> list[Path]:
+    """The files of the masks of a scene's training photographs."""
+    return [folder / f"{name}.png" for name in picture_names(list(scene.train.names))]
 
 
 def view_mask(

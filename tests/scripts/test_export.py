@@ -234,6 +234,9 @@ def test_masks_arrays_and_labels_of_a_cloud(
     assert run_entry(monkeypatch, export.entrypoint, *flags[:4], *rest) == 0
     assert np.array_equal(np.array(Image.open(tmp_path / "rest" / "0003.png")), 255 - found)
     assert answer.mask.any()
+    again = ("--masks-dir", tmp_path / "masks", "--output-dir", tmp_path / "again")
+    assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
+    assert "give another --masks-dir, or --overwrite True" in said(capsys)
     again = ("--transfer", tmp_path / "cloud_labels.ply", "--output-dir", tmp_path / "again")
     assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
     assert "have class_id, instance_id, relevancy_0, relevancy_1 already" in said(capsys)

@@ -88,7 +88,9 @@ def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
     path = Path(checkpoint)
     if os.path.isfile(path) or os.path.isdir(path):
         folder = folder_of(path)
-        if folder is not None and (folder / "config.json").is_file():
+        if folder is not None and not (folder / "config.json").is_file():
+            raise InputError(f"{what} checkpoint {path} is a folder without config.json; {remedy}")
+        if folder is not None:
             with told_of(path, what):
                 kind_of(folder, kinds)
         return
