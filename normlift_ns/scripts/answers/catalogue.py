@@ -39,7 +39,7 @@ def show_catalogue(catalogue: Catalogue) -> None:
     """Prints the table of objects, with places in the coordinates of the capture."""
     table = Table("id", "text", title=f"Objects, in {catalogue.unit}s")
     for name in ("Gaussians", "centroid", "box", "extent", "R", "views"):
-        table.add_column(name, justify="right", min_width=len(name))
+        table.add_column(name, justify="right", no_wrap=name in ("Gaussians", "R", "views"))
     table.add_column("best views")
     for found in catalogue.objects:
         place = found.capture

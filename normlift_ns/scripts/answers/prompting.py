@@ -118,11 +118,12 @@ def _bars(spread: Mapping[str, Any] | None, threshold: float) -> str:
 def table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
     """The numbers of every text; its histogram has a bar | at the threshold, and is left out of a narrow table."""
     made = Table(title=f"Selected: {rule}; centroid and extent in scene units")
+    wrapped = ("text", "centroid", "extent")
     for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
-        made.add_column(name, justify="left" if name == "text" else "right", min_width=len(name))
+        made.add_column(name, justify="left" if name == "text" else "right", no_wrap=name not in wrapped)
     if not narrow:
         made.add_column("histogram", no_wrap=True)
-    made.add_column("suggested", justify="right", min_width=len("suggested"))
+    made.add_column("suggested", justify="right", no_wrap=True)
     for row in rows:
         vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
         numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
