@@ -117,10 +117,11 @@ def _bars(spread: Mapping[str, Any] | None, threshold: float) -> str:
 
 def table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
     """The numbers of every text; its histogram has a bar | at the threshold, and is left out of a narrow table."""
-    made = Table(title=f"Selected: {rule}; centroid and extent in scene units")
+    made = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
     wrapped = ("text", "centroid", "extent")
     for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
-        made.add_column(name, justify="left" if name == "text" else "right", no_wrap=name not in wrapped)
+        justify = "left" if name == "text" else "right"
+        made.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
     if not narrow:
         made.add_column("histogram", no_wrap=True)
     made.add_column("suggested", justify="right", no_wrap=True)
