@@ -123,7 +123,7 @@ def _show(rows: list[Finding], plan: Plan | None) -> None:
         table.add_row(plain(row.what), Text(row.state, style=colors[row.state]), plain(row.found), plain(row.advice))
     CONSOLE.print(table)
     if plan is None:
-        say("The seconds of a lift cannot be told before that is mended.")
+        say("Correct the errors above to see how long the lift will take.")
         return
     from normlift_ns.scripts.planned import needs, plan_table  # noqa: PLC0415
 

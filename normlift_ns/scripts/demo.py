@@ -84,8 +84,8 @@ class Demo:
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
         write_text(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
-        viewer = f"ns-viewer --load-config {run.config} --viewer.websocket-host 127.0.0.1"
-        say(f"Pictures are in {pictures}. See it in the viewer: {viewer}")
+        say(f"Pictures are in {pictures}. Look around in the browser with:")
+        say(shlex.join(("ns-normlift-view", "--load-config", str(run.config))))
         return means
 
 
@@ -114,7 +114,7 @@ def iou_per_class(found: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: i
 
 
 def _show(*words: object) -> None:
-    CONSOLE.print("$ " + shlex.join(map(str, words)), style="bold")
+    CONSOLE.print("$ " + shlex.join(map(str, words)), style="bold", soft_wrap=True)
 
 
 if __name__ == "__main__":

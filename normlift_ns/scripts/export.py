@@ -167,7 +167,7 @@ class NormLiftExport:
 
 
 def _table(tables: list[dict[str, Any]]) -> Table:
-    table = Table("text", "object", title="Objects")
+    table = Table("text", "object", title="Objects, in scene units")
     for name in ("Gaussians", "centroid", "size of the box", "mean reliability"):
         table.add_column(name, justify="right")
     for entry in tables:

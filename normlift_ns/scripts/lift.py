@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Group
@@ -34,6 +33,7 @@ from normlift_ns.scripts.early import (
 from normlift_ns.scripts.several import in_team
 from normlift_ns.scripts.shared import (
     CONSOLE,
+    STAGES,
     plain,
     run_command,
     run_process,
@@ -160,8 +160,7 @@ class NormLift:
             return None
         before = {"start": imported - begun, "open": (opened or [imported])[0] - imported}
         if not terminal.now[-1].quiet:
-            width = min(CONSOLE.width, get_terminal_size().columns) if CONSOLE.is_terminal else None
-            CONSOLE.print(summary(run, before, time.perf_counter() - begun), width=width)
+            CONSOLE.print(summary(run, before, time.perf_counter() - begun))
         say(next_command(run.config, self.queries))
         return run
 
@@ -224,12 +223,7 @@ class NormLift:
 @contextmanager
 def progress_bars() -> Iterator[Report]:
     """One bar per stage, with the time that it took so far; a line per stage where nobody watches or a log is kept."""
-    names = {
-        "features": "2D features",
-        "lift": "lift, reliability",
-        "neighbors": "neighbours",
-        "store": "choosing storage",
-    }
+    names = STAGES | {"features": "2D features", "lift": "lift, reliability", "store": "choosing storage"}
     columns = (
         TextColumn("{task.description:>17}", markup=False),
         BarColumn(),
@@ -278,7 +272,7 @@ def summary(run: LiftedRun, before: dict[str, float], total: float) -> Group:
         table.add_row("refined", f"{numbers['refined_share']:.1%} of Gaussians took over a neighbour's feature; {lost}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values())}
-    parts = ", ".join(f"{name} {t:.1f}" for name, t in seconds.items() if round(t, 1) > 0)
+    parts = ", ".join(f"{STAGES.get(name, name)} {t:.1f}" for name, t in seconds.items() if round(t, 1) > 0)
     table.add_row("time", f"{total:.1f} s: {parts}")
     cost = facts["cost"]
     gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""

@@ -22,7 +22,7 @@ from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import cache_folder, run_directory
 from normlift_ns.scenes.match import judge, match_photographs
 from normlift_ns.scenes.opening import SplatScene
-from normlift_ns.scripts.shared import say
+from normlift_ns.scripts.shared import STAGES, say
 
 
 class Command(Protocol):
@@ -121,7 +121,7 @@ def plan_table(plan: Plan) -> Table:
     table.add_column("seconds", justify="right")
     table.add_column("cached")
     for stage in plan.stages:
-        table.add_row(stage.name, f"{stage.seconds:.1f}", stage.remark)
+        table.add_row(STAGES.get(stage.name, stage.name), f"{stage.seconds:.1f}", stage.remark)
     table.add_section()
     table.add_row("total", f"{plan.seconds:.1f}", f"from {plan.looked_at} views that were looked at")
     return table

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import shlex
+import shutil
 import signal
 import sys
 import threading
@@ -30,7 +31,11 @@ from normlift_ns.scripts import terminal
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
 """Results, on standard output. Nothing in a text is markup."""
+if CONSOLE.is_terminal:  # tables fit into a narrower one; pipes and files get the full width
+    CONSOLE.width = min(CONSOLE.width, shutil.get_terminal_size().columns)
 ERRORS = Console(**_PLAIN, stderr=True)
+STAGES = {"neighbors": "neighbours"}
+"""Stages whose names are spelled otherwise in what people read."""
 _TERMINATED = ("Terminated", signal.SIGTERM)
 _CANNOT = "The output of the command cannot be written: {}. Send it to another place."
 _PACKAGE = str(Path(normlift_ns.__file__).parent)

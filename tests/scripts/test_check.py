@@ -69,7 +69,7 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(
     monkeypatch.setattr(findings, "in_view", lambda means, camera: means[:, 0] > 1e9)
     code, found = checked("--check", "False")
     assert code == 1 and states(found)["in view"] == "error" and found["plan"] is None
-    assert "The seconds of a lift cannot be told" in said(capsys)
+    assert "Correct the errors above" in said(capsys)
 
 
 def test_weights_that_would_be_downloaded_are_a_warning_and_no_plan(

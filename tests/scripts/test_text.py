@@ -122,3 +122,14 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     assert run_entry(monkeypatch, export.entrypoint, *exported) == 0
     shown = capsys.readouterr().out
     assert all(visible(text) in shown for text in texts)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_an_answer_fits_into_the_terminal_with_all_its_numbers(width):
+    file = io.StringIO()
+    row = {"text": "tomato red", **NUMBERS, "centroid": [-0.18, 0.25, -0.45], "extent": [0.26, 0.27, 0.1]}
+    Console(file=file, width=width).print(prompting.table([row], "cosine > 0.5", 0.5, narrow=width < 100))
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    assert "…" not in file.getvalue()
+    assert all(number in file.getvalue() for number in ("-0.18", "0.25", "-0.45", "0.26", "0.27", "0.10"))

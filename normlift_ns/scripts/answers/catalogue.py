@@ -37,9 +37,11 @@ def facts(question: Question) -> dict[str, Any]:
 
 def show_catalogue(catalogue: Catalogue) -> None:
     """Prints the table of objects, with places in the coordinates of the capture."""
-    table = Table("id", "text", title=f"Objects, in {catalogue.unit}s")
+    table = Table(title=f"Objects, in {catalogue.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
+    table.add_column("id")
+    table.add_column("text", overflow="fold")
     for name in ("Gaussians", "centroid", "box", "extent", "R", "views"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=name in ("Gaussians", "R", "views"), overflow="fold")
     table.add_column("best views")
     for found in catalogue.objects:
         place = found.capture

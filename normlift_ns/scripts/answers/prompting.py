@@ -97,7 +97,8 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
 
 def show(rows: list[dict[str, Any]], question: Question) -> None:
     """Prints the table of an answer, and what to know of texts that do not stand out."""
-    CONSOLE.print(table(rows, f"{question.rule} > {question.threshold:.4g}", question.threshold))
+    shown = table(rows, f"{question.rule} > {question.threshold:.4g}", question.threshold, narrow=CONSOLE.width < 100)
+    CONSOLE.print(shown)
     for row in rows:
         if row["stands_out"] is False:
             say(f"{row['text']}: probably not in this scene. {_nearest(row)}")
@@ -114,17 +115,20 @@ def _bars(spread: Mapping[str, Any] | None, threshold: float) -> str:
     return "-" if spread is None else bars(spread["counts"], spread["low"], spread["high"], threshold)
 
 
-def table(rows: list[dict[str, Any]], rule: str, threshold: float) -> Table:
-    """The numbers of every text; its histogram has a bar | at the threshold."""
-    made = Table(title=f"Selected: {rule}")
+def table(rows: list[dict[str, Any]], rule: str, threshold: float, *, narrow: bool = False) -> Table:
+    """The numbers of every text; its histogram has a bar | at the threshold, and is left out of a narrow table."""
+    made = Table(title=f"Selected: {rule}; centroid and extent in scene units", padding=(0, 0 if narrow else 1))
+    wrapped = ("text", "centroid", "extent")
     for name in ("text", "Gaussians", "centroid", "extent", "peak", "reliability"):
-        made.add_column(name, justify="left" if name == "text" else "right")
-    made.add_column("histogram", no_wrap=True)
-    made.add_column("suggested", justify="right")
+        justify = "left" if name == "text" else "right"
+        made.add_column(name, justify=justify, no_wrap=name not in wrapped, overflow="fold")
+    if not narrow:
+        made.add_column("histogram", no_wrap=True)
+    made.add_column("suggested", justify="right", no_wrap=True)
     for row in rows:
         vectors = (" ".join(f"{x:.2f}" for x in row[name]) if row[name] else "-" for name in ("centroid", "extent"))
         numbers = (f"{row[name]:.3f}" if row[name] is not None else "-" for name in ("peak", "mean_reliability"))
         suggested = "-" if row["suggested_threshold"] is None else f"{row['suggested_threshold']:.3f}"
-        line = plain(_bars(row["histogram"], threshold))
-        made.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers, line, suggested)
+        line = () if narrow else (plain(_bars(row["histogram"], threshold)),)
+        made.add_row(plain(row["text"]), f"{row['fraction']:.2%}", *vectors, *numbers, *line, suggested)
     return made
