@@ -11,7 +11,7 @@ BESIDE := -n $(WORKERS) --dist loadfile
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 12) else f"Python 3.10 to 3.12 is needed, this is {v[0]}.{v[1]}; try: make PYTHON=python3.11 $(MAKECMDGOALS)")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet "uv>=0.5"
-	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv pip install --quiet -e ".[dev]"
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv pip install --quiet --compile-bytecode -e ".[dev]"
 	touch $@
 
 style: .venv/installed

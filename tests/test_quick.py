@@ -194,8 +194,8 @@ def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, c
         ((), "no text given"),
         (("--text", "a", "--stdin"), "--text and --stdin are two ways to give texts"),
         (("--stdin", "--interactive", "True"), "--stdin and --interactive are two ways"),
-        (("--stdin", "--json", "a.json"), "--json stores the answer to --text; leave it out with --stdin"),
-        (("--interactive", "--save"), "--save stores the answer to --text; leave it out with --interactive"),
+        (("--stdin", "--json", "a.json"), "--json goes with --text only; leave it out with --stdin"),
+        (("--interactive", "--save"), "--save goes with --text only; leave it out with --interactive"),
         (("--interactive",), "--interactive needs a terminal"),
     ],
 )

@@ -114,8 +114,8 @@ def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
     image = number[:, :, ::1]
     return [
         (lists.assign, (table, table, numbers, table, whole, whole, whole, number, whole)),
+        (kernels.draw, (*listed, table, image, table, whole, limits, whole)),
         (kernels.count_labels, (labels, whole)),
         (kernels.fill, (*listed, wholes, labels, whole, whole, limits, wholes, wholes, slots, whole)),
         (kernels.merge, (wholes, wholes, slots, whole, whole)),
-        (kernels.draw, (*listed, table, image, table, whole, limits, whole)),
     ]

@@ -68,7 +68,7 @@ def add_photographs(scene: _Scene, cameras: Path, images: Path | None = None) ->
     options = (
         SplatOptions(transforms=path, images=images) if of_transforms else SplatOptions(colmap=path, images=images)
     )
-    found = read_camera_file(options)
+    found = read_camera_file(options, f"take them out of {path}")
     known = _known(scene)
     new = [frame for frame in found.frames if _key(frame.name) not in known]
     if len(new) == 0:

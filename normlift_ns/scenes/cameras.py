@@ -29,9 +29,11 @@ class Cameras(NamedTuple):
     """By --world-transform."""
 
 
-def read_camera_file(options: SplatOptions) -> Cameras:
+def read_camera_file(options: SplatOptions, advice: str = "say where the photographs are with --images") -> Cameras:
     """The cameras that the options name, with photographs that exist.
 
+    Args:
+        advice: what to do about missing photographs.
     Raises:
         FileNotFoundError: a file, folder, photograph or mask is missing.
         ValueError: none or two files of cameras, or one that cannot be read.
@@ -46,22 +48,22 @@ def read_camera_file(options: SplatOptions) -> Cameras:
     for name, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and not folder.is_dir():
             raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give the folder of the files.")
-    cameras = _colmap(options, options.colmap) if options.colmap is not None else _transforms(options)
+    cameras = _transforms(options, advice) if options.colmap is None else _colmap(options, options.colmap, advice)
     check_frames(cameras.frames, cameras.source)
     return cameras._replace(frames=[sized(frame, cameras.source) for frame in cameras.frames])
 
 
-def _transforms(options: SplatOptions) -> Cameras:
+def _transforms(options: SplatOptions, advice: str) -> Cameras:
     path = Path(options.transforms or "").absolute()
     path = path / "transforms.json" if path.is_dir() else path
-    found = read_transforms(path, options.images, options.masks)
+    found = read_transforms(path, options.images, options.masks, advice=advice)
     world = options.world_transform
     to_splat = None if world is None else read_world_transform(world, found.applied, found.applied_scale)
     base = path.parent if options.images is None else options.images.absolute().parent
     return Cameras(found.frames, found.held_out, path, path.parent, base, to_splat)
 
 
-def _colmap(options: SplatOptions, folder: Path) -> Cameras:
+def _colmap(options: SplatOptions, folder: Path, advice: str) -> Cameras:
     folder = folder.absolute()
     model = model_folder(folder)
     cameras, images = read_model(model)
@@ -69,11 +71,9 @@ def _colmap(options: SplatOptions, folder: Path) -> Cameras:
     intrinsics = {number: intrinsics_of(camera, model) for number, camera in cameras.items()}
     place = options.images or folder / "images"
     if not place.is_dir():
-        raise FileNotFoundError(f"There is no folder {place} of photographs. Say where they are with --images.")
+        raise FileNotFoundError(f"There is no folder {place} of photographs. Put it there, or {advice}.")
     listed = [image.name for image in registered]
-    files = find_photographs(
-        listed, place.absolute(), model, "say where the photographs are with --images", copies=True
-    )
+    files = find_photographs(listed, place.absolute(), model, advice, copies=True)
     masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
     base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
     frames = [

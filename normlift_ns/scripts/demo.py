@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
+import subprocess
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +28,7 @@ TEXTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGIONS = 700
 """Superpixels of a view: small enough that the green star of a tomato has its own."""
 ASK = AskOptions(threshold="auto")
+_COMPILE = "import torch; from normlift_ns.raster.numba import warm; warm(torch.float32).join()"
 
 
 @dataclass
@@ -49,9 +52,12 @@ class Demo:
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
         from normlift_ns.observing import spread  # noqa: PLC0415
 
+        # Kernels that no cache holds are compiled on another core meanwhile.
+        compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
         room = demo_room(self.num_gaussians)
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
+        compiling.wait()
 
         CONSOLE.rule("Lifting it")
         flags = ("--encoder", "colour", "--region-count", REGIONS)

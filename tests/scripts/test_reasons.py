@@ -39,7 +39,7 @@ def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypa
     ("flags", "message"),
     [
         (("--text", "red", "--why-dir", "x"), "--why-dir has no effect without --why True"),
-        (("--stdin", "--why"), "--why stores the answer to --text; leave it out with --stdin"),
+        (("--stdin", "--why"), "--why goes with --text only; leave it out with --stdin"),
     ],
 )
 def test_flags_that_do_not_fit(flags, message, lifted: Path, monkeypatch, capsys) -> None:

@@ -13,6 +13,9 @@ from normlift_ns.objects.catalogue import Catalogue
 from normlift_ns.question import Question
 from normlift_ns.scripts.shared import CONSOLE, plain, say
 
+_SHOWN = 40
+"""Objects in the table, at most."""
+
 
 def find_catalogue(config: Path, data: Path | None, question: Question, metres_per_unit: float | None) -> Catalogue:
     """The objects of the answer to a question, of the run opened whole: only its scene knows cameras.
@@ -36,19 +39,22 @@ def facts(question: Question) -> dict[str, Any]:
 
 
 def show_catalogue(catalogue: Catalogue) -> None:
-    """Prints the table of objects, with places in the coordinates of the capture."""
+    """Prints the table of objects, the largest of many, with places in the coordinates of the capture."""
     table = Table(title=f"Objects, in {catalogue.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
     table.add_column("id")
     table.add_column("text", overflow="fold")
     for name in ("Gaussians", "centroid", "box", "extent", "R", "views"):
         table.add_column(name, justify="right", no_wrap=name in ("Gaussians", "R", "views"), overflow="fold")
     table.add_column("best views")
-    for found in catalogue.objects:
+    largest = sorted(catalogue.objects, key=lambda found: -found.gaussians)[:_SHOWN]
+    for found in sorted(largest, key=lambda found: found.id):
         place = found.capture
         vectors = (" ".join(f"{x:.3g}" for x in row) for row in (place.centroid, place.box.size, place.extent))
         numbers = (f"{found.gaussians:,}", *vectors, f"{found.reliability:.3f}", str(found.views))
         best = plain(" ".join(Path(name).stem for name in found.best_views))
         table.add_row(str(found.id), plain(found.text), *numbers, best)
     CONSOLE.print(table)
+    if len(catalogue.objects) > _SHOWN:
+        say(f"{len(catalogue.objects) - _SHOWN:,} smaller objects are not shown; --objects-dir FOLDER writes all.")
     if catalogue.in_smaller_parts > 0:
         say(f"{catalogue.in_smaller_parts:,} selected Gaussians are in parts too small to be listed.")
