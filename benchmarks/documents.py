@@ -59,8 +59,7 @@ Documents = Mapping[str, Document]
 def read(path: Path) -> Document:
     """The document of one results file; one without metrics where there is no file."""
     if not path.exists():
-        name = path.stem.removesuffix("_gpu").removesuffix("_cpu")
-        return Document(f"python -m benchmarks.{name}", "no machine so far", ())
+        return Document(f"python -m benchmarks.{path.stem.removesuffix('_gpu')}", "no machine so far", ())
     content = json.loads(path.read_text())
     rows = ({**row, "value": nan if row["value"] is None else row["value"]} for row in content["metrics"])
     return Document(content["command"], content["hardware"], tuple(Metric(**row) for row in rows))
@@ -70,7 +69,7 @@ def documents() -> Documents:
     """All results files that the pages speak of, by their names."""
     names = (
         "cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu",
-        "overhead", "grid", "segments", "planning_gpu", "planning_cpu",
+        "overhead", "grid", "segments", "planning_gpu",
     )  # fmt: skip
     return {name: read(RESULTS / f"{name}.json") for name in names}
 

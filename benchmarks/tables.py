@@ -50,7 +50,7 @@ def tables(found: Documents) -> dict[str, str]:
         "grid-columns": columns(found["grid"]),
         "segments": segments(found["segments"]),
         "segments-objects": segments_objects(found["segments"]),
-        **{f"plans-{kind}": plans(found[f"planning_{kind}"]) for kind in ("gpu", "cpu")},
+        "plans": plans(found["planning_gpu"]),
     }
 
 

@@ -91,9 +91,9 @@ def test_texts_of_sam3_are_those_of_the_lift(texts, checked, monkeypatch, traine
     folder.mkdir()
     flags = ("--regions", "sam3", "--sam-model", folder, *texts)
     code, found = checked(*flags)
-    assert code == 1 and states(found)["weights"] == "ok" and states(found)["plan"] == "error"
-    (told,) = (row["found"] for row in found["findings"] if row["what"] == "plan")
-    assert "--segment-model" in told and "sam-vit" not in told
+    assert code == 1 and states(found)["2D features"] == "error" and "weights" not in states(found)
+    (told,) = (row["found"] for row in found["findings"] if row["what"] == "2D features")
+    assert "without config.json" in told and "--segment-model" in told and "sam-vit" not in told
     given = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--device", "cpu", *flags)
     assert run_entry(monkeypatch, lift.entrypoint, *given, "--dry-run", "True") == 1
     assert "SAM 3 checkpoint" in said(capsys)
