@@ -105,7 +105,7 @@ def warm(*dtypes: torch.dtype) -> Thread:
 
 
 def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
-    """Every kernel that is called from here, with the types of its arguments."""
+    """Every kernel that is called from here, with the types of its arguments; those that draw pictures first."""
     number = numba.float64 if dtype == torch.float64 else numba.float32
     whole, wholes, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
     labels, members, limits = numba.int32[:, ::1], numba.int32[::1], numba.types.UniTuple(number, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from normlift_ns.objects.tables import columns
 from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.splats import instances_of
 from normlift_ns.scripts import query
+from normlift_ns.scripts.answers.catalogue import show_catalogue
 from tests.scripts.conftest import run_entry, said
 
 DOCS = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
@@ -48,6 +50,16 @@ def test_places_are_those_of_the_capture(written: Path, lifted: Path, room: Demo
     assert np.allclose(back, ball["scene"]["centroid"], atol=1e-5)
     ratio = np.array(ball["scene"]["box"]["size"]) / ball["capture"]["box"]["size"]
     assert ratio == pytest.approx(np.full(3, transform["scale"] / 0.5))
+
+
+def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None:
+    run = open_run(lifted)
+    few = run.catalogue(run.ask("red"))
+    many = tuple(replace(few.objects[0], id=i, gaussians=1000 + i) for i in range(1, 43))
+    show_catalogue(replace(few, objects=many))
+    shown = said(capsys)
+    assert "1,042" in shown and "1,003" in shown and "1,002" not in shown
+    assert "2 smaller objects are not shown; --objects-dir FOLDER writes all." in shown
 
 
 def test_table_boxes_and_document_say_the_same(written: Path) -> None:

@@ -38,6 +38,7 @@ REMEDY_SAM3 = (
     f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, with "
     "--sam-model in a lift, with --segment-model in a query; or do without it: another --regions, no --segment"
 )
+_REMEDIES = {"SAM": REMEDY, "SAM 3": REMEDY_SAM3}
 _FILES = (WEIGHTS, "pytorch_model.bin")
 _FIRST = "the first SAM, ViT-B, -L or -H"
 _AS_FOLDER = ", or for SAM 2 and HQ-SAM a folder as transformers writes it"
@@ -84,7 +85,8 @@ def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
         FileNotFoundError: what looks like a path does not exist.
     """
     import_transformers()
-    what, remedy, known = ("SAM", REMEDY, DEFAULT_SAM) if kinds is MASK_KINDS else ("SAM 3", REMEDY_SAM3, DEFAULT_SAM3)
+    what, known = _name_of(kinds), DEFAULT_SAM if kinds is MASK_KINDS else DEFAULT_SAM3
+    remedy = _REMEDIES[what]
     path = Path(checkpoint)
     if os.path.isfile(path) or os.path.isdir(path):
         folder = folder_of(path)
@@ -102,6 +104,11 @@ def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
         raise InputError(
             f"{what} checkpoint {checkpoint!r} is neither a path nor a name of the hub such as {known}; {remedy}"
         )
+
+
+def _name_of(kinds: Mapping[str, Kind]) -> str:
+    """What messages call the networks."""
+    return "SAM" if kinds is MASK_KINDS else "SAM 3"
 
 
 def local_sam(checkpoint: str) -> Path | None:
@@ -157,9 +164,10 @@ def told_of(path: Path, what: str = "SAM") -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:  # the configs of transformers raise types of their own for a wrong value
-        remedy = REMEDY if what == "SAM" else REMEDY_SAM3
         reason = str(error) if isinstance(error, InputError) else first_line(error)
-        raise InputError(f"{what} checkpoint {path} is damaged or not of {what} ({reason}); {remedy}") from None
+        raise InputError(
+            f"{what} checkpoint {path} is damaged or not of {what} ({reason}); {_REMEDIES[what]}"
+        ) from None
 
 
 def load_sam(checkpoint: str) -> Any:
@@ -197,10 +205,10 @@ def download(checkpoint: str, kinds: Mapping[str, Kind], more: Sequence[str] = (
         wanted = ["config.json", WEIGHTS, *more] if known else ["config.json"]
         return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
     except Exception as error:  # a download's client raises types of its own, which have nothing in common
-        what, remedy = ("SAM", REMEDY) if kinds is MASK_KINDS else ("SAM 3", REMEDY_SAM3)
+        what = _name_of(kinds)
         raise FileNotFoundError(
             f"{what} checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
-            f"({first_line(error)}); go online once, or {remedy}"
+            f"({first_line(error)}); go online once, or {_REMEDIES[what]}"
         ) from None
 
 
