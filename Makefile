@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Files of tests are shared among so many processes; one after the other: make test WORKERS=0
 WORKERS ?= 2
+# Tests start hundreds of processes: what one compiles, the next reads, also where the environment forbids it
+export PYTHONDONTWRITEBYTECODE :=
 BESIDE := -n $(WORKERS) --dist loadfile
 
 .PHONY: check style changed-types quick-tests test test-slow test-viser1 soak torture demo docs bench lint format clean

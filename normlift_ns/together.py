@@ -103,13 +103,6 @@ def lift_run_together(
     for remark in scene.remarks:
         say(f"Warning: {remark}")
     how, stages = lift or LiftOptions(), Stages(report)
-    if check and team.rank == 0:
-        with stages("check") as step:
-            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)), device=device)
-            warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
-            step()
-        if warning is not None:
-            say(f"Warning: {warning}")
     if export is not None:
         _refuse_equal_stems(scene.train.names)
     settings = encoder_settings(options)
@@ -119,6 +112,13 @@ def lift_run_together(
         settings = given_settings(TEXTS_FILE if texts else None)
         if len(queries) > 0:
             made.text(queries)
+    if check and team.rank == 0:
+        with stages("check") as step:
+            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)), device=device)
+            warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
+            step()
+        if warning is not None:
+            say(f"Warning: {warning}")
     cache = cache_folder(run_dir)
     with team.shares(cache):
         result = lift_together(

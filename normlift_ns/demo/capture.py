@@ -37,8 +37,7 @@ def held_out_cameras(count: int = 4, width: int = WIDTH, height: int = HEIGHT) -
 
 def view_image(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w 3"]:
     """The room as the camera sees it, sRGB, on black."""
-    image, _ = render(room.scene, camera, room.colors)
-    return (image.clamp(0, 1) * 255).round().byte()
+    return _image(render(room.scene, camera, room.colors)[0])
 
 
 def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
@@ -46,9 +45,7 @@ def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
 
     The class with the largest sum of compositing weights wins; floaters count for nothing.
     """
-    one_hot = torch.nn.functional.one_hot(room.labels + 1, len(room.names) + 1)[:, 1:].to(room.scene.means.dtype)
-    shares, _ = render(room.scene, camera, one_hot)
-    return torch.where(shares.sum(dim=2) > 0.5, shares.argmax(dim=2) + 1, 0).byte()
+    return _labels(render(room.scene, camera, _one_hot(room))[0])
 
 
 def write_capture(
@@ -61,11 +58,10 @@ def write_capture(
     """
     cameras = [*demo_cameras(views, width, height), *held_out_cameras(held_out, width, height)]
     paths = [f"images/{i:04d}.png" for i in range(len(cameras))]
+    channels = torch.cat([room.colors, _one_hot(room)], dim=1)
     for path, camera in zip(paths, cameras):
-        for file, pixels in (
-            (path, view_image(room, camera)),
-            (f"instance/{Path(path).name}", view_labels(room, camera)),
-        ):
+        color, shares = render(room.scene, camera, channels)[0].tensor_split([3], dim=2)
+        for file, pixels in ((path, _image(color)), (f"instance/{Path(path).name}", _labels(shares))):
             with new_file(folder / file, overwrite=True) as draft:
                 Image.fromarray(pixels.numpy()).save(draft)
     (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
@@ -81,6 +77,19 @@ def write_capture(
     labels = {"labels": {str(i): name for i, name in enumerate(room.names, 1)}, "background": 0}
     for name, content in (("transforms.json", transforms), ("labels.json", labels)):
         write_text(folder / name, json.dumps(content, indent=1), overwrite=True)
+
+
+def _one_hot(room: DemoRoom) -> Float[Tensor, "n classes"]:
+    """Whose class every Gaussian is of; floaters are of none."""
+    return torch.nn.functional.one_hot(room.labels + 1, len(room.names) + 1)[:, 1:].to(room.colors.dtype)
+
+
+def _image(color: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+    return (color.clamp(0, 1) * 255).round().byte()
+
+
+def _labels(shares: Float[Tensor, "h w classes"]) -> UInt8[Tensor, "h w"]:
+    return torch.where(shares.sum(dim=2) > 0.5, shares.argmax(dim=2) + 1, 0).byte()
 
 
 def _look(place: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int) -> Camera:

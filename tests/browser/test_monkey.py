@@ -30,8 +30,8 @@ KILLS = (0.2, 0.4)
 """When the server is killed, as shares of the time; the last one lives on."""
 WARM = 0.65
 """From when on its memory is watched."""
-LOOKS = 4
-"""How often, the last time at the end."""
+LOOKS = 4 if MINUTES > 5 else 2
+"""How often, the last time at the end; a look takes half a minute."""
 ASKED = (
     "import ctypes, faulthandler, gc, signal; faulthandler.register(signal.SIGUSR1); "
     "signal.signal(signal.SIGUSR2, lambda *_: (gc.collect(), ctypes.CDLL(None).malloc_trim(0))); "

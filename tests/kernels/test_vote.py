@@ -130,7 +130,7 @@ def test_winners_are_those_of_float64_up_to_rounding(
 
 
 def test_the_first_halves_decide_what_is_clear_and_nothing_else():
-    means, directions, reliability = close_calls(5, 60, 70, 0.3)
+    means, directions, reliability = close_calls(5, 40, 40, 0.3)
     config = RefineConfig(k=12)
     neighbors = nearest_neighbors(means, 12)
     known = any_reliable(neighbors.index.to(DEVICE), reliability.to(DEVICE)).cpu()
@@ -141,10 +141,10 @@ def test_the_first_halves_decide_what_is_clear_and_nothing_else():
     assert steep.sum() < 0.2 * sure.sum()
     # the same twice: neither wins by rounding
     twice = torch.cat([directions, directions]), torch.cat([reliability, reliability])
-    neighbors = nearest_neighbors(torch.cat([means, means]), 25)
-    assert not bool((cast(neighbors, *twice, RefineConfig(k=25), precision="first") >= 0).any())
+    neighbors = nearest_neighbors(torch.cat([means, means]), 13)
+    assert not bool((cast(neighbors, *twice, RefineConfig(k=13), precision="first") >= 0).any())
     # rows that are not unit vectors are outside of the bound
-    assert not bool((cast(neighbors, 1.2 * twice[0], twice[1], RefineConfig(k=25), precision="first") >= 0).any())
+    assert not bool((cast(neighbors, 1.2 * twice[0], twice[1], RefineConfig(k=13), precision="first") >= 0).any())
 
 
 @pytest.mark.parametrize("kind", ["paper", "posterior"])

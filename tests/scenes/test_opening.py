@@ -26,7 +26,10 @@ from tests.scenes.made import in_file_world, ply_columns, rows_of, write_colmap,
 
 ROUNDED = 5e-4
 """Where the Gaussians themselves were moved to another world in float32, single pixels cross thresholds: 9e-5 seen."""
-OPTIONS = {"source": SourceOptions(encoder="colour", regions="grid"), "lift": LiftOptions(storage="evidence")}
+OPTIONS = {
+    "source": SourceOptions(encoder="colour", regions="grid"),
+    "lift": LiftOptions(storage="evidence", max_views=4),
+}
 
 
 @pytest.fixture(scope="module")

@@ -186,7 +186,17 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
             raise KeyboardInterrupt
         return rasterize(*args, **kwargs)
 
-    flags = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--timestamp", "t")
+    flags = (
+        "--load-config",
+        trained,
+        *SMALL,
+        "--refine",
+        "False",
+        "--output-dir",
+        tmp_path / "out",
+        "--timestamp",
+        "t",
+    )
     monkeypatch.setattr(seen, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
     assert "rerun the command to resume" in capsys.readouterr().err
@@ -244,7 +254,8 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     for path in (trained.parents[4] / "room" / "instance").iterdir():
         classes = np.asarray(Image.open(path)).astype(int)
         np.save(tmp_path / f"{path.stem}.npy", np.stack([classes, (classes > 0).astype(int)]))
-    flags = ("--load-config", trained, *SMALL, "--regions-dir", tmp_path, "--output-dir", tmp_path / "out")
+    flags = ("--load-config", trained, *SMALL, "--max-views", "4", "--regions-dir", tmp_path)
+    flags = (*flags, "--output-dir", tmp_path / "out")
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
         monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)

@@ -80,10 +80,10 @@ def test_one_two_and_three_processes_write_the_same_files(flags, trained, tmp_pa
     not TABLETOP.exists(), reason="the trained captures (folder shared beside the repository) are absent"
 )
 def test_the_tabletop_is_the_same(tmp_path):
-    for count in (1, 2, 3):
-        done = lifted(*words(TABLETOP, tmp_path / str(count), count, "--max-views", "8", "--lift-downscale", "2"))
+    for count in (1, 3):
+        done = lifted(*words(TABLETOP, tmp_path / str(count), count, "--max-views", "6", "--lift-downscale", "4"))
         assert done.returncode == 0, done.stderr
-    check_same([tmp_path / str(count) for count in (1, 2, 3)])
+    check_same([tmp_path / str(count) for count in (1, 3)])
 
 
 def children(pid: int) -> list[int]:
