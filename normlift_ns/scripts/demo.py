@@ -7,8 +7,10 @@ import shlex
 import subprocess
 import sys
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,10 +55,12 @@ class Demo:
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
         from normlift_ns.observing import spread  # noqa: PLC0415
 
-        # Kernels that no cache holds are compiled on another core, while this one imports nerfstudio for 10 s or more.
+        # Other processes compile kernels that no cache holds, and make the room, while this one imports nerfstudio.
         compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
-        room = demo_room(self.num_gaussians)
-        import_module("nerfstudio.configs.method_configs")
+        with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+            making = beside.submit(demo_room, self.num_gaussians)
+            import_module("nerfstudio.configs.method_configs")  # takes 10 s or more
+            room = making.result()
         compiling.wait()
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())

@@ -39,7 +39,7 @@ def demo_run(lifted_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def lifted_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo room, lifted with four queries into its folder outputs, as `make demo` leaves it but smaller."""
     folder = tmp_path_factory.mktemp("demo")
-    room = plain_room(6_000)  # software draws twice as many half as fast
+    room = plain_room(12_000)
     write_capture(room, folder / "room", views=12, width=320, height=240)
     config = write_splatfacto_run(room, folder / "room", folder / "outputs")
     NormLift(config, source=SourceOptions(encoder="colour"), queries=TEXTS, timestamp="demo").main()

@@ -54,11 +54,7 @@ class Own:
     """One tab with the viewer of its own in it, used as a person would."""
 
     def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (960, 480)) -> None:
-        # Half the pixels in each direction are drawn in half the time; pictures that are kept are sharp.
-        sharpness = 0.5 if os.environ.get("NORMLIFT_SCREENSHOTS") is None else 1.0
-        self.context = browser.new_context(
-            viewport={"width": size[0], "height": size[1]}, device_scale_factor=sharpness, accept_downloads=True
-        )
+        self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.page: Page = self.context.new_page()
         self.size, self.problems = size, []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))

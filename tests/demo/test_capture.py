@@ -6,7 +6,20 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.demo import DemoRoom, demo_cameras, held_out_cameras, view_image, view_labels, write_capture
+from normlift_ns.demo import (
+    DemoRoom,
+    demo_cameras,
+    demo_room,
+    held_out_cameras,
+    view_image,
+    view_labels,
+    write_capture,
+)
+
+
+@pytest.fixture(scope="module")
+def room() -> DemoRoom:
+    return demo_room(2000)
 
 
 @pytest.fixture(scope="module")

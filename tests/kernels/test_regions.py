@@ -125,6 +125,6 @@ def test_any_shape_of_cells_sums_the_same(monkeypatch):
     scene, cameras = hard_scene(), orbit(1, width=33, height=18)
     labels = [random_labels(cameras[0], 3, seed=0)]
     expected = rasterize_evidence(scene, cameras, labels, num_regions=[3], backend="torch")
-    for cell in ((16, 16), (8, 8), (16, 8)):
+    for cell in ((8, 8), (16, 8)):
         monkeypatch.setattr(triton, "CELL", cell)
         assert_same(kernel_evidence(scene, cameras, labels, [3]), expected, 3)

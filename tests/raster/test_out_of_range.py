@@ -74,7 +74,7 @@ def check_any_parameters(rows):
                 assert int(weights.count_nonzero()) == 0
 
 
-@settings(deadline=None, max_examples=6)
+@settings(deadline=None, max_examples=3)
 @given(rows=st.lists(ROW, min_size=1, max_size=4))
 def test_any_parameters(rows):
     check_any_parameters(rows)
