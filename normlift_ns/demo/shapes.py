@@ -157,7 +157,7 @@ def cover(shape: Distance, points: Array, count: int, rng: np.random.Generator) 
 
 def _nearest(centres: Array, sample: Array) -> NDArray[np.int64]:
     """Index of the nearest centre of every row of the sample."""
-    return np.asarray(KDTree(centres).query(sample, workers=-1)[1])
+    return np.asarray(KDTree(centres).query(sample)[1])
 
 
 def _patch_means(values: Array, patch: NDArray[np.int64], empty: Array) -> Array:

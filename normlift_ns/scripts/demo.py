@@ -7,10 +7,8 @@ import shlex
 import subprocess
 import sys
 import warnings
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,18 +50,16 @@ class Demo:
         """Runs the demo; returns mIoU before and after refinement."""
         CONSOLE.rule("A room made in code")
         warnings.simplefilter("ignore", FutureWarning)  # of packages that others must mend
+        # Kernels that no cache holds are compiled on another core meanwhile.
+        compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
         from normlift_ns.observing import spread  # noqa: PLC0415
 
-        # Other processes compile kernels that no cache holds, and make the room, while this one imports nerfstudio.
-        compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
-        with ProcessPoolExecutor(1, get_context("spawn")) as beside:
-            making = beside.submit(demo_room, self.num_gaussians)
-            import_module("nerfstudio.configs.method_configs")  # takes 10 s or more
-            room = making.result()
-        compiling.wait()
+        room = demo_room(self.num_gaussians)
+        import_module("nerfstudio.configs.method_configs")  # takes 10 s or more
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
+        compiling.wait()
 
         CONSOLE.rule("Lifting it")
         flags = ("--encoder", "colour", "--region-count", REGIONS)
