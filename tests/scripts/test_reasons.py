@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from normlift_ns import open_run
+from normlift_ns.insight.why import ViewVote, Why
 from normlift_ns.scripts import export, query
+from normlift_ns.scripts.answers import reasons
 from tests.scripts.conftest import run_entry, said
 
 
@@ -33,6 +37,20 @@ def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypa
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite") == 0
     assert run_entry(monkeypatch, query.entrypoint, *flags[:-2]) == 1
     assert "exists" in said(capsys)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_reasons_fit_into_the_terminal_with_all_their_numbers(width: int) -> None:
+    votes = tuple(ViewVote(i, 13_320.0, 0.088, 0.994 - i, 0.21, ()) for i in range(2))
+    why = Why(606, 60, 1.0, 1.0, 1.0, 16.6, 0.9, votes)
+    file, names = io.StringIO(), ["images/0012.png", "images/0017.png"]
+    Console(file=file, width=width).print(reasons.table(names, ["tomato red"], [why], narrow=width < 120))
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    text = " ".join(lines)
+    assert "…" not in text
+    assert all(number in text for number in ("8.8%", "0.994", "-0.006", "21%"))
+    assert (width < 120) == ("13,320" not in text)
 
 
 @pytest.mark.parametrize(

@@ -43,16 +43,21 @@ def show_catalogue(catalogue: Catalogue) -> None:
     table = Table(title=f"Objects, in {catalogue.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
     table.add_column("id")
     table.add_column("text", overflow="fold")
-    for name in ("Gaussians", "centroid", "box", "extent", "R", "views"):
-        table.add_column(name, justify="right", no_wrap=name in ("Gaussians", "R", "views"), overflow="fold")
-    table.add_column("best views")
+    tiny = CONSOLE.width < 70
+    vectors = ("centroid", "box", *(() if tiny else ("extent",)))
+    for name in ("Gaussians", *vectors, "R", "views"):
+        width = 8 if name in vectors else None  # a number is not broken in two
+        table.add_column(name, justify="right", no_wrap=name not in vectors, overflow="fold", min_width=width)
+    if not tiny:
+        table.add_column("best views")
     largest = sorted(catalogue.objects, key=lambda found: -found.gaussians)[:_SHOWN]
     for found in sorted(largest, key=lambda found: found.id):
         place = found.capture
-        vectors = (" ".join(f"{x:.3g}" for x in row) for row in (place.centroid, place.box.size, place.extent))
-        numbers = (f"{found.gaussians:,}", *vectors, f"{found.reliability:.3f}", str(found.views))
-        best = plain(" ".join(Path(name).stem for name in found.best_views))
-        table.add_row(str(found.id), plain(found.text), *numbers, best)
+        rows = (place.centroid, place.box.size, place.extent)[: len(vectors)]
+        places = (" ".join(f"{x:.3g}" for x in row) for row in rows)
+        numbers = (f"{found.gaussians:,}", *places, f"{found.reliability:.3f}", str(found.views))
+        best = () if tiny else (plain(" ".join(Path(name).stem for name in found.best_views)),)
+        table.add_row(str(found.id), plain(found.text), *numbers, *best)
     CONSOLE.print(table)
     if len(catalogue.objects) > _SHOWN:
         say(f"{len(catalogue.objects) - _SHOWN:,} smaller objects are not shown; --objects-dir FOLDER writes all.")

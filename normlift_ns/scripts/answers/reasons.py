@@ -78,18 +78,28 @@ def save_pictures(
 
 def show_reasons(run: LiftedRun, texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
     """Prints a table of photographs, and how far they agree in words."""
-    table = Table("text", "", "photograph", title="Why")
-    for name in ("weight in pixels", "share", "agreement", "disagreement", "regions"):
-        table.add_column(name, justify="right")
+    shown = table(run.votes.names, texts, reasons, narrow=CONSOLE.width < 120)
+    if shown.row_count > 0:
+        CONSOLE.print(shown)
+    for text, why in zip(texts, reasons):
+        say(f"{text}: {'nothing is selected, so that nothing has voted for it.' if why is None else why.sentence}")
+
+
+def table(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], *, narrow: bool = False) -> Table:
+    """The photographs of every text; a narrow table has no weights and no numbers of regions."""
+    made = Table(title="Why", padding=(0, 0 if narrow else 1))
+    for name in ("text", "", "photo" if narrow else "photograph"):
+        made.add_column(name, overflow="fold")
+    for name in (*(() if narrow else ("weight in pixels",)), "share", "agreement", "disagreement"):
+        made.add_column(name, justify="right", no_wrap=True)
+    if not narrow:
+        made.add_column("regions", justify="right", no_wrap=True)
     for text, why in zip(texts, reasons):
         first = text
         for kind, votes in ({} if why is None else shown_votes(why)).items():
             for vote in votes:
-                numbers = (f"{vote.weight:,.0f}", f"{vote.share:.1%}", f"{vote.agreement:.3f}")
-                rest = (f"{vote.disagreement:.0%}", str(len(vote.regions)))
-                table.add_row(plain(first), kind, plain(run.votes.names[vote.view]), *numbers, *rest)
+                shares = (f"{vote.share:.1%}", f"{vote.agreement:.3f}", f"{vote.disagreement:.0%}")
+                numbers = shares if narrow else (f"{vote.weight:,.0f}", *shares, str(len(vote.regions)))
+                made.add_row(plain(first), kind, plain(names[vote.view]), *numbers)
                 first = ""
-    if table.row_count > 0:
-        CONSOLE.print(table)
-    for text, why in zip(texts, reasons):
-        say(f"{text}: {'nothing is selected, so that nothing has voted for it.' if why is None else why.sentence}")
+    return made
