@@ -118,5 +118,5 @@ class Own:
 
     def _shot(self) -> np.ndarray:
         box = {"x": 0, "y": 0, "width": self.size[0] - PANEL, "height": self.size[1]}
-        shot = self.page.screenshot(clip=box, animations="disabled", scale="css")  # type: ignore[arg-type]
+        shot = self.page.screenshot(clip=box, animations="disabled")  # type: ignore[arg-type]
         return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))

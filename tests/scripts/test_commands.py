@@ -186,17 +186,8 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
             raise KeyboardInterrupt
         return rasterize(*args, **kwargs)
 
-    flags = (
-        "--load-config",
-        trained,
-        *SMALL,
-        "--refine",
-        "False",
-        "--output-dir",
-        tmp_path / "out",
-        "--timestamp",
-        "t",
-    )
+    small = (*SMALL, "--refine", "False")
+    flags = ("--load-config", trained, *small, "--output-dir", tmp_path / "out", "--timestamp", "t")
     monkeypatch.setattr(seen, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
     assert "rerun the command to resume" in capsys.readouterr().err

@@ -21,6 +21,7 @@ from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.splats import instances_of
 from normlift_ns.scripts import query
 from normlift_ns.scripts.answers.catalogue import show_catalogue
+from normlift_ns.scripts.shared import CONSOLE
 from tests.scripts.conftest import run_entry, said
 
 DOCS = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
@@ -60,6 +61,19 @@ def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None
     shown = said(capsys)
     assert "1,042" in shown and "1,003" in shown and "1,002" not in shown
     assert "2 smaller objects are not shown; --objects-dir FOLDER writes all." in shown
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_objects_fit_into_the_terminal_and_no_number_is_broken(lifted: Path, width: int, monkeypatch, capsys) -> None:
+    run = open_run(lifted)
+    found = run.catalogue(run.ask("red"))
+    monkeypatch.setattr(CONSOLE, "width", width)
+    show_catalogue(found)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    words = " ".join(lines).replace("│", " ").split()
+    place = found.objects[0].capture
+    assert {f"{x:.3g}" for x in (*place.centroid, *place.box.size)} <= set(words)
 
 
 def test_table_boxes_and_document_say_the_same(written: Path) -> None:
