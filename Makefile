@@ -36,7 +36,10 @@ QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metric
 quick-tests: .venv/installed
 	$(BIN)/pytest -q $(BESIDE) -m "not slow" $(QUICK) tests/test_imports.py
 
-test: lint
+# Kernels that no cache holds are compiled on the other core while types are checked
+KERNELS := import torch; from normlift_ns.raster.numba import warm; warm(torch.float32, torch.float64).join()
+test: style
+	@echo $(BIN)/basedpyright; $(BIN)/python -W ignore -c "$(KERNELS)" & $(BIN)/basedpyright; types=$$?; wait; exit $$types
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow"
 
 # A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time

@@ -44,10 +44,10 @@ def trained(room: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lifted(trained: Path) -> Path:
     """config.yml of the lifted run."""
     from normlift_ns.scripts import lift  # noqa: PLC0415
-    from tests.scripts.conftest import SMALL, run_entry  # noqa: PLC0415
+    from tests.scripts.conftest import QUICK, run_entry  # noqa: PLC0415
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        flags = ("--load-config", trained, *SMALL, "--timestamp", "one", "--queries", "red", "yellow")
+        flags = ("--load-config", trained, *QUICK, "--timestamp", "one", "--queries", "red", "yellow")
         assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     return trained.parents[2] / "normlift" / "one" / "config.yml"
 

@@ -294,6 +294,7 @@ def test_cells_of_one_place_stay_together():
     assert Place("demo", "masks", floaters=True) in {Place.of(some[0]) for some in parts_of}
 
 
+@pytest.mark.slow
 def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
     path = tmp_path / "rows.jsonl"
     cells = [

@@ -30,11 +30,9 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     Raises:
         AssertionError: `capture_folder` does not exist (nerfstudio's message).
     """
-    # Importing nerfstudio takes 20 seconds.
-    from nerfstudio.configs.method_configs import method_configs  # noqa: PLC0415
     from nerfstudio.models.splatfacto import RGB2SH  # noqa: PLC0415
 
-    config: Any = copy.deepcopy(method_configs["splatfacto"])
+    config = splatfacto_config()
     config.data = config.pipeline.datamanager.data = capture_folder
     config.output_dir = output_dir
     config.machine.device_type = "cpu"
@@ -70,6 +68,21 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     trainer.optimizers.scheduler_step_all(0)
     trainer.save_checkpoint(0)
     return trainer.base_dir / "config.yml"
+
+
+def splatfacto_config() -> Any:
+    """Method splatfacto of nerfstudio, without importing the list of all its methods, which takes seconds more."""
+    from nerfstudio.models.splatfacto import SplatfactoModelConfig  # noqa: PLC0415
+    from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig  # noqa: PLC0415
+
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    config = copy.deepcopy(normlift_method.config)
+    config.method_name = "splatfacto"
+    config.pipeline = VanillaPipelineConfig(
+        datamanager=config.pipeline.datamanager, model=SplatfactoModelConfig()
+    )
+    return config
 
 
 def to_dataparser_world(scene: GaussianScene, transform: Float[Tensor, "3 4"], scale: float) -> GaussianScene:

@@ -56,7 +56,7 @@ class Demo:
         from normlift_ns.observing import spread  # noqa: PLC0415
 
         room = demo_room(self.num_gaussians)
-        import_module("nerfstudio.configs.method_configs")  # takes 10 s or more
+        import_module("normlift_ns.method_configs.normlift")  # with nerfstudio, which takes 10 s
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
         compiling.wait()

@@ -1,6 +1,6 @@
 """Both viewers before a monkey: nothing breaks, whatever is pressed, and the server's memory does not grow.
 
-NORMLIFT_SOAK: minutes per viewer (2). NORMLIFT_SEED: the seed, which is printed. `make soak` takes 30 minutes and a
+NORMLIFT_SOAK: minutes per viewer (1). NORMLIFT_SEED: the seed, which is printed. `make soak` takes 30 minutes and a
 seed of its own.
 """
 
@@ -22,11 +22,11 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"),
 ]
-MINUTES = float(os.environ.get("NORMLIFT_SOAK", "2"))
+MINUTES = float(os.environ.get("NORMLIFT_SOAK", "1"))
 SEED = os.environ.get("NORMLIFT_SEED", "1")
 MOST_GROWTH = 50.0
 """Megabytes that are not freed, once it is warm."""
-KILLS = (0.2, 0.4)
+KILLS = (0.2, 0.4) if MINUTES > 5 else (0.3,)
 """When the server is killed, as shares of the time; the last one lives on."""
 WARM = 0.65
 """From when on its memory is watched."""

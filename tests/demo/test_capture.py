@@ -9,7 +9,6 @@ from PIL import Image
 from normlift_ns.demo import (
     DemoRoom,
     demo_cameras,
-    demo_room,
     held_out_cameras,
     view_image,
     view_labels,
@@ -18,8 +17,8 @@ from normlift_ns.demo import (
 
 
 @pytest.fixture(scope="module")
-def room() -> DemoRoom:
-    return demo_room(2000)
+def room(small: DemoRoom) -> DemoRoom:
+    return small
 
 
 @pytest.fixture(scope="module")

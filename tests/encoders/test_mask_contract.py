@@ -28,7 +28,7 @@ from tests.encoders.tiny_library import write_tiny
 
 EVERY = replace(LOOSE, box_iou=0.99, suppression=Suppression(iou=1.0, score=-9.0, outer=0.0, inner=2.0))
 NETWORKS = ("sam", "sam2", "sam_hq", "sam3")
-IMAGE, NAME = photograph(60, 90), "a.png"
+IMAGE, NAME = photograph(40, 60), "a.png"
 
 
 class Source(NamedTuple):
@@ -186,12 +186,12 @@ def test_memory_on_a_cpu_is_that_of_a_batch_of_masks(sources, kind, monkeypatch)
     monkeypatch.setitem(rules._CHUNK, "cpu", 2**17)  # of the suppression
     source: Any = make(folder)
     if kind != "sam3":
-        source = replace(source, rules=replace(EVERY, points_per_side=7))
+        source = replace(source, rules=replace(EVERY, points_per_side=5))
         source.network.masks.size = 4
     together = 2 if kind == "sam3" else 4
     _ = source.network
     with Largest() as largest:
         labels = source.labels(image, NAME)
     assert int(labels.max()) >= 0
-    network = 147 * 3 * 32 * 32 if kind != "sam3" else 0  # all logits of a crop, at the resolution of the network
+    network = 75 * 3 * 32 * 32 if kind != "sam3" else 0  # all logits of a crop, at the resolution of the network
     assert largest.most <= max(together * max(image.shape[0] * image.shape[1], 128 * 128), network, 300_000)

@@ -137,7 +137,7 @@ def test_an_empty_scene_and_an_empty_view():
 
 
 def test_many_cells_need_wider_keys():
-    scene = random_scene(6, dtype=torch.float32, size=0.4)
+    scene = random_scene(6, dtype=torch.float32, size=0.15)
     camera = orbit(1, width=3000, height=3000, focal=3000.0)[0]  # 35,344 cells, or twice as many halves
     small = Camera(torch.diag(torch.tensor([1 / 40, 1 / 40, 1]).double()) @ camera.K, camera.world_to_camera, 75, 75)
     _, seen, lists = see(scene, [camera])

@@ -17,13 +17,13 @@ def transposed(rows: SparseRows, columns: int) -> SparseRows:
 
 
 def test_products_are_rows_of_the_square():
-    rows = random_evidence(40, [70, 3, 40], 1, dtype=torch.float32).rows  # rows longer than what is added at a time
+    rows = random_evidence(12, [70, 3, 40], 1, dtype=torch.float32).rows  # rows longer than what is added at a time
     matrix = dense(rows, 113).double()
     turned, rows = transposed(rows, 113).to(DEVICE), rows.to(DEVICE)
     for first, last in ((0, 113), (5, 6), (100, 113)):
         found = overlaps.products(turned, rows, 113, first, last)
         assert torch.allclose(found.cpu().double(), (matrix.T @ matrix)[first:last], rtol=1e-5, atol=1e-6)
-        assert torch.equal(found, overlaps.products(turned, rows, 113, first, last))
+    assert torch.equal(found, overlaps.products(turned, rows, 113, first, last))
 
 
 def test_row_maxima():
@@ -39,7 +39,7 @@ def test_row_maxima():
 def test_consensus_by_kernels_equals_that_of_the_cpu(monkeypatch, block):
     monkeypatch.setattr(module, "CHANCE", -1)  # as if the regions were things
     monkeypatch.setattr(module, "THINGS", 0)
-    evidence = random_evidence(120, [5, 0, 7, 4, 6], 3)
+    evidence = random_evidence(40, [5, 0, 7, 4, 6], 3)
     features = unit_rows(22, 8, 3)
     expected = consensus(evidence, features)
     iou = dense(region_overlaps(evidence.rows, evidence.region_view).iou, 22)

@@ -103,7 +103,7 @@ def close_calls(seed: int, n: int, dimension: int, noise: float) -> tuple[torch.
 def test_winners_are_those_of_float64_up_to_rounding(
     kind, prior, far, seed, k, dimension, noise, gamma, tau, sigma_d, delta, dtype
 ):
-    means, directions, reliability = close_calls(seed, 24, dimension, noise)
+    means, directions, reliability = close_calls(seed, 16, dimension, noise)
     means[:4] *= far
     shape = {"k": k, "tau": tau, "gamma": gamma, "sigma_d": sigma_d}
     directions, config = directions.to(dtype), RefineConfig(vote=kind, prior=prior, delta=delta, **shape)
@@ -130,7 +130,7 @@ def test_winners_are_those_of_float64_up_to_rounding(
 
 
 def test_the_first_halves_decide_what_is_clear_and_nothing_else():
-    means, directions, reliability = close_calls(5, 40, 40, 0.3)
+    means, directions, reliability = close_calls(5, 24, 40, 0.3)
     config = RefineConfig(k=12)
     neighbors = nearest_neighbors(means, 12)
     known = any_reliable(neighbors.index.to(DEVICE), reliability.to(DEVICE)).cpu()
@@ -152,7 +152,7 @@ def test_a_margin_counts_in_the_units_of_supports(kind):
     """The best neighbour of a Gaussian without evidence, some spacings away, wins with Delta a little below its support
     and not with one a little above.
     """
-    means, directions, reliability = close_calls(2, 30, 20, 0.3)
+    means, directions, reliability = close_calls(2, 20, 20, 0.3)
     means[0] = torch.tensor([2.0, 0.5, 0.5])
     directions[0], reliability[0] = 0, 0
     neighbors = nearest_neighbors(means, 9)

@@ -12,6 +12,7 @@ from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins import registry
 
+from normlift_ns.demo.run import splatfacto_config
 from normlift_ns.method_configs import entry
 from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method
 from normlift_ns.method_configs.normlift import normlift_method
@@ -51,6 +52,12 @@ def test_it_trains_as_splatfacto_does() -> None:
     assert ours.viewer.websocket_host == "127.0.0.1"
     assert ours.pipeline.datamanager == theirs.pipeline.datamanager
     assert ours.pipeline.model == NormLiftModelConfig.upgrade(theirs.pipeline.model)  # type: ignore[arg-type]
+
+
+def test_the_demo_is_a_run_of_splatfacto() -> None:
+    ours, theirs = splatfacto_config(), method_configs["splatfacto"]
+    assert ours.viewer.websocket_host == "127.0.0.1"
+    assert replace(ours, viewer=theirs.viewer) == theirs
 
 
 @pytest.mark.slow

@@ -101,7 +101,7 @@ def test_photographs_of_another_scene_are_refused(scene) -> None:
 
 def test_one_wrong_photograph_of_three_is_named(scene) -> None:
     last = len(scene.train) - 1
-    for place in (0, last // 2, last):
+    for place, exchange in ((0, False), (last // 2, True), (last, False)):
         name = scene.train[place].name
         other = scene.train[(place + 1) % len(scene.train)].image
 
@@ -111,11 +111,10 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
         def exchanged(view: View, name: str = name, other: torch.Tensor = other) -> View:
             return view._replace(image=other) if view.name == name else view
 
-        for change in (black, exchanged):
-            match = match_photographs(Changed(scene, change))
-            assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
-            warning = judge(match, own_cameras=True)
-            assert warning is not None and f"dB on {name}, one of three photographs" in warning
+        match = match_photographs(Changed(scene, exchanged if exchange else black))
+        assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
+        warning = judge(match, own_cameras=True)
+        assert warning is not None and f"dB on {name}, one of three photographs" in warning
 
 
 def test_masked_pixels_do_not_count(scene) -> None:

@@ -8,6 +8,8 @@ import pytest
 
 SMALL = ("--encoder", "colour", "--k", "12")
 """Flags that lift the small demo room in a moment."""
+QUICK = (*SMALL, "--check", "False")
+"""The same without comparing the photographs first."""
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:

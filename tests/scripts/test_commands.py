@@ -24,7 +24,7 @@ from normlift_ns.scripts import export, lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from normlift_ns.team import seen
 from tests.encoders.tiny import CLIP, write_clip, write_sam
-from tests.scripts.conftest import SMALL, run_entry, said
+from tests.scripts.conftest import QUICK, run_entry, said
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
@@ -144,7 +144,7 @@ def test_a_damaged_run_is_refused_with_a_message(name, lifted, tmp_path, monkeyp
 
 def test_lifts_without_a_name_at_the_same_second_both_remain(trained, tmp_path, monkeypatch):
     monkeypatch.setattr("normlift_ns.runs.files.datetime", Clock)
-    flags = ("--load-config", trained, *SMALL, "--output-dir", tmp_path, "--max-views", "2", "--refine", "False")
+    flags = ("--load-config", trained, *QUICK, "--output-dir", tmp_path, "--max-views", "2", "--refine", "False")
     for overwrite in ("False", "True"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
     runs = tmp_path / "room" / "normlift"
@@ -167,7 +167,7 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(trained, monkeypatch, caps
 
     monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", never)
     monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", never)
-    flags = ("--load-config", trained, *SMALL, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
+    flags = ("--load-config", trained, *QUICK, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     first, second = (open_run(trained.parents[2] / "normlift" / t / "config.yml").field for t in ("one", "two"))
     assert torch.equal(first.scalars.norm, second.scalars.norm)
@@ -186,7 +186,7 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
             raise KeyboardInterrupt
         return rasterize(*args, **kwargs)
 
-    small = (*SMALL, "--refine", "False")
+    small = (*QUICK, "--refine", "False")
     flags = ("--load-config", trained, *small, "--output-dir", tmp_path / "out", "--timestamp", "t")
     monkeypatch.setattr(seen, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
@@ -233,7 +233,8 @@ def test_label_maps_of_another_size_are_refused_or_resampled(trained, tmp_path, 
     folder.mkdir()
     for path in (trained.parents[4] / "room" / "instance").iterdir():
         Image.open(path).resize((80, 60), Image.Resampling.NEAREST).save(folder / path.name)
-    flags = ("--load-config", trained, *SMALL, "--regions", "files", "--regions-dir", folder, "--timestamp", "maps")
+    flags = ("--load-config", trained, *QUICK, "--regions", "files", "--regions-dir", folder, "--timestamp", "maps")
+    flags = (*flags, "--max-views", "3")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     shown = said(capsys)
     assert "80" in shown
@@ -245,7 +246,7 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     for path in (trained.parents[4] / "room" / "instance").iterdir():
         classes = np.asarray(Image.open(path)).astype(int)
         np.save(tmp_path / f"{path.stem}.npy", np.stack([classes, (classes > 0).astype(int)]))
-    flags = ("--load-config", trained, *SMALL, "--max-views", "4", "--regions-dir", tmp_path)
+    flags = ("--load-config", trained, *QUICK, "--max-views", "4", "--regions-dir", tmp_path)
     flags = (*flags, "--output-dir", tmp_path / "out")
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
@@ -274,6 +275,8 @@ def clip(tmp_path_factory) -> tuple[object, ...]:
         "--max-views",
         "2",
         "--refine",
+        "False",
+        "--check",
         "False",
     )
 
@@ -316,7 +319,7 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
 
 def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
     flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
-    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *SMALL, *flags) == 0
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *QUICK, *flags) == 0
     field = open_run(trained.parents[2] / "normlift" / "less" / "config.yml").field
     assert field.manifest["statistics"]["views"] == 5
     assert 0 < field.manifest["statistics"]["zero_evidence_share"] < 0.5
@@ -412,7 +415,7 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
     flags = (
         *("--load-config", trained, "--features", "langsplat", "--features-dir", tmp_path / "features"),
-        *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t"),
+        *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t", "--check", "False", "--k", "12"),
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     assert "1 of 12 images have no features" in said(capsys)
@@ -428,7 +431,7 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
 
 @pytest.mark.slow
 def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, monkeypatch):
-    flags = ("--load-config", trained, *SMALL, "--timestamp", "double", "--precision", "double")
+    flags = ("--load-config", trained, *QUICK, "--timestamp", "double", "--precision", "double")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     double, single = (open_run(config).field for config in (lifted.parents[1] / "double" / "config.yml", lifted))
     assert double.manifest["options"]["precision"] == "double"
