@@ -79,9 +79,7 @@ def splatfacto_config() -> Any:
 
     config = copy.deepcopy(normlift_method.config)
     config.method_name = "splatfacto"
-    config.pipeline = VanillaPipelineConfig(
-        datamanager=config.pipeline.datamanager, model=SplatfactoModelConfig()
-    )
+    config.pipeline = VanillaPipelineConfig(datamanager=config.pipeline.datamanager, model=SplatfactoModelConfig())
     return config
 
 

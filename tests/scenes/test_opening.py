@@ -13,7 +13,16 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from normlift_ns import LiftOptions, RefineConfig, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
+from normlift_ns import (
+    LiftOptions,
+    RefineConfig,
+    SourceOptions,
+    SplatOptions,
+    lift_run,
+    open_run,
+    open_scene,
+    open_splat,
+)
 from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from normlift_ns.scenes.photographs import PhotographViews
@@ -205,7 +214,9 @@ def test_the_lifted_run_opens_again(native, splat, trained: Path, tmp_path: Path
     run = lift_run(scene, timestamp="t", **OPTIONS)
     assert run.folder == tmp_path / "outputs" / folder.name / "normlift" / "t"
     path.unlink()  # the run holds its own copy
-    expected = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check=False, **OPTIONS).ask("red", "yellow")
+    expected = lift_run(native, output_dir=tmp_path / "native", timestamp="t", check=False, **OPTIONS).ask(
+        "red", "yellow"
+    )
     again = open_run(run.config)
     assert again.scene.train.names == scene.train.names
     assert again.scene.held_out.names == scene.held_out.names

@@ -415,7 +415,8 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
     flags = (
         *("--load-config", trained, "--features", "langsplat", "--features-dir", tmp_path / "features"),
-        *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t", "--check", "False", "--k", "12"),
+        *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t"),
+        *("--check", "False", "--k", "12"),
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     assert "1 of 12 images have no features" in said(capsys)
