@@ -17,13 +17,14 @@ def transposed(rows: SparseRows, columns: int) -> SparseRows:
 
 
 def test_products_are_rows_of_the_square():
-    rows = random_evidence(12, [70, 3, 40], 1, dtype=torch.float32).rows  # rows longer than what is added at a time
-    matrix = dense(rows, 113).double()
-    turned, rows = transposed(rows, 113).to(DEVICE), rows.to(DEVICE)
-    for first, last in ((0, 113), (5, 6), (100, 113)):
-        found = overlaps.products(turned, rows, 113, first, last)
+    rows = random_evidence(12, [130, 3, 40], 1, dtype=torch.float32).rows
+    assert rows.offsets.diff().max() > overlaps._WIDTH  # longer than what is added at a time
+    matrix = dense(rows, 173).double()
+    turned, rows = transposed(rows, 173).to(DEVICE), rows.to(DEVICE)
+    for first, last in ((0, 173), (5, 6), (160, 173)):
+        found = overlaps.products(turned, rows, 173, first, last)
         assert torch.allclose(found.cpu().double(), (matrix.T @ matrix)[first:last], rtol=1e-5, atol=1e-6)
-    assert torch.equal(found, overlaps.products(turned, rows, 113, first, last))
+    assert torch.equal(found, overlaps.products(turned, rows, 173, first, last))
 
 
 def test_row_maxima():
