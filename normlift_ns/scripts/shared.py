@@ -11,7 +11,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
@@ -27,6 +27,7 @@ from normlift_ns.crash import USER, explain
 from normlift_ns.errors import InputError, OutputError, visible
 from normlift_ns.ranges import named_as_flags
 from normlift_ns.scripts import terminal
+from normlift_ns.scripts.mistyped import plain_errors
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
@@ -96,9 +97,8 @@ def _ended(command: type[Command], words: list[str]) -> int:
     try:
         with _terminable(), _plain_warnings(), _named_output(), named_as_flags():
             _run(command, words)
-    except SystemExit as stop:  # tyro's own, 2 for flags that it cannot read; rich's, where nobody reads the output
-        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
-        return USER if code == 2 else code
+    except SystemExit as stop:  # tyro's own, after a help; rich's, where nobody reads the output
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
     except (KeyboardInterrupt, Terminated) as stop:
         word, number = ("Interrupted", signal.SIGINT) if isinstance(stop, KeyboardInterrupt) else _TERMINATED
         say_error(f"{word}. No partial files remain; rerun the command to resume.")
@@ -133,11 +133,14 @@ def read_flags(command: type[_Command], words: Sequence[str], name: str | None =
     Args:
         name: of the command; None: as this process was started.
     Raises:
-        SystemExit: words that it does not know, which tyro has told on standard error; or its help, with code 0.
+        InputError: words that it does not know.
+        SystemExit: its help, with code 0.
     """
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
     words = with_values(words, switches(command))
-    return tyro.cli(flags, prog=name, args=words, description=f"{summary(command)} {terminal.FLAGS}")
+    helping = {"-h", "--help"} & set(words)
+    with nullcontext() if helping else plain_errors(name or sys.argv[0]):
+        return tyro.cli(flags, prog=name, args=words, description=f"{summary(command)} {terminal.FLAGS}")
 
 
 def switches(options: Any) -> set[str]:

@@ -148,12 +148,9 @@ def _read(words: Sequence[str]) -> NormLift:
     """
     try:
         command = read_flags(NormLift, words, name="ns-normlift")
-    except SystemExit as stop:
-        if stop.code in (None, 0):  # the help
-            raise
+    except InputError as error:
         raise InputError(
-            "ns-normlift does not know all of these options, as it says above; correct them, or see ns-normlift --help:"
-            f" {visible(shlex.join(words))}"
+            f"ns-normlift does not know all of these options: {visible(shlex.join(words))}. {error}"
         ) from None
     if command.timestamp is not None or command.overwrite:
         flag = "--overwrite" if command.overwrite else "--timestamp"
