@@ -150,7 +150,7 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     [
         (("--text", "red", "--threshold", "1.5", "--part", "selection"), "no Gaussian is selected"),
         (("--text", "oragne"), "orange"),
-        (("--part", "nothing"), "invalid choice"),
+        (("--part", "nothing"), "--part cannot be 'nothing'"),
     ],
 )
 def test_mistakes_have_a_message(flags, message, lifted, tmp_path, monkeypatch, capsys) -> None:
