@@ -1,10 +1,11 @@
-"""What tyro says in a box of flags that it cannot read, in one line as all other errors."""
+"""Flags that tyro cannot read: its box on standard error becomes one line, like every other error."""
 
 from __future__ import annotations
 
 import io
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
@@ -31,7 +32,7 @@ _WORDS = (
 
 @contextmanager
 def plain_errors(program: str) -> Iterator[None]:
-    """Raises InputError where tyro draws a box on standard error and ends the process.
+    """Raises InputError where tyro draws a box on standard error and ends the process. Warnings are printed afterwards.
 
     Args:
         program: as tyro calls the command; it is named without its folder.
@@ -41,6 +42,7 @@ def plain_errors(program: str) -> Iterator[None]:
     try:
         with redirect_stderr(told):
             yield
+        sys.stderr.write(told.getvalue())
     except SystemExit as stop:
         if stop.code in (None, 0):
             raise

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from normlift_ns.scripts import evaluate, export, lift, query, view
+from normlift_ns.scripts.mistyped import plain_errors
 from tests.scripts.conftest import run_entry
 
 
@@ -48,6 +49,12 @@ def test_in_a_terminal_too() -> None:
     shown = re.sub(r"\x1b\[[\d;]*m", "", b"".join(said).decode())
     assert "--k cannot be 'many'. --k INT: Number of neighbours" in shown
     assert not set("│╭╰") & set(shown)
+
+
+def test_a_warning_meanwhile_is_not_lost(capsys) -> None:
+    with plain_errors("command"):
+        print("k is lowered", file=sys.stderr)
+    assert capsys.readouterr().err == "k is lowered\n"
 
 
 def test_other_errors_and_help_are_as_before(monkeypatch, capsys) -> None:
