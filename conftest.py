@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import sys
@@ -17,6 +18,16 @@ if TYPE_CHECKING:
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # another process tests beside this one; read when torch is imported
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+gc.disable()  # until all is imported, which stays for good: looking through it again and again takes a quarter longer
+
+
+def pytest_collection_finish() -> None:
+    """What was imported is left alone by the collector from here on."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
+
 
 # Imports stand inside the fixtures: the other tests need not wait for them.
 _OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")

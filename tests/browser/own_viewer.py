@@ -10,15 +10,25 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Browser, Locator, Page
+from playwright.sync_api import Browser, Error, Locator, Page, Route
 
 PANEL = 320
 """Width of viser's control panel in pixels."""
+_UNHURRIED = """
+const [soon, never, waiting] = [requestAnimationFrame, cancelAnimationFrame, new Map()];
+window.requestAnimationFrame = (draw) => {
+  const name = setTimeout(() => waiting.set(name, soon((now) => { waiting.delete(name); draw(now); })), 100);
+  return name;
+};
+window.cancelAnimationFrame = (name) => { clearTimeout(name); never(waiting.get(name)); waiting.delete(name); };
+"""
+_SHARPNESS = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*\w+\)")
+"""Where viser's client makes its pictures coarser, step by step, because drawing is slow."""
 _PROGRAM = "from normlift_ns.scripts.view import main; main()"
 
 
@@ -50,12 +60,32 @@ def own_viewer(
     assert "Traceback" not in log.read_text(), log.read_text()[-3000:]
 
 
+def draw_in_software(page: Page, sharpness: float = 0.4) -> None:
+    """Lets a page leave time to the server: it draws ten pictures per second at most, all of the same sharpness.
+
+    Args:
+        sharpness: pixels of the picture per pixel of the page.
+    """
+
+    def coarse(route: Route) -> None:
+        try:
+            answer = route.fetch()
+            route.fulfill(response=answer, body=_SHARPNESS.sub(str(sharpness), answer.text()))
+        except Error:  # the server is away, or the page has gone
+            with suppress(Error):
+                route.abort()
+
+    page.add_init_script(_UNHURRIED)
+    page.route(re.compile(r"/assets/index-.*\.js$"), coarse)
+
+
 class Own:
     """One tab with the viewer of its own in it, used as a person would."""
 
     def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (960, 480)) -> None:
         self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.page: Page = self.context.new_page()
+        draw_in_software(self.page)
         self.size, self.problems = size, []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
-from tests.browser.own_viewer import PANEL, free_port
+from tests.browser.own_viewer import PANEL, draw_in_software, free_port
 
 CHROMIUM = shutil.which("chromium")
 _FLAGS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -89,8 +89,7 @@ class Tab:
     ) -> None:
         self.page: Page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self._size = size
-        ratio = sharpness / 0.2  # the client goes down to a fifth of the device's ratio where drawing is slow
-        self.page.add_init_script(f"Object.defineProperty(window, 'devicePixelRatio', {{get: () => {ratio}}})")
+        draw_in_software(self.page, sharpness)
         self.problems: list[str] = []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")
