@@ -29,6 +29,11 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_unconfigure() -> None:
+    """Python ends as usual; some libraries complain of what is left."""
+    gc.unfreeze()
+
+
 # Imports stand inside the fixtures: the other tests need not wait for them.
 _OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")
 

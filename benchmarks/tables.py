@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.accuracy_report import OTHERS
+from benchmarks.agreement import by_regions
 from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps, table
 from benchmarks.grid_tables import columns, verdicts
 from benchmarks.hard_case import DOUBLE, QUANTITIES
@@ -51,6 +52,7 @@ def tables(found: Documents) -> dict[str, str]:
         "segments": segments(found["segments"]),
         "segments-objects": segments_objects(found["segments"]),
         "plans": plans(found["planning_gpu"]),
+        "agreement": by_regions(found["agreement"]),
     }
 
 

@@ -221,10 +221,12 @@ def _agree(
 ) -> tuple[Float[Tensor, "s d"], dict[str, Any]]:
     """The feature table on which the views agree, and what the manifest says of it."""
     with stages("consensus") as step:
-        power, sample = options.consensus_power, options.consensus_sample
-        found = consensus(evidence, features, level=level, power=power, sample=sample, portion=portion)
+        how = {
+            "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
+        }  # fmt: skip
+        found = consensus(evidence, features, level=level, portion=portion, **how)
         step()
-    facts = {"power": power, "sample": sample, "seed": SEED, "gaussians": found.gaussians, "agreement": found.agreement}
+    facts = {**how, "seed": SEED, "gaussians": found.gaussians, "agreement": found.agreement}
     return found.features, {"consensus": facts}
 
 

@@ -63,6 +63,7 @@ RANGES: dict[str, Range] = {
     "beta": _NOT_NEGATIVE,
     "consensus_power": _NOT_NEGATIVE,
     "consensus_sample": _at_least(1),
+    "consensus_least": _SHARE,
     "tolerance": Range(1e-9, _LARGEST, "positive, at least 1e-09"),
     "load_step": _at_least(0),
     # 2D features

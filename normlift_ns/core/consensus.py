@@ -8,7 +8,7 @@ region s, in pixels without a region too, and sums over the Gaussians that both 
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
     J_st = 1 / (1 / c_st + 1 / c_ts - 1)                         soft intersection over union, symmetric, in 0..1
     B    = sum_sv a_sv max_{t in v} J_st / sum_sv a_sv           what best overlaps come to
-    F'_s = normalise(F_s + b(B) sum_t J_st c_ts ** q F_t)        b: 0 up to B = 0.4, 1 from B = 0.5
+    F'_s = normalise(F_s + b(B) sum_t J_st c_ts ** q F_t)        b: 0 up to B = 0.4, 1 from there plus 0.1
 
 Pixels without a region count because a thing that a view has no mask of would else seem to lie in the masks of its
 neighbours, whose frayed borders reach it. a_sv = sum_j p_js sum_{t in v} p_jt is what of s lies in regions of v.
@@ -43,8 +43,8 @@ LEAST = 0.1
 """Overlaps below this, one-sided or J, count as none."""
 SEEN = 0.5
 """A view sees a Gaussian whose weight in it is at least this share of the median over those that its regions hold."""
-CHANCE, THINGS = 0.4, 0.5
-"""B of regions that overlap by chance, and from which all regions are those of things."""
+CHANCE, RISE = 0.4, 0.1
+"""B of regions that overlap by chance; so much above it, all regions are those of things."""
 FAINT = 0.02
 """Regions with a smaller share of a Gaussian's weight in their view do not count."""
 SEED = 0
@@ -93,6 +93,7 @@ def consensus(
     level: Int[Tensor, " s"] | None = None,
     power: float = 1.0,
     sample: int = 50,
+    least: float = CHANCE,
     portion: Portion | None = None,
 ) -> Consensus:
     """F' of every region; formulas at the top of this file.
@@ -102,10 +103,11 @@ def consensus(
         level: of every region; regions of different levels are not compared. None: all are of one.
         power: q, the exponent of c_ts, >= 0.
         sample: Gaussians that every region has at least, or all that it has; >= 1.
+        least: B up to which regions overlap by chance and keep their features, in 0..1.
         portion: which Gaussians the evidence is of, where others of the team have the rest; None: all there are.
     Raises:
         ValueError: a table or levels of another length, rows that are neither unit vectors nor 0, negative levels, a
-            power or a sample outside its range.
+            power, a sample or a least B outside its range.
 
     >>> import torch
     >>> from normlift_ns import Evidence, consensus
@@ -128,6 +130,8 @@ def consensus(
         raise InputError(f"power must be a number >= 0, got {power!r}")
     if not isinstance(sample, int) or sample < 1:
         raise InputError(f"sample must be a whole number >= 1, got {sample!r}")
+    if not isinstance(least, int | float) or not 0 <= least <= 1:
+        raise InputError(f"least must be a number in 0..1, got {least!r}")
     check_unit_rows(features, "feature rows", "normalise them, or set those without a feature to 0", zeros=True)
     device = evidence.rows.weight.device
     chosen, chance = sampled_gaussians(evidence.rows, size, sample, portion)
@@ -144,7 +148,7 @@ def consensus(
         columns = (level == number).nonzero().squeeze(1).to(device)
         part = rows if len(columns) == size else rows.select_columns(columns, size)
         overlaps = region_overlaps(part, evidence.region_view[columns], chance, total)
-        out[columns] = agreed(out[columns], overlaps, power)
+        out[columns] = agreed(out[columns], overlaps, power, least)
         agreement.append(overlaps.agreement)
     if portion is not None:
         out, agreement = portion.team.spread(out), portion.team.tell(agreement)
@@ -165,9 +169,11 @@ def seen_reliability(agreed: Scalars, seen: Scalars) -> Scalars:
     return replace(agreed, reliability=torch.where(agreed.norm > 0, seen.reliability, 0.0))
 
 
-def agreed(features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0) -> Float[Tensor, "s d"]:
+def agreed(
+    features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE
+) -> Float[Tensor, "s d"]:
     """F' of the regions of one level. Regions that overlap none keep their rows as they are."""
-    strength = min(1.0, max(0.0, (overlaps.agreement - CHANCE) / (THINGS - CHANCE)))
+    strength = min(1.0, max(0.0, (overlaps.agreement - least) / RISE))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features
     table = features.to(torch.promote_types(features.dtype, torch.float32))

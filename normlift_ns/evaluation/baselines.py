@@ -100,7 +100,7 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
     how = {key: options.get(key, getattr(defaults, key)) for key in ("beta", "unlabeled")}
     found = lift(evidence, features, **how)
     if on:
-        given = {"power": options.get("consensus_power"), "sample": options.get("consensus_sample")}
+        given = {key: options.get(f"consensus_{key}") for key in ("power", "sample", "least")}
         given = {key: value for key, value in given.items() if value is not None}
         agreed = consensus(evidence, features, level=torch.cat(levels), **given)
         of_agreed = lift(evidence, agreed.features, **how)

@@ -104,7 +104,9 @@ def _costs(
     seconds: dict[str, float] = {}
     table, copied = features, None
     if options.consensus:
-        given = {"power": options.consensus_power, "sample": options.consensus_sample}
+        given = {
+            "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
+        }  # fmt: skip
         seconds["consensus"], found = timed(lambda: consensus(evidence, features, **given))
         table = found.features
     seconds["lift"], lifted = timed(lambda: lift(evidence, table, **how))

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from normlift_ns.core.consensus import consensus
+from normlift_ns.core.consensus import CHANCE, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.scene import Scene, View
@@ -125,8 +125,8 @@ class Votes:
         evidence, features = Evidence.merge(*parts), torch.cat(tables)
         if self._option("consensus", bool, False):
             power, sample = self._option("consensus_power", float, 1.0), self._option("consensus_sample", int, 50)
-            level = torch.cat(levels)
-            features = consensus(evidence, features, level=level, power=power, sample=sample).features
+            how = {"power": power, "sample": sample, "least": self._option("consensus_least", float, CHANCE)}
+            features = consensus(evidence, features, level=torch.cat(levels), **how).features
         return evidence, features
 
     def _kept(self, block: Block) -> Evidence:

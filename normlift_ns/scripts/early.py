@@ -233,7 +233,7 @@ def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> N
 def check_effect(lift: LiftOptions) -> None:
     """Raises ValueError for options of something that is switched off."""
     usual = LiftOptions()
-    for name in ("consensus_power", "consensus_sample"):
+    for name in ("consensus_power", "consensus_sample", "consensus_least"):
         if not lift.consensus and getattr(lift, name) != getattr(usual, name):
             raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Set that, or leave it out.")
     if lift.vote.vote != "posterior" and lift.vote.prior != usual.vote.prior:

@@ -263,9 +263,11 @@ def summary(run: LiftedRun, before: dict[str, float], total: float) -> Group:
     if numbers["left_out"] > 0:
         table.add_row("left out", f"{numbers['left_out']} images without features")
     features = facts["features"]
-    table.add_row("2D features", features["kind"] if "kind" in features else features["regions"]["kind"])
+    kind = features["kind"] if "kind" in features else features["regions"]["kind"]
+    table.add_row("2D features", kind)
     if "consensus" in numbers:
-        table.add_row("consensus", "; ".join(map(consensus_of, numbers["consensus"]["agreement"])))
+        found = numbers["consensus"]
+        table.add_row("consensus", "; ".join(consensus_of(x, found["least"], kind) for x in found["agreement"]))
     table.add_row("reliability R", reliability_of(numbers["reliability_quantiles"]))
     if "refined_share" in numbers:
         lost = f"{numbers['unsupported_share']:.1%} have no reliable neighbour"
@@ -310,18 +312,21 @@ def reliability_of(quantiles: dict[str, float]) -> str:
     )
 
 
-def consensus_of(agreement: float) -> str:
-    """What the consensus found in a level of regions.
+def consensus_of(agreement: float, least: float, kind: str) -> str:
+    """What the consensus found in a level of regions of a kind.
 
-    >>> consensus_of(0.3)
+    >>> consensus_of(0.3, 0.4, "superpixel")
     'regions overlap by chance (agreement 0.30 of 0.40 at least), features stay as they were'
     """
-    from normlift_ns.core.consensus import CHANCE, THINGS  # noqa: PLC0415 (torch is there by now)
+    from normlift_ns.core.consensus import RISE  # noqa: PLC0415 (torch is there by now)
 
     found = f"agreement {agreement:.2f}"
-    if agreement <= CHANCE:
-        return f"regions overlap by chance ({found} of {CHANCE:.2f} at least), features stay as they were"
-    return f"{found}, features agreed" if agreement >= THINGS else f"{found}, features agreed in part"
+    if agreement > least:
+        return f"{found}, features agreed" if agreement >= least + RISE else f"{found}, features agreed in part"
+    kept = f"regions overlap by chance ({found} of {least:.2f} at least), features stay as they were"
+    if kind in ("superpixel", "grid", "patches"):
+        return kept
+    return f"{kept}; if they are bad masks of things, try --consensus-least 0"
 
 
 def entrypoint() -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift
-from normlift_ns.core.consensus import consensus, region_overlaps, sampled_gaussians
+from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from tests.scenes import dense, generator, random_evidence, unit_rows
@@ -254,6 +254,23 @@ def test_cells_of_an_arbitrary_partition_are_left_alone(side):
     found = consensus(evidence, features)
     assert found.agreement[0] < 0.45
     assert (found.features * features).sum(1).mean() > 0.9
+    asked = consensus(evidence, features, least=0.0)  # that they are things, says whoever asks
+    assert asked.agreement == found.agreement
+    assert (asked.features * features).sum(1).mean() < 0.85
+
+
+def test_strength_rises_by_a_tenth_above_the_least():
+    evidence = random_evidence(40, [5, 6, 7], 3)
+    features = unit_rows(18, 8, 3)
+    overlaps = region_overlaps(evidence.rows, evidence.region_view)
+    whole, b = agreed(features, overlaps, least=0.0), overlaps.agreement
+    assert b > 0.1
+    assert torch.equal(agreed(features, overlaps, least=b), features)
+    assert torch.equal(agreed(features, overlaps, least=b - 0.11), whole)
+    others = dense(SparseRows(overlaps.iou.offsets, overlaps.iou.column, overlaps.iou.weight * overlaps.inside), 18)
+    half = features + 0.5 * others.to(features.dtype) @ features
+    expected = torch.nn.functional.normalize(half, dim=1)
+    assert torch.allclose(agreed(features, overlaps, least=b - 0.05), expected, atol=1e-5)
 
 
 def large(regions: int, gaussians: int, views: int) -> Evidence:
@@ -362,6 +379,8 @@ def test_refusals(unchecked):
         ({"power": -1.0}, "power must be"),
         ({"power": float("nan")}, "power must be"),
         ({"sample": 0}, "sample must be a whole number >= 1"),
+        ({"least": -0.1}, "least must be a number in 0..1"),
+        ({"least": float("nan")}, "least must be a number in 0..1"),
     ):
         with pytest.raises(InputError, match=message):
             consensus(evidence, **{"features": features, **arguments})

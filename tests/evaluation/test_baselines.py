@@ -56,17 +56,10 @@ def lifted(tmp_path_factory) -> EvaluatedRun:
         gaussians=random_scene(N, dtype=torch.float32, size=0.3), train=Photographs(orbit(VIEWS)),
         held_out=Photographs([]), rasterize_mode="classic", identity={}, name="made",
     )  # fmt: skip
-    options = LiftOptions(refine=False, max_views=4, consensus=False)
+    options = LiftOptions(refine=False, max_views=4, consensus=False, consensus_least=0.0)  # cells count as things
     found = lift_scene(scene, make_source(OPTIONS), options, folder, encoder={}).field
     manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
     return EvaluatedRun(scene, replace(found, manifest=manifest), make_source(OPTIONS), False, folder)
-
-
-@pytest.fixture
-def as_things(monkeypatch):
-    """Cells of a grid count as regions of things, or a consensus would leave them alone."""
-    monkeypatch.setattr("normlift_ns.core.consensus.CHANCE", -1)
-    monkeypatch.setattr("normlift_ns.core.consensus.THINGS", 0)
 
 
 def observations(lifted: EvaluatedRun) -> list[tuple[Camera, Tensor, Tensor]]:
@@ -167,11 +160,12 @@ def test_features_that_cannot_be_made_again_are_refused(lifted, change, message)
         baseline_field("sfs", other, "cpu")
 
 
-@pytest.mark.usefixtures("as_things")
 @pytest.mark.parametrize("power", [0.0, 2.0])
 def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
     """As `lift_scene` lifts them, numbers that vote included."""
-    options = LiftOptions(refine=False, max_views=4, consensus=True, consensus_power=power, consensus_sample=9)
+    options = LiftOptions(
+        refine=False, max_views=4, consensus=True, consensus_power=power, consensus_sample=9, consensus_least=0.0
+    )
     found = lift_scene(lifted.scene, lifted.texts, options, lifted.cache, encoder={}).field
     manifest = {**found.manifest, "source": lifted.field.manifest["source"]}
     agreed = replace(lifted, field=replace(found, manifest=json.loads(json.dumps(manifest))))
@@ -191,7 +185,6 @@ def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
     assert (agreed.field.scalars.norm - lifted.field.scalars.norm).mean() > 0.001
 
 
-@pytest.mark.usefixtures("as_things")
 def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
     """A run with consensus, and one without it, give the same rows; what cannot be made again is left out, and said."""
 

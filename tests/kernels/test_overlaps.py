@@ -38,16 +38,14 @@ def test_row_maxima():
 
 @pytest.mark.parametrize("block", [2**26, 100])
 def test_consensus_by_kernels_equals_that_of_the_cpu(monkeypatch, block):
-    monkeypatch.setattr(module, "CHANCE", -1)  # as if the regions were things
-    monkeypatch.setattr(module, "THINGS", 0)
     evidence = random_evidence(40, [5, 0, 7, 4, 6], 3)
     features = unit_rows(22, 8, 3)
-    expected = consensus(evidence, features)
+    expected = consensus(evidence, features, least=0.0)
     iou = dense(region_overlaps(evidence.rows, evidence.region_view).iou, 22)
     monkeypatch.setattr(module, "kernels_apply", lambda tensor: True)
     monkeypatch.setattr(module, "_DENSE", block)
     evidence, features = evidence.to(DEVICE), features.to(DEVICE)
-    found = consensus(evidence, features)
+    found = consensus(evidence, features, least=0.0)
     assert torch.allclose(found.features.cpu(), expected.features, atol=1e-6)
     assert found.agreement == pytest.approx(expected.agreement, abs=1e-6)
     again = dense(region_overlaps(evidence.rows, evidence.region_view).iou, 22)

@@ -303,6 +303,7 @@ def test_a_mistake_costs_little_and_imports_nothing_heavy(module, flags, config,
     [
         ({"consensus": False, "consensus_power": 2.0}, "--consensus-power is for --consensus True"),
         ({"consensus": False, "consensus_sample": 9}, "--consensus-sample is for --consensus True"),
+        ({"consensus": False, "consensus_least": 0.0}, "--consensus-least is for --consensus True"),
         ({"vote": RefineConfig(vote="paper", prior=2.0)}, "--prior is for --vote posterior"),
     ],
 )
