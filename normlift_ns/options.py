@@ -300,8 +300,8 @@ class LiftOptions:
     consensus_sample: int = 50
     """Gaussians that the consensus looks at in every region, or all that it has. For --consensus True."""
     consensus_least: float = 0.4
-    """Agreement of regions across views, in 0..1, up to which they overlap by chance and keep their features. 0: masks
-    are known to be those of things, however bad they are. For --consensus True."""
+    """Agreement of regions across views, in 0..1, up to which they count as overlapping by chance and keep their
+    features. Give 0 if your masks show things, however badly. For --consensus True."""
     refine: bool = True
     """Let a vote among neighbours repair directions: a Gaussian copies the one that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)

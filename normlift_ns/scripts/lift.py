@@ -317,6 +317,8 @@ def consensus_of(agreement: float, least: float, kind: str) -> str:
 
     >>> consensus_of(0.3, 0.4, "superpixel")
     'regions overlap by chance (agreement 0.30 of 0.40 at least), features stay as they were'
+    >>> consensus_of(0.3, 0.4, "files").split("; ")[1]
+    'if they are bad masks of things, try --consensus-least 0'
     """
     from normlift_ns.core.consensus import RISE  # noqa: PLC0415 (torch is there by now)
 
