@@ -5,7 +5,7 @@ BIN := .venv/bin
 WORKERS ?= 2
 # Tests start hundreds of processes: what one compiles, the next reads, also where the environment forbids it
 export PYTHONDONTWRITEBYTECODE :=
-BESIDE = -n $(WORKERS) --dist loadfile
+BESIDE := -n $(WORKERS) --dist loadfile
 
 .PHONY: check style changed-types quick-tests test test-slow test-viser1 soak torture demo docs bench lint format clean
 
@@ -42,9 +42,7 @@ test: style
 	@echo $(BIN)/basedpyright; $(BIN)/python -W ignore -c "$(KERNELS)" & $(BIN)/basedpyright; types=$$?; wait; exit $$types
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow"
 
-# Slow tests often wait for the processes that they start. A browser and the viewer that it shows fill two cores: their
-# tests run after the rest, one at a time
-test-slow: WORKERS = 3
+# A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time
 test-slow: .venv/installed
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m slow --ignore=tests/browser
 	$(BIN)/pytest -m slow tests/browser
