@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 if "PYTEST_XDIST_WORKER" in os.environ:  # another process tests beside this one; read when torch is imported
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-gc.disable()  # until all is imported, which stays for good: looking through it again and again takes a quarter longer
+gc.disable()  # until all is imported: what imports make stays, and looking through it takes a quarter of the time
 
 
 def pytest_collection_finish() -> None:

@@ -1,6 +1,6 @@
 """Where the consensus stays off: what its least agreement B costs where regions are things, and saves elsewhere.
 
-    python -m benchmarks.agreement           four rooms made in code, four minutes on a GPU
+    python -m benchmarks.agreement           four rooms made in code, two minutes on a GPU
     python -m benchmarks.agreement --quick   the plain room of 5,000 Gaussians, two steps, one seed
 
 Regions are masks, damaged by every step of the ladder, and partitions that know of no things: squares, and superpixels
@@ -30,10 +30,10 @@ from benchmarks.third_room import third
 from benchmarks.variants import lifted_scores
 from benchmarks.worlds import Words, World, made_words, world_of_room
 from normlift_ns import Evidence, lift, rasterize_evidence, render
-from normlift_ns.core.consensus import agreed, region_overlaps, sampled_gaussians, seen_weights
-from normlift_ns.demo import demo_cameras, demo_room, held_out_cameras
+from normlift_ns.core.consensus import consensus
+from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras
 
-SEEDS, GAUSSIANS, SAMPLE = 4, 20_000, 50
+SEEDS, GAUSSIANS = 4, 20_000
 SQUARES, SUPERPIXELS = (32, 64, 96), (30, 100, 300)
 """Pixels along a side, in pictures of 320; superpixels per view, about."""
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -42,9 +42,9 @@ NOISE = 0.5
 """Length of what is added to the unit feature of every region of a partition."""
 
 
-def _room(make: Callable[[int], object]) -> Callable[[int], World]:
+def _room(make: Callable[[int], DemoRoom]) -> Callable[[int], World]:
     cameras = demo_cameras(24, 320, 240), held_out_cameras(1, 320, 240)
-    return lambda count: world_of_room("room", make(count), *cameras)  # type: ignore[arg-type]
+    return lambda count: world_of_room("room", make(count), *cameras)
 
 
 ROOMS = {"demo": _room(demo_room), "plain": _room(plain_room), "second": second, "third": third}
@@ -78,16 +78,13 @@ def called(labels: list[Tensor], maps: Tensor, classes: Tensor) -> Tensor:
 
 def gains(world: World, words: Words, evidence: Evidence, features: Tensor) -> dict[str, float]:
     """B, and points of mIoU gained by the consensus as it is and with a least B of 0."""
-    chosen, chance = sampled_gaussians(evidence.rows, len(features), SAMPLE)
-    seen = evidence.select_gaussians(chosen)
-    total = seen_weights(seen, torch.arange(len(chosen)))
-    overlaps = region_overlaps(seen.rows, evidence.region_view, chance, total)
+    default, always = consensus(evidence, features), consensus(evidence, features, least=0.0)
     known = (world.truth >= 0).nonzero().squeeze(1)
     alone, as_it_is, unlimited = (
         scores_3d(world, lifted_scores(lift(evidence, x), words.classes), known)["miou"]
-        for x in (features, agreed(features, overlaps), agreed(features, overlaps, least=0.0))
+        for x in (features, default.features, always.features)
     )
-    return {"agreement": overlaps.agreement, "gain": as_it_is - alone, "unlimited": unlimited - alone}
+    return {"agreement": default.agreement[0], "gain": as_it_is - alone, "unlimited": unlimited - alone}
 
 
 def observations(name: str, *, quick: bool) -> Iterator[tuple[str, dict[str, float]]]:

@@ -222,7 +222,7 @@ class Monkey:
         while len(used) < 12:  # pictures and photographs that were asked for are still being made
             time.sleep(2.5)
             used.append(self._server.megabytes())
-            if len(used) > 4 and used[-1] > used[-4] - 1:  # no less than 7 seconds ago
+            if len(used) > 4 and used[-1] > used[-4] - 1:  # no less than it was 7 seconds ago
                 break
         for page in self._pages:
             page.goto(self._server.address, wait_until="domcontentloaded")

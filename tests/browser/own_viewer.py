@@ -60,17 +60,13 @@ def own_viewer(
     assert "Traceback" not in log.read_text(), log.read_text()[-3000:]
 
 
-def draw_in_software(page: Page, sharpness: float = 0.4) -> None:
-    """Lets a page leave time to the server: it draws ten pictures per second at most, all of the same sharpness.
-
-    Args:
-        sharpness: pixels of the picture per pixel of the page.
-    """
+def draw_in_software(page: Page) -> None:
+    """Makes a page leave time to the server: it draws at most ten pictures per second, all at 0.4 of its resolution."""
 
     def coarse(route: Route) -> None:
         try:
             answer = route.fetch()
-            route.fulfill(response=answer, body=_SHARPNESS.sub(str(sharpness), answer.text()))
+            route.fulfill(response=answer, body=_SHARPNESS.sub("0.4", answer.text()))
         except Error:  # the server is away, or the page has gone
             with suppress(Error):
                 route.abort()

@@ -78,18 +78,12 @@ def _behind_the_server(script: Path) -> str | Path | None:
 
 
 class Tab:
-    """One browser tab with the viewer in it, used as a person would.
+    """One browser tab with the viewer in it, used as a person would."""
 
-    Args:
-        sharpness: pixels of the picture per pixel of the page, at least; more is slower.
-    """
-
-    def __init__(
-        self, browser: Browser, address: str, *, sharpness: float = 0.4, size: tuple[int, int] = _SIZE
-    ) -> None:
+    def __init__(self, browser: Browser, address: str, *, size: tuple[int, int] = _SIZE) -> None:
         self.page: Page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self._size = size
-        draw_in_software(self.page, sharpness)
+        draw_in_software(self.page)
         self.problems: list[str] = []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")

@@ -254,7 +254,7 @@ def test_cells_of_an_arbitrary_partition_are_left_alone(side):
     found = consensus(evidence, features)
     assert found.agreement[0] < 0.45
     assert (found.features * features).sum(1).mean() > 0.9
-    asked = consensus(evidence, features, least=0.0)  # that they are things, says whoever asks
+    asked = consensus(evidence, features, least=0.0)  # whoever asks says that they are things
     assert asked.agreement == found.agreement
     assert (asked.features * features).sum(1).mean() < 0.85
 
