@@ -45,7 +45,7 @@ def own(browser: Browser, address: str) -> None:
 
 def stock(browser: Browser, address: str) -> None:
     """ns-viewer with an answer, and with one thing alone."""
-    tab = Tab(browser, address, sharpness=1, size=(1300, 947))
+    tab = Tab(browser, address, size=(1300, 947))
     tab.press("Hide Train Cams")
     tab.type("Prompts", STOCK)
     tab.press("Ask")
