@@ -5,8 +5,10 @@ ours and those of other packages alike. Imports nothing heavy; a package is load
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -149,11 +151,21 @@ def absolute_paths(options: SourceOptions) -> dict[str, str]:
     return {name: os.path.abspath(value) if os.path.exists(value) else value for name, value in values.items()}
 
 
-def _points() -> Iterator[EntryPoint]:
+def _points() -> Sequence[EntryPoint]:
     """The entry points of the group. Packages whose metadata is damaged are passed over."""
+    return _points_on(tuple(sys.path))
+
+
+@cache
+def _points_on(path: tuple[str, ...]) -> Sequence[EntryPoint]:
+    """Looking through some hundreds of packages takes as long as asking a question does."""
+    return tuple(_found(path))
+
+
+def _found(path: Sequence[str]) -> Iterator[EntryPoint]:
     seen: set[str] = set()
     yield from [EntryPoint(name, value, GROUP) for name, value in BUILT_IN.items()]
-    for package in distributions():
+    for package in distributions(path=list(path)):
         try:
             text = package.read_text("entry_points.txt")
             if text is None or GROUP not in text or package.name in seen:

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import sys
 import urllib.error
 import urllib.request
 from dataclasses import replace
@@ -10,7 +11,6 @@ from dataclasses import replace
 import cv2
 import huggingface_hub
 import numpy as np
-import open_clip
 import pytest
 import timm
 import torch
@@ -19,9 +19,10 @@ from safetensors.torch import save_file
 from normlift_ns.encoders import SourceOptions, make_encoder
 from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
+from normlift_ns.encoders.clip.weights import import_open_clip
 from normlift_ns.encoders.texts.kept import text_identity
 from tests.encoders.tiny import CLIP as NAME
-from tests.encoders.tiny import DEVICES, needs_cuda, write_clip
+from tests.encoders.tiny import DEVICES, needs_cuda, open_clip, write_clip
 
 IMAGE = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 LABELS = torch.full((48, 64), -1, dtype=torch.int32)
@@ -97,6 +98,15 @@ def test_crops_are_those_of_the_protocol(region, box, fill, value):
         expected = torch.nn.functional.interpolate(pixels[None], size, mode="bilinear", align_corners=False)[0]
         torch.testing.assert_close(resized, expected, rtol=0, atol=1e-3)
         assert np.abs(resized.permute(1, 2, 0).numpy() - cv2.resize(square, size[::-1])).max() <= 1  # cv2 rounds
+
+
+def test_timm_is_imported_without_wandb(monkeypatch):
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    found = []
+    monkeypatch.setattr("importlib.import_module", lambda name: found.append((name, sys.modules["wandb"])))
+    import_open_clip()
+    assert found == [("open_clip", None)]
+    assert "wandb" not in sys.modules
 
 
 def test_a_crop_shows_all_of_a_region_whatever_lies_on_it():

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import open_clip
 import pytest
 import torch
 
@@ -13,7 +12,7 @@ from normlift_ns.encoders.clip.patches import dense_tokens
 from normlift_ns.encoders.images import read_image
 from normlift_ns.encoders.patches import PatchFeatures, patch_grid
 from tests.captures import needs_shared
-from tests.encoders.tiny import CLIP, needs_cuda, write_clip
+from tests.encoders.tiny import CLIP, needs_cuda, open_clip, write_clip
 
 IMAGE = torch.randint(0, 256, (48, 80, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 

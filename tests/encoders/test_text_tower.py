@@ -7,7 +7,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-import open_clip
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -17,7 +16,7 @@ from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.text_tower import load_text_tower
 from normlift_ns.options import SourceOptions
 from normlift_ns.text_encoders import encoder_of, encoder_settings
-from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES, write_clip
+from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES, open_clip, write_clip
 
 TEXTS = ["fox", "a red fox that sleeps under a very old tree", "ÄÖ 狐 🦊", "word " * 200, "it's 12,5 %"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,17 @@ _SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 
 def import_open_clip() -> Any:
     """open_clip, imported at the first use because that takes seconds, without the warnings of the old timm that
-    nerfstudio pins."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return importlib.import_module("open_clip")
+    nerfstudio pins, and without wandb, with which timm would log its trainings: a third of those seconds."""
+    absent = "wandb" not in sys.modules
+    if absent:
+        sys.modules["wandb"] = None  # type: ignore[assignment]  # importing it is an ImportError, which timm expects
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return importlib.import_module("open_clip")
+    finally:
+        if absent:
+            del sys.modules["wandb"]
 
 
 def check_names(model: str, pretrained: str) -> None:

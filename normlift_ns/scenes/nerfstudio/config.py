@@ -44,12 +44,13 @@ def read_config(path: Path) -> TrainerConfig:
             f"{_EXPECTED}"
         )
     try:
-        text = path.read_text("utf8")
-        method = _method_name(yaml.compose(text, Loader=ConfigLoader))
+        loader = ConfigLoader(path.read_text("utf8"))
+        root = loader.get_single_node()
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
             f"{path} is not a nerfstudio config: it is no valid YAML ({_brief(error)}). {_EXPECTED}"
         ) from error
+    method = _method_name(root)
     if method is None:
         raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {_EXPECTED}")
     if method not in SUPPORTED_METHODS:
@@ -59,7 +60,7 @@ def read_config(path: Path) -> TrainerConfig:
             "with ns-export gaussian-splat and lift that file with --load-ply"
         )
     try:
-        config = yaml.load(text, Loader=ConfigLoader)
+        config = loader.construct_document(root)
     except Exception as error:  # PyYAML turns values into dates, numbers and sets, and lets all their errors through
         raise InputError(
             f"{path} cannot be read: {_brief(error)}. Only the configuration classes of splatfacto and normlift_ns "
