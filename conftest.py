@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     from normlift_ns.demo import DemoRoom
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # another process tests beside this one; read when torch is imported
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads without work leave the core to the other process
+if "PYTEST_XDIST_WORKER" in os.environ:  # another process tests beside this one; both read when torch is imported
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 gc.disable()  # until all is imported: what imports make stays, and looking through it takes a quarter of the time

@@ -103,9 +103,10 @@ def drsplat(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
 
 def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     u = torch.zeros(N, seen[0][2].shape[1], dtype=torch.float64)
+    some = [(features != 0).any(1) for *_, features in seen]
+    labelled = [(weights[:, i], features[i]) for (_, weights, features), i in zip(seen, some)]
     for j in range(N):
-        views = [(weights[j][labelled], features[labelled]) for _, weights, features in seen
-                 for labelled in [(features != 0).any(1)]]  # fmt: skip
+        views = [(weights[j], features) for weights, features in labelled]
         most = max(float(weight.sum()) for weight, _ in views)
         used = [(weight, features) for weight, features in views if weight.sum() >= VISIBLE * most and most > 0]
         if len(used) == 0:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -176,8 +176,11 @@ def run(tmp_path) -> Run:
 
 
 @pytest.fixture
-def crowd(run) -> People:
-    return People(run)
+def crowd(run) -> Iterator[People]:
+    people = People(run)
+    yield people
+    for number in list(people._here):
+        people.go(number)
 
 
 def opened(crowd: People, number: int, token: str, link: str = "") -> FakePage:
@@ -433,12 +436,12 @@ def test_a_page_that_is_gone_before_its_panel_is_made_leaves_nothing(crowd):
 
 def test_a_slow_page_gets_the_last_picture_and_not_all_of_them(crowd):
     page = opened(crowd, 0, "one")
+    page.ask("red")
+    page.says(f"**{2 * BLOCK}** of")
     page.draws(4 * BLOCK)
     drawn, draw = [], page.draw
     page.draw = lambda buffer: drawn.append(len(buffer)) or draw(buffer)  # type: ignore[method-assign]
     page.behind = True
-    page.ask("red")
-    page.until(lambda: not page.gui["Ask"].disabled)
     page.gui["Selection"].press("Hide")
     page.gui["Selection"].press("Unhide")
     page.gui["Selection"].press("Only")
