@@ -273,7 +273,7 @@ def test_the_threshold_stays_for_another_query_of_the_same_rule(panel: Any) -> N
 
 def test_poor_evidence_is_said_and_can_be_left_out(panel: Any, pipeline: Any, monkeypatch: Any) -> None:
     field = pipeline.model.field
-    reliability = torch.where(torch.arange(60) % 3 == 0, 0.9, 0.5)
+    reliability = torch.where(torch.arange(60) % 3 == 0, 0.9, 0.5).to(pipeline.model.device)
     poor = replace(field, scalars=replace(field.scalars, reliability=reliability))
     monkeypatch.setattr(pipeline.model, "_field", field)
     pipeline.model.attach(poor, QUESTION)
@@ -494,7 +494,7 @@ def test_floaters_are_selected_hidden_and_brought_back(panel: Any, pipeline: Any
     assert pipeline.model._display.drawn is None
     panel.act("Undo")
     assert panel.state.from_answer
-    monkeypatch.setattr(pipeline.model, "scene", lambda: replace(scene, opacities=torch.zeros(60)))
+    monkeypatch.setattr(pipeline.model, "scene", lambda: replace(scene, opacities=torch.zeros_like(scene.opacities)))
     press(button(panel, "Select likely floaters"))
     assert "There are no likely floaters" in said(panel)
     assert panel.state.from_answer
@@ -521,9 +521,11 @@ def test_why_shows_the_photographs_and_drops_what_is_stale(stock: StockRun, tmp_
     how = {"source": SourceOptions(encoder="colour"), "lift": LiftOptions(storage="evidence")}
     run = nl.lift_run(stock.config, **how, output_dir=tmp_path, timestamp="one")
     reasons = reasons_of(run.folder / "normlift", run.field)
-    state = actions.select(State(Space(run.field, run.scene.gaussians.means)), run.field.scalars.weight > 0)
+    device = panel.state.space.means.device
+    field, means = run.field.to(device), run.scene.gaussians.means.to(device)
+    state = actions.select(State(Space(field, means)), field.scalars.weight > 0)
     reasons.find(reasons.start(state), state)
-    why = run.why(state.selection)
+    why = run.why(state.selection.cpu())
     text = html.unescape(reasons.content)
     assert why.words in text
     names = {run.votes.names[vote.view] for vote in (*why.views[:3], *why.most_different[:3])}

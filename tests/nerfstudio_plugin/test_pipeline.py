@@ -94,10 +94,10 @@ def test_the_run_is_lifted_in_place(train: Callable[..., StockRun], registered: 
     expected = answer(field, run.gaussians.means, make_question(field, encoder_of(field).rows, ["red", "sky blue"]))
 
     model = trained.trainer.pipeline.model  # the viewer of the training
-    assert torch.equal(model.normlift.answer.relevancy, expected.relevancy)
+    assert torch.equal(model.normlift.answer.relevancy.cpu(), expected.relevancy)
     loaded = eval_setup(trained.config, update_config_callback=lambda c: rerooted(c, trained.config))[1].model
-    assert torch.equal(loaded.normlift.answer.selected, expected.selected)
-    assert torch.equal(loaded.means, model.means)
+    assert torch.equal(loaded.normlift.answer.selected.cpu(), expected.selected)
+    assert torch.equal(loaded.means.cpu(), model.means.cpu())
 
     stored = yaml.load(trained.config.read_text(), Loader=yaml.Loader)
     assert stored.pipeline.lift == LIFT

@@ -76,9 +76,9 @@ def test_stock_eval_setup_loads_it_from_the_directory_of_the_training(
     assert step == 2
     assert path.name == "step-000000002.ckpt"
     assert type(pipeline.model) is NormLiftModel
-    assert torch.equal(pipeline.model.means, source.gaussians.means)
+    assert torch.equal(pipeline.model.means.cpu(), source.gaussians.means)
     assert pipeline.model.field is not None
-    assert torch.equal(pipeline.model.field.scalars.reliability, field.scalars.reliability)
+    assert torch.equal(pipeline.model.field.scalars.reliability.cpu(), field.scalars.reliability)
 
 
 def test_our_loader_reads_it_from_anywhere_and_can_lift_it_again(copied: Path, tmp_path: Path) -> None:
