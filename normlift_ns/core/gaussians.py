@@ -12,7 +12,8 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 
 LARGEST_SCALE = 4.8517e8
-"""e^20 world units. The projected covariance of a larger Gaussian may not be a float32 number."""
+"""e^20 world units, however an exponential is rounded. The projected covariance of a larger Gaussian may not be a
+float32 number."""
 LARGEST_MEAN = 1e18
 """In world units along each axis: the square of a distance must be a float32 number."""
 QUATERNION_LENGTHS = (1e-18, 1e18)

@@ -30,7 +30,7 @@ def drawable(mean, quat, scale, opacity):
     return (
         all(math.isfinite(x) for x in (*mean, *quat, *scale, opacity))
         and all(abs(x) <= np.float32(1e18) for x in mean)
-        and all(x <= math.exp(20) for x in scale)
+        and all(x <= np.float32(4.8517e8) for x in scale)  # e^20, however it is rounded
         and np.float32(1e-18) <= longest <= np.float32(1e18)
     )
 
