@@ -220,9 +220,9 @@ class Monkey:
             page.goto("about:blank")
         used: list[float] = []
         while len(used) < 12:  # pictures and photographs that were asked for are still being made
-            time.sleep(2.5)
+            time.sleep(2)
             used.append(self._server.megabytes())
-            if len(used) > 4 and used[-1] > used[-4] - 1:  # no less than it was 7 seconds ago
+            if len(used) > 3 and used[-1] > used[-4] - 1:  # no less than it was 6 seconds ago
                 break
         for page in self._pages:
             page.goto(self._server.address, wait_until="domcontentloaded")

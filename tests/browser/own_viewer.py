@@ -21,12 +21,36 @@ PANEL = 320
 """Width of viser's control panel in pixels."""
 _UNHURRIED = """
 const [soon, never, waiting] = [requestAnimationFrame, cancelAnimationFrame, new Map()];
-window.requestAnimationFrame = (draw) => {
-  const name = setTimeout(() => waiting.set(name, soon((now) => { waiting.delete(name); draw(now); })), 100);
+let [names, awake] = [0, 6000];
+const draw = (name) => {
+  const picture = waiting.get(name);
+  if (picture) picture.frame ??= soon((now) => { waiting.delete(name); picture.draw(now); });
+};
+window.requestAnimationFrame = (callback) => {
+  const [name, picture] = [++names, {draw: callback}];
+  waiting.set(name, picture);
+  picture.timer = setTimeout(draw, performance.now() < awake ? 100 : 1000, name);
   return name;
 };
-window.cancelAnimationFrame = (name) => { clearTimeout(name); never(waiting.get(name)); waiting.delete(name); };
+window.cancelAnimationFrame = (name) => {
+  const picture = waiting.get(name);
+  clearTimeout(picture?.timer);
+  never(picture?.frame);
+  waiting.delete(name);
+};
+const wake = () => {
+  const asleep = performance.now() >= awake;
+  awake = performance.now() + 6000;
+  if (asleep) [...waiting.keys()].forEach(draw);
+};
+for (const what of ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "keyup", "input", "resize"])
+  addEventListener(what, wake, true);
+const heard = (Kind) => class extends Kind {
+  constructor(...how) { super(...how); this.addEventListener("message", wake); }
+};
+[window.Worker, window.WebSocket] = [heard(Worker), heard(WebSocket)];
 """
+"""Ten pictures per second at most; one, where for six seconds nobody has done anything and nothing has come."""
 _SHARPNESS = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*\w+\)")
 """Where viser's client makes its pictures coarser, step by step, because drawing is slow."""
 _PROGRAM = "from normlift_ns.scripts.view import main; main()"
@@ -61,7 +85,8 @@ def own_viewer(
 
 
 def draw_in_software(page: Page) -> None:
-    """Makes a page leave time to the server: it draws at most ten pictures per second, all at 0.4 of its resolution."""
+    """Makes a page leave time to the server: it draws ten pictures per second at most, one where nothing happens, and
+    all at 0.4 of its resolution."""
 
     def coarse(route: Route) -> None:
         try:

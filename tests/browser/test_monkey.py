@@ -1,6 +1,6 @@
 """Both viewers before a monkey: nothing breaks, whatever is pressed, and the server's memory does not grow.
 
-NORMLIFT_SOAK: minutes per viewer (1). NORMLIFT_SEED: the seed, which is printed. `make soak` takes 30 minutes and a
+NORMLIFT_SOAK: minutes per viewer (0.5). NORMLIFT_SEED: the seed, which is printed. `make soak` takes 30 minutes and a
 seed of its own.
 """
 
@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"),
 ]
-MINUTES = float(os.environ.get("NORMLIFT_SOAK", "1"))
+MINUTES = float(os.environ.get("NORMLIFT_SOAK", "0.5"))
 SEED = os.environ.get("NORMLIFT_SEED", "1")
 MOST_GROWTH = 50.0
 """Megabytes that are not freed, once it is warm."""

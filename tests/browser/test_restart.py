@@ -29,8 +29,8 @@ def test_a_saved_click_is_asked_again_after_a_restart(demo_run: Path, tmp_path: 
             tab.press("More like this")
             tab.says("Click on something in the scene")
             tab.click(*middle(yellow))
-            tab.until(
-                lambda: tab.field("Prompts").input_value() == "like click 1" and tab.selected() > 0,
+            tab.until(  # what is stored has four answers
+                lambda: tab.field("Prompts").input_value() == "like click 1" and tab.answered() == 1,
                 "clicked",
                 timeout=60,
             )

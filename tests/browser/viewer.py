@@ -155,8 +155,8 @@ class Tab:
     def settle(self) -> None:
         """Waits until the picture does not change any more: the viewer draws coarsely first."""
         before, calm, deadline = self.picture(), 0, time.monotonic() + 60
-        while calm < 4 and time.monotonic() < deadline:
-            self.page.wait_for_timeout(700)
+        while calm < 3 and time.monotonic() < deadline:
+            self.page.wait_for_timeout(600)
             now = self.picture()
             calm = calm + 1 if np.abs(now.astype(int) - before).mean() < 0.2 else 0
             before = now

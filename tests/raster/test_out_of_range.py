@@ -81,7 +81,7 @@ def test_any_parameters(rows):
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=40)
 @given(rows=st.lists(ROW, min_size=1, max_size=4))
 def test_any_parameters_at_length(rows):
     check_any_parameters(rows)
