@@ -63,11 +63,9 @@ class NormLiftModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """As splatfacto's, without what it needs CUDA or a download for; with the panel of the viewer."""
-        if self.config.semantics is not None:
-            # The checkpoint brings its Gaussians; without these, splatfacto draws 50,000 and finds their neighbours.
-            self.seed_points = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)
-        elif not torch.cuda.is_available():
-            self.seed_points = None  # splatfacto moves their colours to CUDA
+        if not torch.cuda.is_available():  # where splatfacto cannot move the colours of seed points to, nor train
+            few = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)  # without, it finds the neighbours of 50,000
+            self.seed_points = None if self.config.semantics is None else few  # until the checkpoint brings its own
         with _lazy_lpips():
             super().populate_modules()
         self._field: SemanticField | None = None

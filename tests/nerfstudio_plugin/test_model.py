@@ -11,7 +11,7 @@ import torch
 import yaml
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.utils import CameraState, get_camera
 
@@ -359,6 +359,16 @@ def test_eval_with_lpips(pipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     metrics = pipeline.get_average_eval_image_metrics()
     torch.testing.assert_close(metrics["lpips"], 10 ** (-metrics["psnr"] / 10), rtol=1e-4, atol=0)
     assert not any("lpips" in name for name in pipeline.state_dict())
+
+
+def test_a_lifted_run_opens_without_gaussians_of_chance(
+    lifted: Path, stock: StockRun, registered: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    made, neighbours = [], SplatfactoModel.k_nearest_sklearn
+    monkeypatch.setattr(SplatfactoModel, "k_nearest_sklearn", lambda *how: made.append(how[1]) or neighbours(*how))
+    assert _setup(lifted).model.num_points == len(load_scene(stock.config).gaussians)
+    assert [len(means) for means in made] == [4]
 
 
 def test_seed_points_need_no_cuda(registered: None, workspace: Path) -> None:

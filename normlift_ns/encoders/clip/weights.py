@@ -24,7 +24,7 @@ _SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 
 def import_open_clip() -> Any:
     """open_clip, imported at the first use because that takes seconds, without the warnings of the old timm that
-    nerfstudio pins, and without wandb, with which timm would log its trainings: a third of those seconds."""
+    nerfstudio pins, and without wandb, with which timm would log its trainings: a quarter of those seconds."""
     absent = "wandb" not in sys.modules
     if absent:
         sys.modules["wandb"] = None  # type: ignore[assignment]  # importing it is an ImportError, which timm expects
@@ -34,7 +34,7 @@ def import_open_clip() -> Any:
             return importlib.import_module("open_clip")
     finally:
         if absent:
-            del sys.modules["wandb"]
+            sys.modules.pop("wandb", None)
 
 
 def check_names(model: str, pretrained: str) -> None:
