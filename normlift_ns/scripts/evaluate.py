@@ -223,7 +223,7 @@ def results_table(evaluation: Evaluation) -> Table:
 
 def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
     """One row per class, with scene or frame where there are several; or per vote."""
-    table = Table(*(Column(plain(name)) for name in (rows[0] if len(rows) > 0 else ())), title=title)
+    table = Table(*(Column(plain(name), overflow="fold") for name in (rows[0] if len(rows) > 0 else ())), title=title)
     for row in rows:
         table.add_row(*(f"{x:.3f}" if isinstance(x, float) else plain(x) for x in row.values()))
     return table
@@ -241,7 +241,8 @@ def _short(number: int, row: Row) -> Row:
 
 def signals_table(rows: Sequence[Row]) -> Table:
     """One column per scene."""
-    table = Table("signal", *(Column(plain(row.get("scene", "value"))) for row in rows), title="signals")
+    scenes = (Column(plain(row.get("scene", "value")), overflow="fold") for row in rows)
+    table = Table("signal", *scenes, title="signals")
     for name in (key for key in rows[0] if key != "scene"):
         digits = ".3g" if name.endswith("_p") else ".3f"  # p-values may be tiny
         table.add_row(name, *(f"{row[name]:{digits}}" for row in rows))

@@ -169,7 +169,7 @@ class NormLiftExport:
 def _table(tables: list[dict[str, Any]]) -> Table:
     table = Table("text", "object", title="Objects, in scene units")
     for name in ("Gaussians", "centroid", "size of the box", "mean reliability"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for entry in tables:
         for i, found in enumerate(entry["objects"]):
             box = found["box"]
