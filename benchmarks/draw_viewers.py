@@ -36,7 +36,7 @@ def main(config: Path) -> None:
 
 def own(browser: Browser, address: str) -> None:
     """ns-normlift-view with an answer."""
-    page = Own(browser, address, size=(1200, 640))
+    page = Own(browser, address, size=(1200, 640), sharpness=1)
     page.ask(OWN)
     page.until(lambda: page.selected() > 0, "an answer")
     page.picture()
@@ -45,7 +45,7 @@ def own(browser: Browser, address: str) -> None:
 
 def stock(browser: Browser, address: str) -> None:
     """ns-viewer with an answer, and with one thing alone."""
-    tab = Tab(browser, address, size=(1300, 947))
+    tab = Tab(browser, address, size=(1300, 947), sharpness=1)
     tab.press("Hide Train Cams")
     tab.type("Prompts", STOCK)
     tab.press("Ask")

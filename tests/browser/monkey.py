@@ -19,7 +19,7 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, ConsoleMessage, Page, TimeoutError
 
-from tests.browser.own_viewer import draw_in_software
+from tests.browser.own_viewer import COARSE, draw_in_software
 from tests.browser.viewer import faults, is_ours
 
 PROMPTS = (
@@ -177,7 +177,7 @@ class Monkey:
         page.on("dialog", lambda dialog: self._note(f"a dialog says {dialog.message}"))
         page.on("console", self._hear)
         page.add_init_script(_STACKS)
-        draw_in_software(page)
+        draw_in_software(page, COARSE)
         page.goto(self._server.address, wait_until="domcontentloaded")
         return page
 

@@ -51,6 +51,8 @@ const heard = (Kind) => class extends Kind {
 [window.Worker, window.WebSocket] = [heard(Worker), heard(WebSocket)];
 """
 """Ten pictures per second at most; one, where for six seconds nobody has done anything and nothing has come."""
+COARSE = 0.4
+"""Pixels of a picture per pixel of the page: enough for the tests, and quick."""
 _SHARPNESS = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*\w+\)")
 """Where viser's client makes its pictures coarser, step by step, because drawing is slow."""
 _PROGRAM = "from normlift_ns.scripts.view import main; main()"
@@ -84,14 +86,14 @@ def own_viewer(
     assert "Traceback" not in log.read_text(), log.read_text()[-3000:]
 
 
-def draw_in_software(page: Page) -> None:
+def draw_in_software(page: Page, sharpness: float) -> None:
     """Makes a page leave time to the server: it draws ten pictures per second at most, one where nothing happens, and
-    all at 0.4 of its resolution."""
+    all with so many pixels per pixel of the page and side."""
 
     def coarse(route: Route) -> None:
         try:
             answer = route.fetch()
-            route.fulfill(response=answer, body=_SHARPNESS.sub("0.4", answer.text()))
+            route.fulfill(response=answer, body=_SHARPNESS.sub(str(sharpness), answer.text()))
         except Error:  # the server is away, or the page has gone
             with suppress(Error):
                 route.abort()
@@ -103,10 +105,12 @@ def draw_in_software(page: Page) -> None:
 class Own:
     """One tab with the viewer of its own in it, used as a person would."""
 
-    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (960, 480)) -> None:
+    def __init__(
+        self, browser: Browser, address: str, size: tuple[int, int] = (960, 480), *, sharpness: float = COARSE
+    ) -> None:
         self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.page: Page = self.context.new_page()
-        draw_in_software(self.page)
+        draw_in_software(self.page, sharpness)
         self.size, self.problems = size, []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")

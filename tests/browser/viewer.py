@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
-from tests.browser.own_viewer import PANEL, draw_in_software, free_port
+from tests.browser.own_viewer import COARSE, PANEL, draw_in_software, free_port
 
 CHROMIUM = shutil.which("chromium")
 _FLAGS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -80,10 +80,12 @@ def _behind_the_server(script: Path) -> str | Path | None:
 class Tab:
     """One browser tab with the viewer in it, used as a person would."""
 
-    def __init__(self, browser: Browser, address: str, *, size: tuple[int, int] = _SIZE) -> None:
+    def __init__(
+        self, browser: Browser, address: str, *, size: tuple[int, int] = _SIZE, sharpness: float = COARSE
+    ) -> None:
         self.page: Page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self._size = size
-        draw_in_software(self.page)
+        draw_in_software(self.page, sharpness)
         self.problems: list[str] = []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")
