@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 from xxhash import xxh3_128
 
+from normlift_ns.core.ahead import ahead
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
@@ -28,7 +28,7 @@ from normlift_ns.raster.settings import RasterSettings
 
 _LARGEST_CHUNK = 16
 _READERS = 8
-"""Photographs that are read at a time."""
+"""Photographs that are read at a time, while one is looked at or a network loads."""
 _SMALLEST = 8
 """Pixels along a side of an image made smaller; fewer show nothing."""
 _KEY = "normlift_ns.block/6"
@@ -107,7 +107,7 @@ def observe_views(
     waiting: deque[View] = deque()
 
     def images() -> Iterator[tuple[Tensor, str]]:
-        for read in _read_ahead(scene.train.__getitem__, indices):
+        for read in ahead(scene.train.__getitem__, indices, _READERS):
             view = (
                 read if rendered is None else read._replace(image=render_picture(scene, read.camera, settings=rendered))
             )
@@ -130,20 +130,6 @@ def observe_views(
         block.features.append(found.features)
         done(view)
     return block
-
-
-def _read_ahead(read: Callable[[int], View], indices: Sequence[int]) -> Iterator[View]:
-    """The views in their order; while one is looked at, or a network loads, threads read the next ones."""
-    with ThreadPoolExecutor(_READERS, "photographs") as readers:
-        reading = deque(readers.submit(read, index) for index in indices[:_READERS])
-        try:
-            for index in [*indices[_READERS:], *[None] * len(reading)]:
-                view = reading.popleft().result()
-                if index is not None:
-                    reading.append(readers.submit(read, index))
-                yield view
-        finally:
-            readers.shutdown(cancel_futures=True)
 
 
 def _check_sizes(view: View) -> None:

@@ -17,7 +17,8 @@ from normlift_ns.core.portions import GRAIN, spatial_order
 from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
-_CHUNK_ELEMENTS = 2**24
+_CHUNK_ELEMENTS = (2**22, 2**24)
+"""Of a tensor in a vote by torch, on CPU, whose caches hold little, and GPU."""
 _BLOCK = (2 * GRAIN, 16 * GRAIN)
 """Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
 MOST_VOTERS = 256
@@ -199,7 +200,7 @@ def _vote(
     """Writes source[voters]; row_of[j] is the row of u_j."""
     dtype, numbers = torch.promote_types(directions.dtype, torch.float32), config.numbers
     reliability = reliability.to(dtype)
-    step = max(1, _CHUNK_ELEMENTS // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
+    step = max(1, _CHUNK_ELEMENTS[reliability.is_cuda] // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
     for i in voters.split(step):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1)  # N+, self first
         r = _gather(reliability, group)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
-from normlift_ns.demo.shapes import ON_SURFACE, Array, Distance, cover, length, surface_points
+from normlift_ns.demo.shapes import ON_SURFACE, Array, Distance, cover, each, length, points_near, projected
 from normlift_ns.errors import InputError
 
 HALF_WIDTH = 1.6
@@ -124,13 +125,13 @@ def built(parts: Sequence[Part], painter: Painter, area: float, num_gaussians: i
 def _surface(parts: Sequence[Part], painter: Painter, area: float, count: int, rng: np.random.Generator) -> _Gaussians:
     """All surfaces but those inside other parts."""
     low, high = np.array([-HALF_WIDTH, -HALF_WIDTH, 0]), np.array([HALF_WIDTH, HALF_WIDTH, HEIGHT])
-    samples = [
-        surface_points(part.shape, low, high, _POINTS_PER_GAUSSIAN * count * part.detail / area, rng) for part in parts
-    ]
-    samples = _uncovered(parts, samples)
+    density, shapes = _POINTS_PER_GAUSSIAN * count / area, [part.shape for part in parts]
+    near = [points_near(part.shape, low, high, density * part.detail, rng) for part in parts]
+    samples = _uncovered(shapes, each(partial(projected, low=low, high=high), shapes, near))
     bounds = np.cumsum([len(points) for points in samples])
     counts = np.diff(np.rint(bounds / bounds[-1] * count).astype(int), prepend=0)
-    covers = [cover(part.shape, points, n, rng) for part, points, n in zip(parts, samples, counts)]
+    first = [rng.choice(len(points), n, replace=False) for points, n in zip(samples, counts)]
+    covers = each(cover, shapes, samples, first)
     means, normals, radii, thickness = (np.concatenate(values) for values in zip(*covers))
     labels = np.repeat(np.arange(len(parts)), counts)
     scales = np.stack([radii, radii, thickness], axis=1)
@@ -138,21 +139,25 @@ def _surface(parts: Sequence[Part], painter: Painter, area: float, count: int, r
     return _Gaussians(means, normals, scales, np.full(count, _OPACITY), colors, labels)
 
 
-def _uncovered(parts: Sequence[Part], samples: Sequence[Array]) -> list[Array]:
+def _uncovered(shapes: Sequence[Distance], samples: Sequence[Array]) -> list[Array]:
     """Those points of each part that lie inside no other part."""
     boxes = [
         (points.min(axis=0, initial=np.inf) - _REACH, points.max(axis=0, initial=-np.inf) + _REACH)
         for points in samples
     ]
-    found = []
-    for part, points in zip(parts, samples):
-        free = np.ones(len(points), bool)
-        for other, (low, high) in zip(parts, boxes):
-            near = np.flatnonzero(free & ((points > low) & (points < high)).all(axis=1))
-            if other is not part:
-                free[near] = other.shape(points[near]) > ON_SURFACE
-        found.append(points[free])
-    return found
+
+    def uncovered(shape: Distance, points: Array) -> Array:
+        left, axes = np.ones(len(points), bool), points.T.copy()
+        for other, (low, high) in zip(shapes, boxes):
+            if other is not shape:
+                inside = left.copy()
+                for axis, least, most in zip(axes, low, high):
+                    inside &= (axis > least) & (axis < most)
+                near = np.flatnonzero(inside)
+                left[near] = other(points[near]) > ON_SURFACE
+        return points[left]
+
+    return each(uncovered, shapes, samples)
 
 
 def _strays(parts: Sequence[Part], surface: _Gaussians, count: int, rng: np.random.Generator) -> _Gaussians:

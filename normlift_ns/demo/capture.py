@@ -63,7 +63,7 @@ def write_capture(
         color, shares = render(room.scene, camera, channels)[0].tensor_split([3], dim=2)
         for file, pixels in ((path, _image(color)), (f"instance/{Path(path).name}", _labels(shares))):
             with new_file(folder / file, overwrite=True) as draft:
-                Image.fromarray(pixels.numpy()).save(draft)
+                Image.fromarray(pixels.numpy()).save(draft, compress_level=1)
     (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
     transforms = {
         "camera_model": "OPENCV",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ ON_SURFACE = 1e-3
 """Nearer points count as lying on the surface, metres."""
 _OVERLAP = 2.6
 """Standard deviation of a Gaussian in units of that of its patch; large enough to close the surface."""
+_SHELL = 0.02
+"""Half the thickness of the layer whose points are projected onto the surface, metres."""
 _MIN_SCALE = 1e-3
 """Metres."""
 _CREASE = 0.03
@@ -115,31 +118,46 @@ def normals(shape: Distance, points: Array) -> Array:
     return gradient / length(gradient)[:, None].clip(1e-12)
 
 
-def surface_points(shape: Distance, low: Array, high: Array, density: float, rng: np.random.Generator) -> Array:
-    """Random points on the surface within the box `low`..`high`, [n, 3], about `density` of them per square metre."""
-    cell, shell = 0.1, 0.02  # side of a search cell; half thickness of the layer that is projected onto the surface
+def each(function: Callable[..., Any], *items: Iterable[Any]) -> list[Any]:
+    """As map, on all cores: NumPy and SciPy let other threads work while they are in a long array."""
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(function, *items))
+
+
+def points_near(shape: Distance, low: Array, high: Array, density: float, rng: np.random.Generator) -> Array:
+    """Random points around the surface within the box `low`..`high`, [m, 3], of which `projected` leaves about
+    `density` per square metre.
+    """
+    cell = 0.1  # side of a search cell
     ticks = [np.arange(a - cell / 2, b + cell, cell) for a, b in zip(low, high)]
     centres = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    centres = centres[np.abs(shape(centres)) < cell + shell]
-    count = int(density * len(centres) * cell**3 / (2 * shell))
-    points = centres[rng.integers(len(centres), size=count)] + rng.uniform(-cell / 2, cell / 2, (count, 3))
-    points = points[np.abs(shape(points)) < shell]
+    centres = centres[np.abs(shape(centres)) < cell + _SHELL]
+    count = int(density * len(centres) * cell**3 / (2 * _SHELL))
+    return centres[rng.integers(len(centres), size=count)] + rng.uniform(-cell / 2, cell / 2, (count, 3))
+
+
+def projected(shape: Distance, points: Array, low: Array, high: Array) -> Array:
+    """Those points that are near the surface, moved onto it, as far as they are in the box `low`..`high` then, [n, 3].
+    """
+    points = points[np.abs(shape(points)) < _SHELL]
     for _ in range(2):
         points = points - shape(points)[:, None] * normals(shape, points)
     inside = ((points >= low - ON_SURFACE) & (points <= high + ON_SURFACE)).all(axis=1)
     return points[inside & (np.abs(shape(points)) < ON_SURFACE)]
 
 
-def cover(shape: Distance, points: Array, count: int, rng: np.random.Generator) -> Surfels:
-    """Cuts a surface into `count` compact patches (k-means) and lays one Gaussian over each.
+def cover(shape: Distance, points: Array, first: NDArray[np.int64]) -> Surfels:
+    """Cuts a surface into compact patches (k-means) and lays one Gaussian over each.
 
     Args:
         points: [m, 3], a dense sample of the surface, at least ten points a patch.
+        first: [n], the points in whose places the patches start.
     """
+    count = len(first)
     if count == 0:
         return Surfels(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
     sample = np.hstack([points, _CREASE * normals(shape, points)])
-    centres = rng.choice(sample, count, replace=False)
+    centres = sample[first]
     for _ in range(6):
         centres = _patch_means(sample, _nearest(centres, sample), centres)
     means, normal = (

@@ -115,6 +115,10 @@ class CachedRegions:
         return self.regions.identity
 
     @property
+    def at_once(self) -> int:
+        return self.regions.at_once
+
+    @property
     def chosen(self) -> tuple[int, ...]:
         return self.regions.chosen
 

@@ -20,6 +20,8 @@ from normlift_ns.errors import InputError
 _SUFFIXES, _FORMATS = (".png", ".npy"), ("PNG",)
 _MOST_BYTES = 2**31
 """Of a label map."""
+_AT_ONCE = min(8, os.cpu_count() or 1)
+"""Images that are cut at a time: the memory of a large one is many times its size."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,10 @@ class Superpixels:
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "superpixel", "count": self.count, "compactness": self.compactness}
+
+    @property
+    def at_once(self) -> int:
+        return _AT_ONCE
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -75,6 +81,10 @@ class Grid:
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "grid", "count": self.count}
+
+    @property
+    def at_once(self) -> int:
+        return 1
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -125,6 +135,10 @@ class LabelFiles:
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "files", "background": self.background, "resample": self.resample}
+
+    @property
+    def at_once(self) -> int:
+        return _AT_ONCE
 
     @property
     def chosen(self) -> tuple[int, ...]:

@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
+from normlift_ns.core.ahead import ahead
 from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 from normlift_ns.errors import InputError
 
@@ -134,6 +135,11 @@ class Regions(Protocol):
         """The levels of `labels` that count, by number; (): the only one."""
         ...
 
+    @property
+    def at_once(self) -> int:
+        """How many images to ask `labels` for at a time, each in a thread; 1 for a network, which fills its device."""
+        ...
+
     def files(self, name: str) -> tuple[Path, ...]:
         """The files beside the image that `labels` reads for it.
 
@@ -206,14 +212,12 @@ class RegionFeatures:
         cut: deque[tuple[Tensor, Tensor]] = deque()  # cells, and their regions in the chosen levels
 
         def levels() -> Iterator[tuple[Tensor, Tensor]]:
-            for image, name in images:
-                check_image(image, name)
-                maps = self._maps(image.cpu(), name)
-                chosen = list(self.regions.chosen or (0,))
+            chosen = list(self.regions.chosen or (0,))
+            for image, maps in ahead(self._cut, images, self.regions.at_once):
                 cells, regions = joint_partition(maps[:, 0])
                 cut.append((cells.cpu(), regions[chosen].cpu()))
                 for level in chosen:
-                    yield image.cpu(), maps[level]
+                    yield image, maps[level]
 
         encoded = self.encoder.encode_each(levels())
         for rows in encoded:
@@ -222,14 +226,17 @@ class RegionFeatures:
             first = torch.tensor([0, *map(len, features)]).cumsum(0)[:-1, None].int()
             yield ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + first, -1))
 
-    def _maps(self, image: Tensor, name: str) -> Int32[Tensor, "levels depth h w"]:
-        """The label maps, which have the chosen levels."""
+    def _cut(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
+        """An image, on the CPU, and its label maps, which have the chosen levels."""
+        image, name = view
+        check_image(image, name)
+        image = image.cpu()
         maps = self.regions.labels(image, name)
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
             found = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
             raise InputError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
-        return maps
+        return image, maps
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)

@@ -25,6 +25,8 @@ from normlift_ns.viewer.sheets import Found, Sheet, contact_sheet, picture_of
 
 SHEET = "contact_sheet"
 """What contact sheets are called, where other pictures have the name of their view."""
+_ZLIB_LEVEL = 4
+"""PIL's own, 6, takes twice as long for files that are 6% smaller."""
 
 
 def save_overlays(
@@ -65,11 +67,11 @@ def save_overlays(
             overlays[q].append((view, *overlay))
             paths.append(folder / files[view][q])
             with new_file(paths[-1], overwrite=overwrite) as draft:
-                picture_of(sheet, found[q], view, photograph, *overlay).save(draft, "PNG")
+                picture_of(sheet, found[q], view, photograph, *overlay).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
     for q, name in enumerate(sheets):
         paths.append(folder / name)
         with new_file(paths[-1], overwrite=overwrite) as draft:
-            contact_sheet(sheet, found[q], overlays[q]).save(draft, "PNG")
+            contact_sheet(sheet, found[q], overlays[q]).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
     return paths
 
 

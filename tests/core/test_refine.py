@@ -246,7 +246,7 @@ def test_a_margin_counts_where_a_support_without_shift_is_nothing():
 def test_chunks_do_not_change_the_vote(monkeypatch):
     means, u, r = scene(1)
     whole = refine(means, u, r, RefineConfig(vote="paper", k=12))
-    monkeypatch.setattr("normlift_ns.core.refine._CHUNK_ELEMENTS", 13 * 13 * 3)
+    monkeypatch.setattr("normlift_ns.core.refine._CHUNK_ELEMENTS", (13 * 13 * 3, 13 * 13 * 3))
     assert torch.equal(refine(means, u, r, RefineConfig(vote="paper", k=12)), whole)
 
 

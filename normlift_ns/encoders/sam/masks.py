@@ -123,6 +123,10 @@ class SamMasks:
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
     @property
+    def at_once(self) -> int:
+        return 1
+
+    @property
     def chosen(self) -> tuple[int, ...]:
         return (LEVELS.index(self.level),)
 

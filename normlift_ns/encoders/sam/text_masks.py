@@ -166,6 +166,10 @@ class Sam3Masks:
         return {**self._kind, "texts": list(self.texts)}
 
     @property
+    def at_once(self) -> int:
+        return 1
+
+    @property
     def chosen(self) -> tuple[int, ...]:
         return ()
 
