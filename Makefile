@@ -9,11 +9,15 @@ BESIDE := -n $(WORKERS) --dist loadfile
 
 .PHONY: check style changed-types quick-tests test test-slow test-viser1 soak torture demo docs bench lint format clean
 
+# Compiles the kernels of the CPU rasterizer that no cache holds, which takes half a minute for each precision
+KERNELS = import torch; from normlift_ns.raster.numba import warm; warm($(1)).join()
+
 .venv/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 12) else f"Python 3.10 to 3.12 is needed, this is {v[0]}.{v[1]}; try: make PYTHON=python3.11 $(MAKECMDGOALS)")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet "uv>=0.5"
 	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv pip install --quiet --compile-bytecode -e ".[dev]"
+	$(BIN)/python -W ignore -c "$(call KERNELS,torch.float32)"
 	touch $@
 
 style: .venv/installed
@@ -36,10 +40,10 @@ QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metric
 quick-tests: .venv/installed
 	$(BIN)/pytest -q $(BESIDE) -m "not slow" $(QUICK) tests/test_imports.py
 
-# Kernels that no cache holds are compiled on the other core while types are checked
-KERNELS := import torch; from normlift_ns.raster.numba import warm; warm(torch.float32, torch.float64).join()
+# Kernels are compiled on the other core while types are checked
+BOTH := torch.float32, torch.float64
 test: style
-	@echo $(BIN)/basedpyright; $(BIN)/python -W ignore -c "$(KERNELS)" & $(BIN)/basedpyright; types=$$?; wait; exit $$types
+	@echo $(BIN)/basedpyright; $(BIN)/python -W ignore -c "$(call KERNELS,$(BOTH))" & $(BIN)/basedpyright; types=$$?; wait; exit $$types
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow"
 
 # A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from normlift_ns import Camera, GaussianScene
 from normlift_ns.demo import DemoRoom
-from normlift_ns.demo.shapes import ON_SURFACE, Array, Distance, cover, length, surface_points, union
+from normlift_ns.demo.shapes import ON_SURFACE, Array, Distance, cover, length, points_near, projected, union
 
 POINTS_PER_GAUSSIAN = 12
 STRAYS, FLOATERS = 0.08, 0.03
@@ -76,13 +76,17 @@ def _surface(plan: Plan, count: int, rng: np.random.Generator) -> tuple[Array, A
     area = 2 * plan.height * sides.sum() + 4 * sides.prod() + 60  # about, each part times its density
     samples = []
     for i, (_, _, dense, shape) in enumerate(all_parts):
-        points = surface_points(shape, low, high, POINTS_PER_GAUSSIAN * count * dense / area, rng)
+        near = points_near(shape, low, high, POINTS_PER_GAUSSIAN * count * dense / area, rng)
+        points = projected(shape, near, low, high)
         others = union(*(other for j, (*_, other) in enumerate(all_parts) if j != i))
         samples.append(points[others(points) > ON_SURFACE])
     bounds = np.cumsum([len(points) for points in samples])
     counts = np.diff(np.rint(bounds / bounds[-1] * count).astype(int), prepend=0)
     with np.errstate(invalid="ignore"):  # both sides of a thin board in one patch
-        covers = [cover(shape, points, n, rng) for (*_, shape), points, n in zip(all_parts, samples, counts)]
+        covers = [
+            cover(shape, points, rng.choice(len(points), n, replace=False))
+            for (*_, shape), points, n in zip(all_parts, samples, counts)
+        ]
     means, normals, radii, thickness = (np.concatenate(values) for values in zip(*covers))
     normals[~np.isfinite(normals).all(axis=1)] = (0, 0, 1)
     thickness = np.nan_to_num(thickness, nan=MIN_THICKNESS).clip(MIN_THICKNESS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -95,31 +94,3 @@ def test_a_file_of_version_0_1_is_rasterized_again(rasterized: list[int], tmp_pa
     Evidence.load(path, key=path.stem).save(path)  # whole, but without the key
     assert torch.equal(evidence_of(0, tmp_path), expected)
     assert len(rasterized) == 2
-
-
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 30])
-def test_photographs_are_read_ahead_in_their_order(count):
-    started: list[int] = []
-
-    def read(index):
-        started.append(index)
-        return index * 10
-
-    views = observing._read_ahead(read, range(100, 100 + count))
-    assert list(islice(views, 3)) == [1000, 1010, 1020][:count]
-    assert len(started) <= 3 + observing._READERS
-    assert list(views) == [index * 10 for index in range(100 + min(count, 3), 100 + count)]
-    assert sorted(started) == list(range(100, 100 + count))
-
-
-def test_a_photograph_that_cannot_be_read_is_told_when_its_turn_comes():
-    def read(index):
-        if index == 4:
-            raise FileNotFoundError("photograph 4")
-        return index
-
-    seen = []
-    with pytest.raises(FileNotFoundError, match="photograph 4"):
-        for view in observing._read_ahead(read, range(20)):
-            seen.append(view)
-    assert seen == [0, 1, 2, 3]

@@ -137,8 +137,7 @@ def points_near(shape: Distance, low: Array, high: Array, density: float, rng: n
 
 
 def projected(shape: Distance, points: Array, low: Array, high: Array) -> Array:
-    """Those points that are near the surface, moved onto it, as far as they are in the box `low`..`high` then, [n, 3].
-    """
+    """Those points near the surface, moved onto it, that are in the box `low`..`high` then, [n, 3]."""
     points = points[np.abs(shape(points)) < _SHELL]
     for _ in range(2):
         points = points - shape(points)[:, None] * normals(shape, points)
