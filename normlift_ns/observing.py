@@ -14,10 +14,10 @@ from jaxtyping import Float, Int32, Int64, UInt8
 from torch import Tensor
 from xxhash import xxh3_128
 
-from normlift_ns.core.ahead import ahead
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
+from normlift_ns.encoders.ahead import ahead
 from normlift_ns.encoders.source import FeatureSource, each_view
 from normlift_ns.encoders.undistorted import check_undistorted
 from normlift_ns.errors import InputError

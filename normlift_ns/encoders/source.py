@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
-from normlift_ns.core.ahead import ahead
+from normlift_ns.encoders.ahead import ahead
 from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 from normlift_ns.errors import InputError
 

@@ -5,7 +5,7 @@ from threading import get_ident
 
 import pytest
 
-from normlift_ns.core.ahead import ahead
+from normlift_ns.encoders.ahead import ahead
 
 
 @pytest.mark.parametrize("threads", [1, 2, 8])
