@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -123,7 +124,8 @@ def read_tensors(path: Path, writer: str, advice: str) -> Any:
         raise FileNotFoundError(f"There is no file {path}. Expected what torch.save writes; {advice}.")
     _check_sums(path, advice)
     try:
-        with numbers_allowed():
+        with numbers_allowed(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "TypedStorage is deprecated")  # torch 2.1 warns of what it does itself
             return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         found = re.search(r"(?:GLOBAL|Unsupported class) (\S+)", str(error))

@@ -50,7 +50,8 @@ class Demo:
     def main(self) -> dict[str, float]:
         """Runs the demo; returns mIoU before and after refinement."""
         CONSOLE.rule("A room made in code")
-        warnings.simplefilter("ignore", FutureWarning)  # of packages that others must mend
+        for category in (FutureWarning, SyntaxWarning):  # of packages that others must mend
+            warnings.simplefilter("ignore", category)
         # Kernels that no cache holds are compiled on another core meanwhile.
         compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
