@@ -52,7 +52,7 @@ class Tree(NamedTuple):
     """A balanced k-d tree of L = 2 ** depth leaves; nodes in heap order, root 1, leaves L..2 L - 1."""
 
     index: Int64[Tensor, " slots"]
-    """Leaf l holds the points index[32 l:32 l + 32]; -1 for none."""
+    """Leaf l holds the points index[32 l:32 l + 32]; -1 for none, behind all points."""
     points: Float32[Tensor, "slots 3"]
     boxes: Float32[Tensor, "nodes 6"]
     """Least and greatest coordinates of each node; the box of an empty node is at infinity."""
@@ -253,11 +253,11 @@ def nearest(
     tree, device, wanted = build_tree(points, team), points.device, k + SPARE
     n, leaves = len(points) if of is None else len(of), len(tree.index) // LEAF
     row_of = torch.arange(len(points), dtype=torch.int32, device=device)
-    asked = torch.arange(leaves, dtype=torch.int32, device=device)
+    asked = torch.arange(-(-len(points) // LEAF), dtype=torch.int32, device=device)  # the others are empty
     if of is not None:
         row_of = torch.full_like(row_of, -1).index_copy_(0, of, row_of[:n])
         rows = torch.where(tree.index < 0, -1, row_of[tree.index.clamp(min=0)])
-        asked = asked[(rows.view(leaves, LEAF) >= 0).any(dim=1)]
+        asked = (rows.view(leaves, LEAF) >= 0).any(dim=1).nonzero().squeeze(1).int()
     found = Found(
         torch.empty(n, k, dtype=torch.int32, device=device),
         torch.empty(n, k, device=device),
