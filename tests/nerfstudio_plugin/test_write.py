@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import resource
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -158,7 +159,8 @@ def test_a_failure_leaves_nothing_and_keeps_what_was_there(
 
 
 @pytest.mark.parametrize("limit", [500, 4000])  # the first file, the checkpoint
-def test_a_full_disk_is_an_os_error(copied: Path, limit: int) -> None:
+def test_a_full_disk_is_an_os_error(copied: Path, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # what is imported now would be cut off in Python's cache
     source = load_scene(copied)
     field = lifted_field(source)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
