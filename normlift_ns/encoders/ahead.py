@@ -15,8 +15,8 @@ Result = TypeVar("Result")
 def ahead(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
     """As `map`, but as many of the next items as there are threads are worked on while a result is used.
 
-    Items are asked for in the caller's thread. What the function raises is raised when its turn comes. With one thread
-    nothing is done ahead.
+    Items are asked for in the caller's thread. What they or the function raise is raised when its turn comes. With one
+    thread nothing is done ahead.
 
     >>> list(ahead(abs, [-1, 2, -3], 2))
     [1, 2, 3]
@@ -25,12 +25,20 @@ def ahead(function: Callable[[Item], Result], items: Iterable[Item], threads: in
         yield from map(function, items)
         return
     left, waiting = iter(items), deque[Future[Result]]()
+
+    def start(count: int) -> None:
+        try:
+            waiting.extend(pool.submit(function, item) for item in islice(left, count))
+        except Exception as error:  # of the items
+            waiting.append(Future())
+            waiting[-1].set_exception(error)
+
     with ThreadPoolExecutor(threads) as pool:
         try:
-            waiting.extend(pool.submit(function, item) for item in islice(left, threads))
+            start(threads)
             while len(waiting) > 0:
                 result = waiting.popleft().result()
-                waiting.extend(pool.submit(function, item) for item in islice(left, 1))
+                start(1)
                 yield result
         finally:
             pool.shutdown(cancel_futures=True)

@@ -20,8 +20,8 @@ from normlift_ns.errors import InputError
 _SUFFIXES, _FORMATS = (".png", ".npy"), ("PNG",)
 _MOST_BYTES = 2**31
 """Of a label map."""
-_AT_ONCE = min(8, os.cpu_count() or 1)
-"""Images that are cut at a time: the memory of a large one is many times its size."""
+_AT_ONCE = min(4, os.cpu_count() or 1)
+"""Images that are cut at a time: superpixels need many times the memory of their image."""
 
 
 @dataclass(frozen=True)

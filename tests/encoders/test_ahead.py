@@ -38,6 +38,19 @@ def test_what_fails_is_told_when_its_turn_comes(threads: int) -> None:
     assert seen == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("threads", [1, 2, 8])
+def test_an_item_that_cannot_be_had_is_told_when_its_turn_comes(threads: int) -> None:
+    def items():
+        yield from range(4)
+        raise FileNotFoundError("photograph 4")
+
+    seen = []
+    with pytest.raises(FileNotFoundError, match="photograph 4"):
+        for found in ahead(lambda index: index, items(), threads):
+            seen.append(found)
+    assert seen == [0, 1, 2, 3]
+
+
 def test_who_stops_asking_waits_for_nothing_that_has_not_begun() -> None:
     started: list[int] = []
     found = ahead(started.append, range(1000), 2)
