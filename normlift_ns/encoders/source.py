@@ -242,6 +242,11 @@ class RegionFeatures:
         return self.encoder.text(prompts)
 
 
+def cut_at_once(source: FeatureSource) -> int:
+    """How many images a source works on at a time."""
+    return source.regions.at_once if isinstance(source, RegionFeatures) else 1
+
+
 def each_view(source: FeatureSource, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
     """`source.view` of several images, in their order, but for rounding. Images are asked for as they are needed:
     several where an encoder sees the regions of several at once."""

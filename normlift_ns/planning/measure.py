@@ -21,7 +21,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.encoders.cache import NotKeptError, only_kept
-from normlift_ns.encoders.source import FeatureSource
+from normlift_ns.encoders.source import FeatureSource, cut_at_once
 from normlift_ns.lifting import Drawing, drawing_of, get_ready
 from normlift_ns.observing import Block, block_evidence, observe_views, spread, view_keys
 from normlift_ns.options import LiftOptions
@@ -33,11 +33,12 @@ from normlift_ns.stages import peak_gib
 Clock = Callable[[], float]
 Result = TypeVar("Result")
 LOOKED_AT = 4
-"""Views that are encoded for real, at most."""
+"""Views that are rasterized for real, at most, and encoded; more are encoded where several are cut at a time."""
 _LOADED = 3.0
 """Seconds that kernels take at most to be loaded; longer, they were compiled, which is done once."""
 _ENOUGH = 20.0
-"""Seconds of the first view from which on only one other is looked at: how many of them were loading is not known."""
+"""Seconds of the first view from which on only as many others are looked at as are cut at a time: how many of these
+seconds were loading is not known."""
 _LOOKED_UP = 16
 """Views that are looked up in the cache, at most."""
 
@@ -99,10 +100,11 @@ def measure(
             with suppress(NotKeptError):
                 kept[index] = look([index], there).block
     new = [index for index in chosen if index not in kept]
-    seen, load_s = _seen([new[i] for i in spread(len(new), LOOKED_AT)], partial(look, seen=source))
+    at_once = cut_at_once(source)
+    encoded = [new[i] for i in spread(len(new), max(LOOKED_AT, 1 + 2 * at_once))]
+    seen, load_s = _seen(encoded, partial(look, seen=source), at_once)
     kept_s = look(list(kept)[:_LOOKED_UP], there).seconds / len(kept) if len(kept) > 0 else None
-    old = [kept[index] for index in list(kept)[: LOOKED_AT - len(seen.block.cameras)]]
-    some = _joined([seen.block, *old])
+    some = Block(*(part[:LOOKED_AT] for part in _joined([seen.block, *kept.values()])))
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
         rasterize = partial(_evidence, gaussians, some, scene, options, drawing, Path(folder))
         if cuda:  # kernels for labels like these are compiled once for all lifts
@@ -139,18 +141,18 @@ def measure(
         view_bytes=maps / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
         device_bytes=held,
-        looked_at=count,
+        looked_at=max(count, len(seen.block.cameras)),
     )
 
 
-def _seen(indices: Sequence[int], look: Callable[[Sequence[int]], _Look]) -> tuple[_Look, float]:
+def _seen(indices: Sequence[int], look: Callable[[Sequence[int]], _Look], at_once: int) -> tuple[_Look, float]:
     """Views as a lift sees them once networks are loaded, and the seconds until they are."""
     if len(indices) == 0:
         return _Look(Block([], [], [], []), 0.0), 0.0
     first = look(indices[:1])
     if len(indices) == 1:
         return first, 0.0
-    others = indices[1 : 2 if first.seconds > _ENOUGH else None]
+    others = indices[1 : 1 + at_once if first.seconds > _ENOUGH else None]
     rest = look(others)
     each = rest.seconds / len(others)
     return _Look(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)

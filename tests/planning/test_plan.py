@@ -65,8 +65,8 @@ def test_what_is_cached_costs_no_disk_and_no_network() -> None:
     assert (kept.features_kept, kept.evidence_kept, new.features_kept) == (40, 40, 0)
 
 
-@pytest.mark.parametrize(("first_s", "looked_at"), [(5.0, 4), (60.0, 2)])
-def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, looked_at: int) -> None:
+@pytest.mark.parametrize(("first_s", "at_once", "looked_at"), [(5.0, 1, 4), (60.0, 1, 2), (60.0, 2, 3)])
+def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, at_once: int, looked_at: int) -> None:
     """Loading took a minute on a cold disk, and a photograph half a second."""
     seen: list[int] = []
 
@@ -75,7 +75,7 @@ def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, looked_
         seen.extend(indices)
         return _Look(Block([], [], [], []), seconds)
 
-    found, load_s = _seen([3, 5, 7, 9], look)
+    found, load_s = _seen([3, 5, 7, 9], look, at_once)
     assert seen == [3, 5, 7, 9][:looked_at]
     assert found.seconds == pytest.approx(0.5 * looked_at)
     assert load_s == pytest.approx(first_s - 0.5)
