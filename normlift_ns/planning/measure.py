@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
@@ -104,7 +104,7 @@ def measure(
     encoded = [new[i] for i in spread(len(new), max(LOOKED_AT, 1 + 2 * at_once))]
     seen, load_s = _seen(encoded, partial(look, seen=source), at_once)
     kept_s = look(list(kept)[:_LOOKED_UP], there).seconds / len(kept) if len(kept) > 0 else None
-    some = Block(*(part[:LOOKED_AT] for part in _joined([seen.block, *kept.values()])))
+    some = _joined([seen.block, *kept.values()], LOOKED_AT)
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
         rasterize = partial(_evidence, gaussians, some, scene, options, drawing, Path(folder))
         if cuda:  # kernels for labels like these are compiled once for all lifts
@@ -158,9 +158,10 @@ def _seen(indices: Sequence[int], look: Callable[[Sequence[int]], _Look], at_onc
     return _Look(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)
 
 
-def _joined(blocks: Sequence[Block]) -> Block:
+def _joined(blocks: Sequence[Block], most: int | None = None) -> Block:
+    """The views of all blocks, as far as there are no more than `most`."""
     parts = zip(Block([], [], [], []), *blocks)
-    return Block(*(list(chain.from_iterable(cast(Any, part))) for part in parts))
+    return Block(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
 
 def _evidence(
