@@ -173,6 +173,16 @@ def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(bod
     assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
 
 
+@pytest.mark.parametrize(("given", "found"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
+def test_threads_that_wait_sleep_unless_the_user_says_otherwise(given, found, tmp_path):
+    body = "print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+    program = PROGRAM.format(body=textwrap.indent(body, " " * 8)).replace("run_command", "run_process")
+    state = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    state |= {"XDG_STATE_HOME": str(tmp_path), **given}
+    done = subprocess.run([sys.executable, "-c", program], env=state, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [found, "False"]
+
+
 @pytest.mark.parametrize("command", ["lift", "query", "export", "evaluate", "view", "batch"])
 def test_ctrl_c_while_a_command_is_loaded(command):
     """Its modules raise what Python raises for Ctrl-C."""
