@@ -91,7 +91,7 @@ RANGES: dict[str, Range] = {
     # many captures
     "patience": Range(1.0, 86400.0, "in 1..86400"),
     # the demo
-    "num_gaussians": _at_least(1, 10**8),
+    "num_gaussians": _at_least(2000, 10**8),
     "views": _at_least(3, 10**5),
 }
 """Every option that is a number, by its name. nan and infinity are in no range."""

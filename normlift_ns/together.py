@@ -99,10 +99,11 @@ def lift_run_together(
         tidy(run_dir)
     if timestamp is not None and team.rank == 0:
         refuse_existing_run(run_dir, overwrite)
-    say(f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, on {device}")
+    how, stages = lift or LiftOptions(), Stages(report)
+    some = "" if how.max_views is None else f"{min(how.max_views, len(scene.train))} of "
+    say(f"{len(scene.gaussians):,} Gaussians, {some}{len(scene.train)} training views, on {device}")
     for remark in scene.remarks:
         say(f"Warning: {remark}")
-    how, stages = lift or LiftOptions(), Stages(report)
     if export is not None:
         _refuse_equal_stems(scene.train.names)
     settings = encoder_settings(options)

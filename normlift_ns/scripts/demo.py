@@ -18,6 +18,7 @@ from rich.table import Table
 from normlift_ns.core.files import new_file, write_text
 from normlift_ns.options import AskOptions, SourceOptions
 from normlift_ns.ranges import check_options
+from normlift_ns.scripts.early import writable_folder
 from normlift_ns.scripts.lift import NormLift
 from normlift_ns.scripts.query import NormLiftQuery
 from normlift_ns.scripts.shared import CONSOLE, run_process, say
@@ -38,17 +39,18 @@ class Demo:
     """Make a room and a trained run of it, lift it with ns-normlift and search it for things by their names."""
 
     folder: Path = Path("demo")
-    """Where everything is written; what an earlier demo left there is replaced."""
+    """Where everything is written; files of the same names are replaced."""
     num_gaussians: int = 45_000
-    """Size of the room."""
+    """Size of the room, at least 2,000."""
     views: int = 24
-    """Number of training views."""
+    """Number of training views, at least 3."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def main(self) -> dict[str, float]:
         """Runs the demo; returns mIoU before and after refinement."""
+        writable_folder(self.folder, "--folder")
         CONSOLE.rule("A room made in code")
         for category in (FutureWarning, SyntaxWarning):  # of packages that others must mend
             warnings.simplefilter("ignore", category)

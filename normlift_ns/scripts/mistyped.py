@@ -25,7 +25,7 @@ _WORDS = (
     (r"\n+ *Got errors:(?:\n *- .*)*", r""),
     (r" *Argument helptext:\n", r""),
     (r"^ {3,}(--\S+ \S.*)\n +", r"\1: "),
-    (r"For full helptext, (?:run|see):?\s+(\S+) --help", r"\n\nAll options: \1 --help"),
+    (r"For full helptext, (?:run|see):?\s+(\S.*?) --help", r"\n\nAll options: \1 --help"),
 )
 """What it says, and how it is said here; a version that says it otherwise is quoted."""
 

@@ -116,15 +116,19 @@ def dry_run(command: Command, begun: float) -> Plan:
 
 def plan_table(plan: Plan) -> Table:
     """The stages of a plan, their seconds and what of them is cached, and what it needs besides."""
-    title = f"{plan.gaussians:,} Gaussians, {plan.views} views, on {plan.device}"
+    title = f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}"
     table = Table("stage", title=title)
     table.add_column("seconds", justify="right")
     table.add_column("cached")
     for stage in plan.stages:
         table.add_row(STAGES.get(stage.name, stage.name), f"{stage.seconds:.1f}", stage.remark)
     table.add_section()
-    table.add_row("total", f"{plan.seconds:.1f}", f"from {plan.looked_at} views that were looked at")
+    table.add_row("total", f"{plan.seconds:.1f}", f"from a look at {_views(plan.looked_at)}")
     return table
+
+
+def _views(count: int) -> str:
+    return f"{count} view{'s' * (count != 1)}"
 
 
 def needs(plan: Plan) -> str:

@@ -141,11 +141,18 @@ def read_flags(command: type[_Command], words: Sequence[str], name: str | None =
         InputError: words that it does not know.
         SystemExit: its help, with code 0.
     """
+    name = name or _module_name()
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
     words = with_values(words, switches(command))
     helping = {"-h", "--help"} & set(words)
     with nullcontext() if helping else plain_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=words, description=f"{summary(command)} {terminal.FLAGS}")
+
+
+def _module_name() -> str | None:
+    """What starts a command that has no name of its own; None: the name under which it was started."""
+    started = Path(sys.argv[0])
+    return f"python -m {__package__}.{started.stem}" if started.parent == Path(__file__).parent else None
 
 
 def switches(options: Any) -> set[str]:

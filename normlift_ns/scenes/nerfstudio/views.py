@@ -172,7 +172,8 @@ class TrainedViews:
             ) from error
         except Exception as error:  # Pillow's readers raise whatever a file leads them to
             raise InputError(
-                f"{file} or its mask cannot be read ({error}). Expected an 8-bit image; copy it again from the capture."
+                f"{file}{'' if masks is None else ' or its mask'} cannot be read ({error}). Expected an 8-bit image; "
+                "copy it again from the capture."
             ) from error
         if self._reading.instead is not None and any(self._reading.instead) and mask is not None:
             filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._reading.instead)
