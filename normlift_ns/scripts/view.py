@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import socket
-import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from normlift_ns.errors import InputError
 from normlift_ns.ranges import check_device, check_options
@@ -62,7 +62,7 @@ class NormLiftView:
         say(f"The viewer is at http://{host}:{door.server.port} (Ctrl-C ends it)")
         try:
             self.open(door)
-            threading.Event().wait()
+            until_stopped()
         except (KeyboardInterrupt, Terminated):
             say("Stopped.")
 
@@ -86,6 +86,14 @@ class NormLiftView:
         shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.share_readonly, lambda: run.votes)
         people = People(shared)
         door.open(f"normlift: {run.scene.name}", people.come, people.go)
+
+
+def until_stopped() -> NoReturn:
+    """Waits for Ctrl-C or SIGTERM. It looks every second: a signal that reaches another thread of the process, or this
+    one just before it waits, would not wake a wait without end.
+    """
+    while True:
+        time.sleep(1)
 
 
 def _check_host(host: str) -> None:

@@ -173,6 +173,21 @@ def test_a_process_ends_at_once_with_its_code_its_output_and_its_last_duties(bod
     assert (done.returncode, done.stdout.split()) == (code, ["done", "duty"])
 
 
+def test_a_server_ends_where_another_thread_gets_the_signal(tmp_path):
+    """It wakes no wait of the main thread: a viewer that had been told to end went on."""
+    body = """
+        import signal, threading
+        from normlift_ns.scripts.view import until_stopped
+        def tell():
+            time.sleep(0.5)
+            signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+        threading.Thread(target=tell).start()
+        until_stopped()
+    """
+    code, _, err = ended(body, state=tmp_path)
+    assert (code, "Terminated" in err) == (143, True)
+
+
 @pytest.mark.parametrize(("given", "found"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
 def test_threads_that_wait_sleep_unless_the_user_says_otherwise(given, found, tmp_path):
     body = "print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
