@@ -83,7 +83,7 @@ def run_process(command: type[Command]) -> NoReturn:
     """`run_command` for a process that does nothing else, and ends at once: taking torch down takes a second.
 
     OpenMP's threads, of torch and of compiled kernels, sleep while they wait. By default they run on without work, on
-    cores that other threads and other lifts could use. Whoever has set OMP_WAIT_POLICY is asked no more.
+    cores that other threads and other lifts could use. A policy that the user has set stays.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is imported
     code: Any = 0
