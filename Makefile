@@ -5,19 +5,19 @@ BIN := .venv/bin
 WORKERS ?= 2
 # Tests start hundreds of processes: what one compiles, the next reads, also where the environment forbids it
 export PYTHONDONTWRITEBYTECODE :=
-BESIDE := -n $(WORKERS) --dist loadfile
+BESIDE := -n $(WORKERS) --dist worksteal
 
-.PHONY: check style changed-types quick-tests test test-slow test-viser1 soak torture demo docs bench lint format clean
+.PHONY: check style changed-types quick-tests test test-slow test-all test-viser1 soak torture demo docs bench lint format clean
 
 # Compiles the kernels of the CPU rasterizer that no cache holds, which takes half a minute for each precision
-KERNELS = import torch; from normlift_ns.raster.numba import warm; warm($(1)).join()
+KERNELS = import torch; from normlift_ns.raster.numba import warm; warm(torch.float32, torch.float64).join()
 
 .venv/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 12) else f"Python 3.10 to 3.12 is needed, this is {v[0]}.{v[1]}; try: make PYTHON=python3.11 $(MAKECMDGOALS)")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet "uv>=0.5"
 	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv pip install --quiet --compile-bytecode -e ".[dev]"
-	$(BIN)/python -W ignore -c "$(call KERNELS,torch.float32)"
+	$(BIN)/python -W ignore -c "$(KERNELS)"
 	touch $@
 
 style: .venv/installed
@@ -38,18 +38,24 @@ changed-types: .venv/installed
 
 QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metrics checks)
 quick-tests: .venv/installed
-	$(BIN)/pytest -q $(BESIDE) -m "not slow" $(QUICK) tests/test_imports.py
+	$(BIN)/pytest -q $(BESIDE) -m "not slow and not extra" $(QUICK) tests/test_imports.py
 
-# Kernels are compiled on the other core while types are checked
-BOTH := torch.float32, torch.float64
+# Types are checked while the tests run
 test: style
-	@echo $(BIN)/basedpyright; $(BIN)/python -W ignore -c "$(call KERNELS,$(BOTH))" & $(BIN)/basedpyright; types=$$?; wait; exit $$types
-	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow"
+	@$(BIN)/basedpyright > .venv/types.log & types=$$!; \
+	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow and not extra"; tests=$$?; \
+	wait $$types; types=$$?; cat .venv/types.log; exit $$((tests + types))
 
 # A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time
 test-slow: .venv/installed
-	$(BIN)/pytest $(BESIDE) $(JUNIT) -m slow --ignore=tests/browser
-	$(BIN)/pytest -m slow tests/browser
+	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "slow and not extra" --ignore=tests/browser
+	$(BIN)/pytest -m "slow and not extra" tests/browser
+
+# Before a release: everything, with twenty times the examples
+test-all: lint
+	NORMLIFT_EXAMPLES=20 NORMLIFT_TORTURE=40 $(BIN)/pytest $(BESIDE) $(JUNIT) --ignore=tests/browser
+	$(BIN)/pytest tests/browser
+	$(MAKE) soak
 
 # The viewer with viser 1.x, in an environment of its own
 test-viser1: .venv/installed
@@ -60,7 +66,7 @@ soak: .venv/installed
 	NORMLIFT_SOAK=$(or $(MINUTES),30) NORMLIFT_SEED=$(or $(SEED),$$(date +%s)) $(BIN)/pytest -s -m slow tests/browser/test_monkey.py
 
 torture: .venv/installed
-	NORMLIFT_TORTURE=40 $(BIN)/pytest -m slow tests/torture
+	NORMLIFT_TORTURE=40 $(BIN)/pytest tests/torture
 
 demo: .venv/installed
 	$(BIN)/python -m normlift_ns.scripts.demo

@@ -1,51 +1,176 @@
-"""Fixtures for all tests."""
+"""Fixtures for all tests, and lifted runs that the processes of one test run share."""
 
+from __future__ import annotations
+
+import gc
+import inspect
 import os
 import sys
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
-import jaxtyping
-import pytest
-import torch
-from hypothesis import settings
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # idle threads leave the core to the other process
+if "PYTEST_XDIST_WORKER" in os.environ:  # another process runs tests too; torch reads both variables when imported
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+gc.disable()  # imports create objects that stay; collecting garbage meanwhile takes a quarter of their time
 
-# max_examples: where a test names no number. CI tries the same examples every time, so that a change fails by its own
-# doing; everybody else, and `make torture`, looks for new ones.
-settings.register_profile("tests", max_examples=30, derandomize="CI" in os.environ)
-settings.load_profile("tests")
-if not torch.cuda.is_available():  # Triton kernels run in its interpreter; read when a kernel is defined
+import jaxtyping  # noqa: E402
+import pytest  # noqa: E402
+import torch  # noqa: E402
+from filelock import FileLock  # noqa: E402
+
+from tests.examples import register_profile  # noqa: E402
+
+if TYPE_CHECKING:
+    from normlift_ns.demo import DemoRoom
+
+# CI tries the same examples every time, so that only a change makes a test fail.
+register_profile("tests", derandomize="CI" in os.environ)
+if not torch.cuda.is_available():  # Triton kernels run in its interpreter; Triton reads this when a kernel is defined
     os.environ["TRITON_INTERPRET"] = "1"
 
 
-def pytest_collection_finish() -> None:
-    """Makes Triton's interpreter prepare its language once per launch.
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keeps research out of the default tiers."""
+    for item in items:
+        if "research" in item.path.parts:
+            item.add_marker("extra")
 
-    It does so again at every call of one jit function by another, though nothing is left to prepare, which is two
-    fifths of the time of the tests of kernels.
+
+def pytest_collection_finish() -> None:
+    """Exempts imported modules from garbage collection, and makes Triton's interpreter patch its language once.
+
+    The interpreter patches it again each time one jit function calls another, which takes two fifths of the time of
+    kernel tests.
     """
+    gc.freeze()
+    gc.enable()
+    _patch_triton_once()
+
+
+def pytest_unconfigure() -> None:
+    """Lets Python end as usual."""
+    gc.unfreeze()
+
+
+def _patch_triton_once() -> None:
     interpreter: Any = sys.modules.get("triton.runtime.interpreter")
-    if not hasattr(interpreter, "_LangPatchScope"):  # not imported, or a version that prepares otherwise
+    if not hasattr(interpreter, "_LangPatchScope"):  # not imported, or a version that patches differently
         return
-    prepare, prepared = interpreter._patch_lang, set()
+    patch, patched = interpreter._patch_lang, set()
 
     def once(fn: Any) -> Any:
         names = frozenset(name for name in ("tl", "core") if name in fn.__globals__)
-        if names in prepared:
-            return None  # a call within a launch, whose answer nobody looks at
-        scope = prepare(fn)
-        if not prepared:  # a launch
+        if names in patched:
+            return None  # a call within a launch; nobody reads the result
+        scope = patch(fn)
+        if not patched:  # a launch
             restore = scope.restore
-            scope.restore = lambda: (prepared.clear(), restore())
-        prepared.add(names)
+            scope.restore = lambda: (patched.clear(), restore())
+        patched.add(names)
         return scope
 
     interpreter._patch_lang = once
 
 
+def import_nerfstudio() -> Any:
+    """Imports nerfstudio's list of methods.
+
+    Each config class calls `inspect.stack`, which searches source files for seconds; only function names are needed.
+    """
+
+    def stack(context: int = 1) -> list[SimpleNamespace]:
+        names, frame = [], inspect.currentframe()
+        while frame is not None and (frame := frame.f_back) is not None:
+            names.append(SimpleNamespace(function=frame.f_code.co_name))
+        return names
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inspect, "stack", stack)
+        from nerfstudio.configs import method_configs  # noqa: PLC0415
+    return method_configs
+
+
+@pytest.fixture(scope="session")
+def nerfstudio() -> Any:
+    """The module `nerfstudio.configs.method_configs`; its import takes seconds."""
+    return import_nerfstudio()
+
+
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Switches the shape checks off, as they are for users: for tests of the messages that users get instead."""
+    """Switches shape checks off, as they are for users, to test the messages that users get instead."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True)
+def _gradients() -> Iterator[None]:
+    """Fails a test that leaves gradients disabled, which would break the next test that trains."""
+    yield
+    if not torch.is_grad_enabled():
+        torch.set_grad_enabled(True)
+        pytest.fail("gradients are disabled after this test")
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Makes a folder by name in the first process that asks, and shares it with the others; tests must not change it.
+
+    `made_once("room", make)` calls `make(folder)` with a new folder, and returns the folder.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def make_once(name: str, make: Callable[[Path], None]) -> Path:
+        folder = shared / f"shared-{name}"
+        with FileLock(shared / f"{name}.lock"):
+            if not (shared / f"{name}.done").exists():
+                folder.mkdir()
+                make(folder)
+                (shared / f"{name}.done").touch()
+        return folder
+
+    return make_once
+
+
+@pytest.fixture(scope="session")
+def room() -> DemoRoom:
+    """A small demo room."""
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+
+    return plain_room(6000)
+
+
+@pytest.fixture(scope="session")
+def trained(room: DemoRoom, made_once: Any) -> Path:
+    """config.yml of a stock splatfacto run in the room."""
+
+    def make(folder: Path) -> None:
+        import_nerfstudio()
+        from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+
+        write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
+        write_splatfacto_run(room, folder / "room", folder / "outputs")
+
+    return next(made_once("trained", make).glob("outputs/*/splatfacto/*/config.yml"))
+
+
+@pytest.fixture(scope="session")
+def lifted(trained: Path, made_once: Any) -> Path:
+    """config.yml of a lifted run of the room, with the stored queries red and yellow."""
+
+    def make(folder: Path) -> None:
+        import_nerfstudio()
+        from normlift_ns.scripts import lift  # noqa: PLC0415
+        from tests.scripts.conftest import QUICK, run_entry  # noqa: PLC0415
+
+        with pytest.MonkeyPatch.context() as patch:
+            flags = ("--load-config", trained, *QUICK, "--timestamp", "one", "--queries", "red", "yellow")
+            assert run_entry(patch, lift.entrypoint, *flags) == 0
+
+    made_once("lifted", make)
+    return trained.parents[2] / "normlift" / "one" / "config.yml"

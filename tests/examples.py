@@ -1,0 +1,20 @@
+"""How many examples hypothesis tries: few in `make test` and `make test-slow`, twenty times as many in `make test-all`."""
+
+from __future__ import annotations
+
+import os
+
+from hypothesis import settings
+
+FACTOR = int(os.environ.get("NORMLIFT_EXAMPLES", "1"))
+
+
+def examples(number: int, **more: object) -> settings:
+    """A decorator beside `@given` for a test that tries another number of examples than ten in the default tiers."""
+    return settings(max_examples=number * FACTOR, deadline=None, **more)  # type: ignore[arg-type]
+
+
+def register_profile(name: str, *, derandomize: bool) -> None:
+    """Sets the number for all tests that name none."""
+    settings.register_profile(name, max_examples=10 * FACTOR, derandomize=derandomize, deadline=None)
+    settings.load_profile(name)
