@@ -1,13 +1,13 @@
 """Small faults planted in the package, to see whether the tests find them.
 
     python -m benchmarks.faults draw --seed 1 --output faults.json
-    python -m benchmarks.faults run faults.json --tree ../checkout --tier test
+    python -m benchmarks.faults run faults.json --trees ../checkout --tier test --label old
     python -m benchmarks.faults table faults.json
 
-`draw` takes places by a seed, some in every package, and keeps those that pass lint, types and import. `run` plants them
-one at a time in another checkout that has a `.venv`, and runs the nearest test files first; those that remain are
-planted together, and the whole tier runs once. Where a test fails then, each fault is tried with that test alone. So a
-fault counts as found if a test fails that passes without it.
+`draw` takes places by a seed, some in every package, and keeps those that pass lint, types and import. `run` plants
+each in another checkout that has a `.venv`, and runs the nearest test files first; those that remain are planted
+together, and the whole tier runs once. Where a test fails then, each fault is tried with that test alone. So a fault
+counts as found if a test fails that passes without it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ import json
 import os
 import random
 import re
+import signal
 import subprocess
-import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from xml.etree import ElementTree
+from queue import Queue
 
 PACKAGES = (
     "core",
@@ -54,7 +55,19 @@ KINDS = (
 CALLS = {
     *("flush", "fsync", "close", "synchronize", "join", "wait", "clear", "discard", "unlink", "release", "set", "put"),
     *("notify", "notify_all", "update", "cancel", "shutdown", "truncate", "remove", "add", "sort", "start", "stop"),
-    *("fill_", "copy_", "zero_", "clamp_", "mul_", "add_", "div_", "sub_", "masked_fill_", "index_add_", "scatter_add_"),
+    *(
+        "fill_",
+        "copy_",
+        "zero_",
+        "clamp_",
+        "mul_",
+        "add_",
+        "div_",
+        "sub_",
+        "masked_fill_",
+        "index_add_",
+        "scatter_add_",
+    ),
 }
 CHECKS = re.compile(r"^_?(check|refuse|ensure|require|validate|writable)_?")
 SWAPPED = {
@@ -89,10 +102,11 @@ class Fault:
     """Why no test can find it, for faults that change nothing."""
 
 
-Edit = tuple[str, ast.AST, str]
+Node = ast.expr | ast.stmt
+Edit = tuple[str, Node, str]
 
 
-def edits(tree: ast.Module) -> Iterator[tuple[str, ast.AST, str, str]]:
+def edits(tree: ast.Module) -> Iterator[tuple[str, Node, str, str]]:
     """Every kind, node, new text and name of the function around it."""
     for node, function in _code(tree, ""):
         for kind, place, text in _edits(node):
@@ -115,8 +129,8 @@ def _code(node: ast.AST, function: str) -> Iterator[tuple[ast.AST, str]]:
             yield from _code(child, function)
 
 
-def _number(node: ast.AST | None) -> bool:
-    return isinstance(node, ast.Constant) and type(node.value) is int
+def _number(node: ast.AST | None) -> int | None:
+    return node.value if isinstance(node, ast.Constant) and type(node.value) is int else None
 
 
 def _text(node: ast.AST) -> bool:
@@ -132,25 +146,25 @@ def _edits(node: ast.AST) -> Iterator[Edit]:
             sign = "-" if isinstance(node.op, ast.Add) else "+"
             right = f"({sides[1]})" if isinstance(node.right, ast.BinOp) else sides[1]
             yield "swapped sign", node, f"({sides[0]} {sign} {right})"
-        if _number(node.right):
-            yield "off by one", node.right, str(node.right.value + 1)
+        if (value := _number(node.right)) is not None:
+            yield "off by one", node.right, str(value + 1)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
         yield "swapped sign", node, ast.unparse(node.operand)
     elif isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in BOUNDS:
-        if _number(node.comparators[0]) or "len(" in ast.unparse(node) or "shape" in ast.unparse(node):
+        if _number(node.comparators[0]) is not None or "len(" in ast.unparse(node) or "shape" in ast.unparse(node):
             text = f"{ast.unparse(node.left)} {BOUNDS[type(node.ops[0])]} {ast.unparse(node.comparators[0])}"
             yield "off by one", node, text
     elif isinstance(node, ast.Slice):
         for bound in (node.lower, node.upper):
-            if _number(bound):
-                yield "off by one", bound, str(bound.value + 1)
+            if bound is not None and (value := _number(bound)) is not None:
+                yield "off by one", bound, str(value + 1)
     elif isinstance(node, ast.Call):
         yield from _calls(node)
-    elif isinstance(node, ast.Subscript) and _number(node.slice):
+    elif isinstance(node, ast.Subscript) and (value := _number(node.slice)) is not None:
         if isinstance(node.value, ast.Attribute) and node.value.attr == "shape":
-            yield "wrong axis", node.slice, str(1 - min(node.slice.value, 1))
+            yield "wrong axis", node.slice, str(1 - min(value, 1))
         else:
-            yield "off by one", node.slice, str(node.slice.value + 1)
+            yield "off by one", node.slice, str(value + 1)
     elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
         called = node.value.func
         name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
@@ -174,22 +188,27 @@ def _edits(node: ast.AST) -> Iterator[Edit]:
 
 def _calls(node: ast.Call) -> Iterator[Edit]:
     for word in node.keywords:
-        if word.arg in ("dim", "axis") and (value := _axis(word.value)) is not None:
-            yield "wrong axis", word.value, "1" if value == 0 else "0"
+        if word.arg in ("dim", "axis"):
+            yield from _other_axis(word.value)
     name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
     if name == "range":
         for bound in node.args:
             if not _text(bound):
                 yield "off by one", bound, f"{ast.unparse(bound)} + 1"
     if name in ("size", "squeeze", "unsqueeze", "flip", "any", "all") and len(node.args) == 1:
-        if (value := _axis(node.args[0])) is not None:
-            yield "wrong axis", node.args[0], "1" if value == 0 else "0"
+        yield from _other_axis(node.args[0])
+
+
+def _other_axis(node: ast.expr) -> Iterator[Edit]:
+    if (value := _axis(node)) is not None:
+        yield "wrong axis", node, "1" if value == 0 else "0"
 
 
 def _axis(node: ast.AST) -> int | None:
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and _number(node.operand):
-        return -node.operand.value
-    return node.value if _number(node) else None
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        value = _number(node.operand)
+        return None if value is None else -value
+    return _number(node)
 
 
 def _default(node: ast.AST | None) -> Iterator[Edit]:
@@ -211,13 +230,14 @@ def _inverted(test: ast.expr) -> str:
     return f"not ({ast.unparse(test)})"
 
 
-def changed(source: str, node: ast.AST, text: str) -> str:
+def changed(source: str, node: Node, text: str) -> str:
     """A source with a node replaced."""
     data = source.encode()
     starts = [0]
     for line in data.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
-    start, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+    last, column = node.end_lineno or node.lineno, node.end_col_offset or 0
+    start, end = starts[node.lineno - 1] + node.col_offset, starts[last - 1] + column
     return (data[:start] + text.encode() + data[end:]).decode()
 
 
@@ -268,10 +288,11 @@ def passed(root: Path, fault: Fault) -> str:
         subprocess.run([binaries / "ruff", "format", "-q", fault.file], cwd=root, check=True)
         if any(subprocess.run(x, cwd=root, capture_output=True, check=False).returncode != 0 for x in checks):
             return ""
-        return subprocess.run(["git", "diff", "--", fault.file], cwd=root, capture_output=True, text=True).stdout
+        diff = ["git", "diff", "--", fault.file]
+        return subprocess.run(diff, cwd=root, capture_output=True, text=True, check=True).stdout
 
 
-class planted:  # noqa: N801
+class planted:
     """Applies the patches of faults to a tree, and takes them back."""
 
     def __init__(self, root: Path, faults: list[Fault]) -> None:
@@ -284,26 +305,25 @@ class planted:  # noqa: N801
         subprocess.run(["git", "checkout", "-q", "--", *self.files], cwd=self.root, check=True)
 
 
-TIERS = {"test": "not slow", "slow": "slow"}
+TIERS = {"test": "not slow and not extra", "slow": "slow and not extra"}
+TIME_OUT = "time-out"
 
 
-def pytest(root: Path, marker: str, *words: str, limit: float) -> tuple[list[str], str]:
-    """Runs tests; the names of those that fail, and what was printed. A time-out is a failure by the name of time-out."""
-    report = root / ".venv/faults.xml"
-    report.unlink(missing_ok=True)
-    command = [".venv/bin/python", "-m", "pytest", "-q", "--no-header", "-m", marker, f"--junitxml={report}", *words]
+def pytest(root: Path, tier: str, *words: str, limit: float) -> list[str]:
+    """Names of tests that fail; `TIME_OUT` if they do not end, "collection" if none could run."""
+    command = [".venv/bin/python", "-m", "pytest", "-q", "--no-header", "-rfE", "-m", TIERS[tier], *words]
+    process = subprocess.Popen(
+        command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
+        env=os.environ | {"CI": "1"}, start_new_session=True,
+    )  # fmt: skip
     try:
-        done = subprocess.run(
-            command, cwd=root, capture_output=True, text=True, timeout=limit, check=False, env=os.environ | {"CI": "1"}
-        )
+        printed, _ = process.communicate(timeout=limit)
     except subprocess.TimeoutExpired:
-        return ["time-out"], ""
-    if done.returncode == 5:  # no tests
-        return [], done.stdout
-    failed = re.findall(r"^(?:FAILED|ERROR) (\S+(?:\[.*?\])?)(?: - |$)", done.stdout, re.MULTILINE)
-    if done.returncode != 0 and len(failed) == 0:
-        failed = ["collection"]
-    return failed, done.stdout
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        return [TIME_OUT]
+    failed = re.findall(r"^(?:FAILED|ERROR) (tests/.*?|normlift_ns/.*?)(?: - .*)?$", printed, re.MULTILINE)
+    return failed or (["collection"] if process.returncode not in (0, 5) else [])
 
 
 def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
@@ -322,57 +342,64 @@ def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
     return sorted(scores, key=lambda x: -scores[x])[:most]
 
 
-def run(faults: list[Fault], root: Path, tier: str, label: str, save: Path) -> list[Fault]:
-    """Looks for every fault with the nearest files, then for the rest with the whole tier."""
-    marker, found = TIERS[tier], {x.name: dict(x.found or {}) for x in faults}
+def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Path) -> None:
+    """Looks for every fault with the nearest files, then for the rest with the whole tier; saves what is found.
+
+    Args:
+        trees: equal checkouts, each with a `.venv`; so many faults are tried at a time.
+        label: the name of what is run, a column of the table.
+    """
+    found = {x.name: dict(x.found or {}) for x in faults}
+    free: Queue[Path] = Queue()
+    for tree in trees:
+        free.put(tree)
+    passes: dict[str, bool] = {}
+    several = ("-n", os.environ.get("WORKERS", "2"))
 
     def keep() -> None:
         save.write_text(json.dumps([asdict(replace(x, found=found[x.name])) for x in faults], indent=1) + "\n")
 
-    workers = os.environ.get("WORKERS", "2")
-    baseline: dict[str, bool] = {}
+    def first(fault: Fault, words: list[str], limit: float) -> str:
+        """The first test that fails with a fault and passes without it."""
+        tree = free.get()
+        try:
+            with planted(tree, [fault]):
+                failed = pytest(tree, tier, *words, limit=limit)
+            return next((x for x in failed if passes_without(tree, x)), "")
+        finally:
+            free.put(tree)
 
-    def truly(failed: list[str]) -> list[str]:
-        """Those that pass without a fault."""
-        for name in failed:
-            if name not in baseline and name not in ("time-out", "collection"):
-                baseline[name] = len(pytest(root, marker, name, limit=900)[0]) == 0
-        return [name for name in failed if baseline.get(name, True)]
+    def passes_without(tree: Path, test: str) -> bool:
+        if test not in passes:
+            passes[test] = test in (TIME_OUT, "collection") or not pytest(tree, tier, test, limit=600)
+        return passes[test]
 
-    for fault in faults:
-        if label in found[fault.name] or fault.equivalent:
-            continue
-        files = nearest(root, fault)
-        with planted(root, [fault]):
-            failed, _ = pytest(root, marker, "-x", "-n", workers, "--dist", "loadfile", *files, limit=900)
-        failed = truly(failed)
-        if failed:
-            found[fault.name][label] = failed[0]
+    def look(fault: Fault, words: list[str], limit: float = 300) -> None:
+        test = first(fault, words, limit)
+        print(fault.name, fault.file, fault.kind, "->", test, flush=True)
+        if test:
+            found[fault.name][label] = test
             keep()
-        print(fault.name, fault.file, fault.kind, "->", failed[:1], flush=True)
-    rest = [x for x in faults if label not in found[x.name] and not x.equivalent]
-    known: set[str] = set()
-    while rest:
-        with planted(root, rest):
-            failed, out = pytest(root, marker, "-n", workers, "--dist", "loadfile", limit=5400)
-        failed = [x for x in truly(failed) if x not in known]
-        print(f"{len(rest)} together: {len(failed)} fail", failed[:20], out[-300:] if "collection" in failed else "")
-        if not failed:
-            break
-        blamed = False
-        for fault in rest:
-            with planted(root, [fault]):
-                alone, _ = pytest(root, marker, "-x", *[x for x in failed if x != "time-out"][:40], limit=1800)
-            if alone:
-                found[fault.name][label], blamed = alone[0], True
-                print(fault.name, fault.file, fault.kind, "->", alone[:1], flush=True)
-                keep()
-        known |= set(failed) if not blamed else set()
-        rest = [x for x in rest if label not in found[x.name]]
+
+    missing = [x for x in faults if label not in found[x.name] and not x.equivalent]
+    with ThreadPoolExecutor(len(trees)) as pool:
+        list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing))
+        rest = [x for x in missing if label not in found[x.name]]
+        tried: set[str] = set()
+        while rest:
+            with planted(trees[0], rest):
+                failed = pytest(trees[0], tier, *several, limit=5400)
+            failed = [x for x in failed if x not in tried and passes_without(trees[0], x)]
+            print(f"{len(rest)} together: {len(failed)} tests fail", failed[:20], flush=True)
+            tests = [x for x in failed if x.startswith(("tests/", "normlift_ns/"))][:40]
+            if not failed:
+                break
+            list(pool.map(lambda x, words=tests: look(x, words or [*several]), rest))
+            tried |= set(failed)
+            rest = [x for x in rest if label not in found[x.name]]
     for fault in rest:
         found[fault.name][label] = ""
     keep()
-    return [replace(x, found=found[x.name]) for x in faults]
 
 
 def load(path: Path) -> list[Fault]:
@@ -393,7 +420,9 @@ def table(faults: list[Fault]) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description="Plants small faults in the package, to see whether the tests find them."
+    )
     actions = parser.add_subparsers(dest="action", required=True)
     drawing = actions.add_parser("draw")
     drawing.add_argument("--seed", type=int, required=True)
@@ -401,7 +430,7 @@ if __name__ == "__main__":
     drawing.add_argument("--output", type=Path, required=True)
     running = actions.add_parser("run")
     running.add_argument("faults", type=Path)
-    running.add_argument("--tree", type=Path, default=Path())
+    running.add_argument("--trees", type=Path, nargs="+", default=[Path()])
     running.add_argument("--tier", choices=TIERS, default="test")
     running.add_argument("--label", required=True)
     showing = actions.add_parser("table")
@@ -411,7 +440,6 @@ if __name__ == "__main__":
         drawn = draw(Path().resolve(), given.seed, given.most)
         given.output.write_text(json.dumps([asdict(x) for x in drawn], indent=1) + "\n")
     elif given.action == "run":
-        run(load(given.faults), given.tree.resolve(), given.tier, given.label, given.faults)
+        run(load(given.faults), [x.resolve() for x in given.trees], given.tier, given.label, given.faults)
     else:
         print(table(load(given.faults)))
-    sys.exit()
