@@ -7,7 +7,7 @@ WORKERS ?= 2
 export PYTHONDONTWRITEBYTECODE :=
 BESIDE := -n $(WORKERS) --dist worksteal
 
-.PHONY: check style changed-types quick-tests test test-slow test-all test-viser1 soak torture demo docs bench lint format clean
+.PHONY: check style changed-types quick-tests test test-slow test-all test-versions test-viser1 soak torture demo docs bench lint format clean
 
 # Compiles the kernels of the CPU rasterizer that no cache holds, which takes half a minute for each precision
 KERNELS = import torch; from normlift_ns.raster.numba import warm; warm(torch.float32, torch.float64).join()
@@ -50,6 +50,10 @@ test: style
 test-slow: .venv/installed
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "slow and not extra" --ignore=tests/browser
 	$(BIN)/pytest -m "slow and not extra" tests/browser
+
+# The core and the commands, for other versions of Python
+test-versions: .venv/installed
+	$(BIN)/pytest $(BESIDE) -m "not slow and not extra" tests/core tests/scripts
 
 # Before a release: everything, with twenty times the examples
 test-all: lint

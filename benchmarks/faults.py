@@ -21,7 +21,7 @@ import random
 import re
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -305,13 +305,19 @@ class planted:
         subprocess.run(["git", "checkout", "-q", "--", *self.files], cwd=self.root, check=True)
 
 
-TIERS = {"test": "not slow and not extra", "slow": "slow and not extra"}
+TIERS = ("test", "slow")
 TIME_OUT = "time-out"
+
+
+def marker(root: Path, tier: str) -> str:
+    """The tests of a tier; checkouts from before the tier `extra` have no such marker."""
+    extra = " and not extra" if '"extra: ' in (root / "pyproject.toml").read_text("utf8") else ""
+    return ("slow" if tier == "slow" else "not slow") + extra
 
 
 def pytest(root: Path, tier: str, *words: str, limit: float) -> list[str]:
     """Names of tests that fail; `TIME_OUT` if they do not end, "collection" if none could run."""
-    command = [".venv/bin/python", "-m", "pytest", "-q", "--no-header", "-rfE", "-m", TIERS[tier], *words]
+    command = [".venv/bin/python", "-m", "pytest", "-q", "--no-header", "-rfE", "-m", marker(root, tier), *words]
     process = subprocess.Popen(
         command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
         env=os.environ | {"CI": "1"}, start_new_session=True,
@@ -323,6 +329,7 @@ def pytest(root: Path, tier: str, *words: str, limit: float) -> list[str]:
         process.wait()
         return [TIME_OUT]
     failed = re.findall(r"^(?:FAILED|ERROR) (tests/.*?|normlift_ns/.*?)(?: - .*)?$", printed, re.MULTILINE)
+    print(words[:3], process.returncode, printed[-150:].strip().splitlines()[-1:], flush=True)
     return failed or (["collection"] if process.returncode not in (0, 5) else [])
 
 
@@ -332,7 +339,7 @@ def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
     names = [x for x in fault.function.split(".") if not x.startswith("_")]
     module = fault.file.removesuffix(".py").replace("/", ".")
     scores: dict[str, float] = {}
-    for path in sorted(root.glob("tests/**/test_*.py")):
+    for path in sorted(set(root.glob("tests/**/test_*.py")) - set(root.glob("tests/browser/*.py"))):
         text = path.read_text("utf8")
         score = 4.0 * (module in text) + 2.0 * any(re.search(rf"\b{re.escape(x)}\b", text) for x in names)
         score += 3.0 * (path.stem == f"test_{stem}") + 1.0 * (f"tests/{fault.package}/" in path.as_posix())
@@ -354,7 +361,7 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
     for tree in trees:
         free.put(tree)
     passes: dict[str, bool] = {}
-    several = ("-n", os.environ.get("WORKERS", "2"))
+    several = ("-n", os.environ.get("WORKERS", "2"), "--ignore=tests/browser")
 
     def keep() -> None:
         save.write_text(json.dumps([asdict(replace(x, found=found[x.name])) for x in faults], indent=1) + "\n")
@@ -365,14 +372,16 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
         try:
             with planted(tree, [fault]):
                 failed = pytest(tree, tier, *words, limit=limit)
-            return next((x for x in failed if passes_without(tree, x)), "")
+            return next((x for x in failed if passes_without(tree, x, words, limit)), "")
         finally:
             free.put(tree)
 
-    def passes_without(tree: Path, test: str) -> bool:
-        if test not in passes:
-            passes[test] = test in (TIME_OUT, "collection") or not pytest(tree, tier, test, limit=600)
-        return passes[test]
+    def passes_without(tree: Path, test: str, words: Sequence[str], limit: float) -> bool:
+        words = words if test in (TIME_OUT, "collection") else [test]
+        name = " ".join(words)
+        if name not in passes:
+            passes[name] = not pytest(tree, tier, *words, limit=limit)
+        return passes[name]
 
     def look(fault: Fault, words: list[str], limit: float = 300) -> None:
         test = first(fault, words, limit)
@@ -383,13 +392,13 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
 
     missing = [x for x in faults if label not in found[x.name] and not x.equivalent]
     with ThreadPoolExecutor(len(trees)) as pool:
-        list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing))
+        list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing)) if not os.environ.get("GROUP") else None
         rest = [x for x in missing if label not in found[x.name]]
         tried: set[str] = set()
         while rest:
             with planted(trees[0], rest):
                 failed = pytest(trees[0], tier, *several, limit=5400)
-            failed = [x for x in failed if x not in tried and passes_without(trees[0], x)]
+            failed = [x for x in failed if x not in tried and passes_without(trees[0], x, several, 5400)]
             print(f"{len(rest)} together: {len(failed)} tests fail", failed[:20], flush=True)
             tests = [x for x in failed if x.startswith(("tests/", "normlift_ns/"))][:40]
             if not failed:
