@@ -349,12 +349,13 @@ def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
     return sorted(scores, key=lambda x: -scores[x])[:most]
 
 
-def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Path) -> None:
+def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Path, *, together: bool) -> None:
     """Looks for every fault with the nearest files, then for the rest with the whole tier; saves what is found.
 
     Args:
         trees: equal checkouts, each with a `.venv`; so many faults are tried at a time.
         label: the name of what is run, a column of the table.
+        together: begin with all faults planted together.
     """
     found = {x.name: dict(x.found or {}) for x in faults}
     free: Queue[Path] = Queue()
@@ -392,20 +393,23 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
 
     missing = [x for x in faults if label not in found[x.name] and not x.equivalent]
     with ThreadPoolExecutor(len(trees)) as pool:
-        list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing)) if not os.environ.get("GROUP") else None
+        if not together:
+            list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing))
         rest = [x for x in missing if label not in found[x.name]]
-        tried: set[str] = set()
+        fails = set(pytest(trees[0], tier, *several, limit=5400)) if rest else set()
         while rest:
             with planted(trees[0], rest):
-                failed = pytest(trees[0], tier, *several, limit=5400)
-            failed = [x for x in failed if x not in tried and passes_without(trees[0], x, several, 5400)]
-            print(f"{len(rest)} together: {len(failed)} tests fail", failed[:20], flush=True)
-            tests = [x for x in failed if x.startswith(("tests/", "normlift_ns/"))][:40]
-            if not failed:
-                break
-            list(pool.map(lambda x, words=tests: look(x, words or [*several]), rest))
-            tried |= set(failed)
+                failed = [x for x in pytest(trees[0], tier, *several, limit=5400) if x not in fails]
+            print(f"{len(rest)} together: {len(failed)} tests fail", *failed, sep="\n", flush=True)
+            files: dict[str, list[str]] = {}
+            for test in failed:
+                files.setdefault(test.split("::", maxsplit=1)[0], []).append(test)
+            tests = [test for some in files.values() for test in some[:4]]
+            before = len(rest)
+            list(pool.map(lambda x, words=tests: look(x, ["-x", *words]), rest if tests else []))
             rest = [x for x in rest if label not in found[x.name]]
+            if len(rest) == before:
+                break
     for fault in rest:
         found[fault.name][label] = ""
     keep()
@@ -442,6 +446,7 @@ if __name__ == "__main__":
     running.add_argument("--trees", type=Path, nargs="+", default=[Path()])
     running.add_argument("--tier", choices=TIERS, default="test")
     running.add_argument("--label", required=True)
+    running.add_argument("--together", action="store_true")
     showing = actions.add_parser("table")
     showing.add_argument("faults", type=Path)
     given = parser.parse_args()
@@ -449,6 +454,7 @@ if __name__ == "__main__":
         drawn = draw(Path().resolve(), given.seed, given.most)
         given.output.write_text(json.dumps([asdict(x) for x in drawn], indent=1) + "\n")
     elif given.action == "run":
-        run(load(given.faults), [x.resolve() for x in given.trees], given.tier, given.label, given.faults)
+        trees = [x.resolve() for x in given.trees]
+        run(load(given.faults), trees, given.tier, given.label, given.faults, together=given.together)
     else:
         print(table(load(given.faults)))
