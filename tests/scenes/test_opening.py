@@ -238,7 +238,7 @@ def test_the_lifted_run_opens_again_also_where_it_moved(
     moved = (tmp_path / "outputs").rename(tmp_path / "results") / run.config.relative_to(tmp_path / "outputs")
     opened = open_run(moved, data=tmp_path / "elsewhere" / "images")
     assert opened.scene.train.names == scene.train.names
-    assert torch.equal(opened.ask("red").selected, found.selected[:1])
+    assert torch.equal(opened.ask("red").selected, found.selected[:, :1])
     with pytest.raises(FileNotFoundError, match=r"nowhere, given with --data"):
         open_run(moved, data=tmp_path / "nowhere")
 
@@ -310,7 +310,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"transforms": "nowhere.json"}, r"nowhere\.json"),
         ({"colmap": "p", "images": "none"}, "folder none, given with --images"),
         ({"colmap": "p"}, "folder .*p/images"),
-        ({"colmap": "p", "images": "half"}, "13 of the 14 .* half"),
+        ({"colmap": "p", "images": "half"}, "13 of the 14 .*half"),
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
@@ -327,7 +327,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     with pytest.raises(TypeError, match="SplatOptions, got str and str"):
         open_splat("x.ply", "capture")  # type: ignore[arg-type]
     assert SplatOptions(holdout=0.1).holdout == ("0.1",)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="test_every .* '8'"):
+    with pytest.raises(InputError, match=r"test_every .* '8'"):
         SplatOptions(test_every="8")  # type: ignore[arg-type]
 
 
@@ -375,7 +375,7 @@ def test_a_ply_file_of_gsplats_trainer_lies_in_its_normalized_world(
     write_ply(path, ply_columns(_in_world(splat, _normalization(frames, points))))
     project = write_colmap(tmp_path / "p", frames, "PINHOLE", points=points)
     said: list[str] = []
-    scene = open_splat(path, replace(given, colmap=project, gsplat_normalize=None), say=said.append)
+    scene = open_splat(path, replace(given, colmap=project, gsplat_normalize=True), say=said.append)
     assert any("normalized world" in text for text in said)
     assert not any("have no camera" in text for text in said)
     assert difference(native, scene) < ROUNDED
@@ -419,17 +419,16 @@ def test_photographs_in_subfolders(native, splat, frames, tmp_path: Path, monkey
 
 @needs_shared
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fox", "tabletop"])
-def test_real_captures_by_other_ways(name: str, tmp_path: Path) -> None:
-    """Two views of each, one at either end of the capture; fox has lens distortion.
+def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
+    """Two views, one at either end of the capture, with lens distortion.
 
     Quaternions hold rotations only, but the matrices of fox's transforms.json are none by 1e-6, which turns single
     pixels on and off; so COLMAP's project is held against the same poses made orthonormal.
     """
-    config = SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml"
+    config = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     scene = open_scene(config)
     path = write_ply(tmp_path / "s.ply", ply_columns(Splat(**scene.parameters)))
-    folder, world = SHARED / "captures" / name, config.parent / "dataparser_transforms.json"
+    folder, world = SHARED / "captures" / "fox", config.parent / "dataparser_transforms.json"
     ends = _Ends(scene)
     of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, holdout=("0.1",)))
     assert of_json.train.names == scene.train.names
