@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 from typing import Any
@@ -314,21 +315,34 @@ def test_free_places():
     assert dict(zip(places, found.tolist())) == {name: free for name, (_, free) in places.items()}
 
 
+@pytest.mark.slow
 def test_camera_path_is_what_nerfstudio_reads(nerfstudio, one_side, tmp_path):
-    from nerfstudio.cameras import camera_paths as paths  # noqa: PLC0415
+    from nerfstudio.cameras import camera_paths  # noqa: PLC0415
 
-    found, written = one_side, one_side.save(tmp_path / "next.json")
-    assert [path.name for path in written][:2] == ["next.json", "next_camera_path.json"]
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in written}
-    read = paths.get_path_from_json(json.loads(written[1].read_text()))
-    cameras = [pose.camera for pose in found.poses]
-    assert len(read) == len(cameras) == len(written) - 2
-    for i, camera in enumerate(cameras):
+    written = one_side.save(tmp_path / "next.json")
+    read = camera_paths.get_path_from_json(json.loads(written[1].read_text()))
+    for i, camera in enumerate(pose.camera for pose in one_side.poses):
         flipped = camera.world_to_camera.inverse() * torch.tensor([1.0, -1, -1, 1])
         torch.testing.assert_close(read.camera_to_worlds[i], flipped[:3], rtol=0, atol=1e-5)
-        K = read.get_intrinsics_matrices()[i]
-        torch.testing.assert_close(K, camera.K, rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(read.get_intrinsics_matrices()[i], camera.K, rtol=1e-5, atol=1e-4)
         assert (int(read.width[i]), int(read.height[i])) == (camera.width, camera.height)
+
+
+def test_poses_and_pictures_are_written(one_side, tmp_path):
+    found, written = one_side, one_side.save(tmp_path / "next.json")
+    cameras = [pose.camera for pose in found.poses]
+    assert [path.name for path in written][:2] == ["next.json", "next_camera_path.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in written}
+    assert len(written) == len(cameras) + 2
+    path = json.loads(written[1].read_text())
+    assert (path["camera_type"], path["fps"], path["seconds"]) == ("perspective", 1, len(cameras))
+    for entry, camera in zip(path["camera_path"], cameras, strict=True):
+        flipped = camera.world_to_camera.inverse() * torch.tensor([1.0, -1, -1, 1])
+        assert entry["camera_to_world"] == pytest.approx(flipped.flatten().tolist(), abs=1e-5)
+        half = math.tan(math.radians(entry["fov"]) / 2)
+        assert path["render_height"] / 2 / half == pytest.approx(float(camera.K[1, 1]), rel=1e-5)
+        assert (path["render_width"], path["render_height"]) == (camera.width, camera.height)
+        assert entry["aspect"] == pytest.approx(camera.width / camera.height)
     document = json.loads(written[0].read_text())
     assert document["regions"][0]["size"] == found.regions[0].size
     assert "pictures" not in document

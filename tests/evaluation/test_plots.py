@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from normlift_ns.evaluation.plots import plot_sweeps, signals_figure, sweeps_figure
-
 
 def test_names_in_figures_are_no_mathematics(tmp_path):
+    from normlift_ns.evaluation.plots import plot_sweeps  # noqa: PLC0415
+
     rows = [{"parameter": "$\\frac{$", "value": x, "$\\frac{$": x} for x in (1.0, 2.0)]
     plot_sweeps(rows, "$\\frac{$", "$\\frac{$", tmp_path / "a.svg")
     assert (tmp_path / "a.svg").stat().st_size > 1000
 
 
 def test_sweeps_mark_the_default_and_the_run_and_draw_the_result():
+    from normlift_ns.evaluation.plots import sweeps_figure  # noqa: PLC0415
+
     values = [("k", 12.0, False, True, 0.4), ("k", 36.0, True, False, 0.5), ("beta", 1.0, True, True, 0.4)]
     rows = [{"parameter": p, "value": v, "default": d, "own": o, "miou": y} for p, v, d, o, y in values]
     of_k, of_beta = sweeps_figure(rows[::-1], "miou", "miou", 0.45).axes[::-1]
@@ -26,6 +28,8 @@ def test_sweeps_mark_the_default_and_the_run_and_draw_the_result():
 
 
 def test_every_scene_has_its_signals_drawn():
+    from normlift_ns.evaluation.plots import signals_figure  # noqa: PLC0415
+
     one = {"zero.share": 0.5, "histogram.0.00": 0.2, "histogram.0.50": 0.3}
     rows = [{"scene": "a$", **one, "reliability.bin1": 0.1, "reliability.bin2": 0.9}, {"scene": "b", **one}]
     figure = signals_figure(rows)

@@ -52,15 +52,15 @@ def loop(scene: SceneLabels, classes: int, first: bool) -> tuple[float, float]:
     return sum(ious) / len(ious), sum(recalls) / len(recalls)
 
 
-@pytest.mark.parametrize("classes", CLASS_SETS)
-def test_equals_the_loop(classes):
+def test_equals_the_loop():
     scenes = [random_scene(seed, n=150 + 100 * seed) for seed in range(3)]
-    found = evaluate_scannet(scenes)
-    for suffix, first in (("", True), ("_none", False)):
-        expected = [loop(scene, classes, first) for scene in scenes]
-        assert found.results[f"miou_{classes}{suffix}"] == pytest.approx(sum(x for x, _ in expected) / 3, abs=1e-12)
-        assert found.results[f"macc_{classes}{suffix}"] == pytest.approx(sum(x for _, x in expected) / 3, abs=1e-12)
-    assert found.results[f"miou_{classes}"] != found.results[f"miou_{classes}_none"]
+    found = evaluate_scannet(scenes).results
+    for classes in CLASS_SETS:
+        for suffix, first in (("", True), ("_none", False)):
+            miou, macc = (sum(part) / 3 for part in zip(*(loop(scene, classes, first) for scene in scenes)))
+            assert found[f"miou_{classes}{suffix}"] == pytest.approx(miou, abs=1e-12)
+            assert found[f"macc_{classes}{suffix}"] == pytest.approx(macc, abs=1e-12)
+        assert found[f"miou_{classes}"] != found[f"miou_{classes}_none"]
 
 
 def test_sets_are_those_of_the_protocol():
@@ -96,7 +96,7 @@ def test_opacity_absent_classes_and_missing_directions_by_hand():
 
 def test_what_cannot_be_scored_is_refused():
     scene = SceneLabels("s", torch.zeros(3, 19), torch.ones(3).bool(), torch.full((3,), 0.5), torch.tensor([1, 2, 3]))
-    with pytest.raises(ValueError, match=r"nothing can be scored with \d+ classes: no Gaussian of s .*--min-opacity"):
+    with pytest.raises(ValueError, match=r" s .*--min-opacity"):
         evaluate_scannet([scene], min_opacity=1)
 
 
@@ -111,13 +111,13 @@ def test_labels_in_scannets_format(tmp_path):
     write_labels(path, [1, 36, 0, 40])
     assert read_labels(path).tolist() == [1, 36, 0, 40]
     check_identity("s", 4, read_labels(path), path)
-    with pytest.raises(ValueError, match=r"has 5 Gaussians, .*labels\.ply 4 vertices"):
+    with pytest.raises(ValueError, match=r"5 Gaussians, .*labels\.ply 4"):
         check_identity("s", 5, read_labels(path), path)
     write_labels(path, [1], name="class")
-    with pytest.raises(ValueError, match=r"vertices have no property label \(found x, y, z, red, class\)"):
+    with pytest.raises(ValueError, match=r" label .*x, y, z, red, class"):
         read_labels(path)
     path.write_bytes(b"ply\nformat")
-    with pytest.raises(ValueError, match="damaged or no PLY file"):
+    with pytest.raises(ValueError, match="damaged"):
         read_labels(path)
     with pytest.raises(FileNotFoundError, match="do not exist"):
         read_labels(tmp_path / "none.ply")
