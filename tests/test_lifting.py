@@ -81,7 +81,7 @@ def scene(*names: str, count: int = N, held_out: Sequence[str] = (), **more: Any
 
 def lifted(source: FeatureSource, cache: Path, made: Any = None, **options: Any) -> Any:
     export = options.pop("export", None)
-    given = LiftOptions(refine=False, **options)
+    given = LiftOptions(refine=False, **{"storage": "evidence", **options})
     return lift_scene(scene() if made is None else made, source, given, cache, encoder={}, export=export)
 
 

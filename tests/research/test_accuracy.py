@@ -1,10 +1,6 @@
 """The controlled benchmark: what damage is, that no damage is none, and that its shortcuts are exact."""
 
-import json
-import subprocess
-import sys
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -26,7 +22,7 @@ from benchmarks.variants import (
     refined_scores,
     top_evidence,
 )
-from benchmarks.worlds import World, cell_evidence, made_words, truth_of, with_floaters
+from benchmarks.worlds import made_words, truth_of, with_floaters
 from normlift_ns import (
     GaussianScene,
     RefineConfig,
@@ -37,32 +33,9 @@ from normlift_ns import (
     refine_variant,
     render,
 )
-from tests.scenes import dense, generator, orbit, random_scene
-
-ROOT = Path(__file__).resolve().parents[1]
-CLASSES = 4
-WORDS = made_words(CLASSES, dimension=128)
-
-
-def exact_maps(cameras, seed: int) -> torch.Tensor:
-    """Quarters of the image, in an order of their own in every view, and a strip of nothing."""
-    g, maps = generator(seed), []
-    for camera in cameras:
-        y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-        quarter = (y > camera.height / 2).long() * 2 + (x > camera.width / 2).long()
-        classes = torch.randperm(CLASSES, generator=g)[quarter]
-        classes[:2] = -1
-        maps.append(classes)
-    return torch.stack(maps)
-
-
-@pytest.fixture(scope="module")
-def world() -> World:
-    scene, cameras, held_out = random_scene(300, dtype=torch.float32), orbit(6), orbit(2, distance=5.0)
-    maps = exact_maps(cameras, 0)
-    evidence, cells = cell_evidence(scene, cameras, maps)
-    truth = torch.randint(-1, CLASSES, (300,), generator=generator(1))
-    return World("tiny", scene, cameras, evidence, cells, truth, CLASSES, held_out, exact_maps(held_out, 1))
+from tests.research import quick
+from tests.research.conftest import CLASSES, WORDS
+from tests.scenes import dense, generator
 
 
 def test_without_damage_cells_become_the_exact_masks(world):
@@ -243,13 +216,8 @@ def test_rows_and_their_summary(world):
     assert values["preset.half.miou"] == pytest.approx(values["ablation.paper.miou"], abs=1)
 
 
-@pytest.mark.slow
 def test_quick_accuracy_benchmark(tmp_path):
-    command = [sys.executable, "-m", "benchmarks.accuracy", "--quick", "--output", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    print(done.stdout)
-    values = {m["key"]: m["value"] for m in json.loads((tmp_path / "accuracy.json").read_text())["metrics"]}
+    values = {key: metric["value"] for key, metric in quick("accuracy", tmp_path).items()}
     assert values["ladder.few views.paper.miou"] > values["ladder.few views.none.miou"]
     assert values["ablation.paper.miou"] > values["ablation.norm_only.miou"]
     assert values["reliability.spearman_bins_mean"] > 0.7
