@@ -107,6 +107,7 @@ def test_names_say_what_is_wrong(tmp_path: Path) -> None:
         ('{"labels": {"1": "a"}, "background": true}', r"`int \| null`, got `bool`"),
         ('{"labels": {"' + "9" * 5000 + '": "a"}}', "value of a mask"),
         ("[" * 100000, "RecursionError"),
+        *((text, "") for text in ("[1]", '{"labels": {}}', '{"labels": {"a": "b"}}', "{")),
         ('{"labels": {"1": "\\ud800"}}', "regex"),
     ):
         (tmp_path / "labels.json").write_text(text)
@@ -138,6 +139,9 @@ def test_labels_are_read_from_text_and_binary_and_absurd_headers_refused(tmp_pat
 
 def test_ids_of_another_list_are_refused_or_warned_of(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
+    path.write_bytes(ply(LABELS).replace(b" label", b" class"))
+    with pytest.raises(InputError, match=r" label .*x, red, class"):
+        read_labels(path)
     for labels, message in (
         (np.array([1163, 1165], np.int32), "NYU40"),
         (np.array([1.5, 2]), "whole numbers"),

@@ -24,11 +24,8 @@ def square(category, x, y, size=5, **more):
 
 
 def test_polygons_are_filled_joined_and_scaled(tmp_path):
-    file = write_frame(
-        tmp_path / "ramen",
-        "frame_00006",
-        [square("egg", 2, 3), square("egg", 20, 10, bbox=[20, 10, 25, 15]), square("bowl", 4, 4)],
-    )
+    egg = square("egg", 20, 10, bbox=[20, 10, 25, 15])
+    file = write_frame(tmp_path / "ramen", "frame_00006", [square("egg", 2, 3), egg, square("bowl", 4, 4)])
     frame = read_frame(file, 40, 30)
     assert list(frame.masks) == ["egg", "bowl"]
     egg = torch.zeros(30, 40, dtype=torch.bool)
@@ -82,11 +79,8 @@ def test_langsplat_reading():
     assert float(average.max()) == pytest.approx(1, abs=1e-5)
     assert float(mixed[45, 31]) == pytest.approx((1 + float(average[45, 31])) / 2)
     truth = relevancy.bool()
-    scores = FrameScores(
-        frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]}),
-        relevancy[..., None],
-        relevancy[..., None][..., :0],
-    )
+    frame = frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]})
+    scores = FrameScores(frame, relevancy[..., None], relevancy[..., None][..., :0])
     (row,) = frame_rows(scores, "langsplat", margin=0, clean=False)
     assert 0.8 < row["iou"] < 0.87  # corners, where the mean is below 0.4, are cut off: 15 % of the square
     assert row["localized"] == 1
@@ -143,10 +137,8 @@ def test_order_of_averages_by_hand():
 def test_scenes_are_averaged_as_the_paper_does_and_pooled_beside_it():
     rows = [row("s", "a", "egg", 1.0), row("t", "a", "egg", 0.0), row("t", "b", "egg", 0.5), row("t", "b", "cup", 0.5)]
     frames = summarize_lerf(rows, "frames", {})
-    assert [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes] == [
-        ("s", 1, 1),
-        ("t", 2, 1 / 4),
-    ]
+    found = [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes]
+    assert found == [("s", 1, 1), ("t", 2, 1 / 4)]
     assert frames.results["miou"] == (1 + 1 / 4) / 2
     assert frames.results["miou_pooled"] == (1 + 0 + 1 / 2) / 3  # three frames
     pairs = summarize_lerf(rows, "pairs", {}).results

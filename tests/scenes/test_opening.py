@@ -243,17 +243,22 @@ def test_the_lifted_run_opens_again_also_where_it_moved(
         open_run(moved, data=tmp_path / "nowhere")
 
 
+def saved(folder: Path, scene) -> Path:
+    """The files of a scene in the folder of its run."""
+    content = checkpoint_of(scene)
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    torch.save(content, folder / "nerfstudio_models" / f"step-{content['step']:09d}.ckpt")
+    save_splat(folder, scene)
+    return folder
+
+
 def test_every_degree_is_saved_and_drawn(native, splat, trained: Path, tmp_path: Path) -> None:
     world = trained.parent / "dataparser_transforms.json"
     for degree in range(4):
         rest = 0.2 * torch.randn(len(splat), (degree + 1) ** 2 - 1, 3, generator=torch.Generator().manual_seed(0))
         path = write_ply(tmp_path / "s.ply", ply_columns(replace(splat, features_rest=rest)))
         scene = open_splat(path, SplatOptions(transforms=native.location.folder, world_transform=world))
-        (tmp_path / str(degree) / "nerfstudio_models").mkdir(parents=True)
-        content = checkpoint_of(scene)
-        torch.save(content, tmp_path / str(degree) / "nerfstudio_models" / f"step-{content['step']:09d}.ckpt")
-        save_splat(tmp_path / str(degree), scene)
-        again = open_saved_splat(tmp_path / str(degree))
+        again = open_saved_splat(saved(tmp_path / str(degree), scene))
         camera = scene.train.cameras[2]
         assert torch.equal(again.colors(camera), scene.colors(camera))
         assert again.splat.degree == max(1, degree)  # splatfacto takes colours without harmonics for logits
@@ -381,10 +386,8 @@ def test_a_ply_file_of_gsplats_trainer_lies_in_its_normalized_world(
     assert difference(native, scene) < ROUNDED
 
 
-@pytest.mark.slow
-def test_photographs_in_subfolders(native, splat, frames, tmp_path: Path, monkeypatch) -> None:
-    """Two cameras with photographs of the same names, in copies outside the dataset, which are moved later."""
-    monkeypatch.chdir(tmp_path)
+def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
+    """Two cameras with images of the same names, in copies outside the dataset, which are moved later."""
     entries = []
     for i, frame in enumerate(frames):
         name = f"{('left', 'right')[i % 2]}/{i // 2:04d}.png"
@@ -392,29 +395,26 @@ def test_photographs_in_subfolders(native, splat, frames, tmp_path: Path, monkey
             (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / folder / name).write_bytes(frame.file.read_bytes())
         camera = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h"), frame.intrinsics))
-        entries.append(
-            {"file_path": f"images/{name}", "transform_matrix": [*frame.pose.tolist(), [0, 0, 0, 1]], **camera}
-        )
+        pose = [*frame.pose.tolist(), [0, 0, 0, 1]]
+        entries.append({"file_path": f"images/{name}", "transform_matrix": pose, **camera})
     (tmp_path / "cap" / "transforms.json").write_text(json.dumps({"frames": entries}))
     path = write_ply(tmp_path / "s.ply", ply_columns(splat))
-    scene = open_splat(path, SplatOptions(transforms="cap", images="photos"))
-    assert scene.train.names[0] == "photos/left/0000.png"
-    assert scene.train.names[-1] == "photos/right/0006.png"
-    run = lift_run(scene, timestamp="t", **OPTIONS)
-    (tmp_path / "photos").rename(tmp_path / "moved")
-    for data in ("moved", "."):
-        if data == ".":
-            (tmp_path / "moved").rename(tmp_path / "photos")
-        again = open_run(run.config, data=tmp_path / data)
-        assert again.scene.train.names == scene.train.names
-        assert again.scene.train[3].image.shape == (120, 160, 3)
-    with pytest.raises(ValueError, match=r"would share the files 0000_\*\.npy of LangSplat's format"):
-        lift_run(again.scene, export=Export(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
-    (tmp_path / "photos" / "left" / "0001.png").unlink()
-    (tmp_path / "photos" / "0001.png").write_bytes(frames[0].file.read_bytes())
-    (tmp_path / "photos" / "right" / "0001.png").unlink()
-    with pytest.raises(ValueError, match=r"there is only .*photos/0001.png for both"):
-        open_splat(path, SplatOptions(transforms="cap", images="photos"))
+    options = SplatOptions(transforms=tmp_path / "cap", images=tmp_path / "photos")
+    scene = open_splat(path, options)
+    assert (scene.train.names[0], scene.train.names[-1]) == ("photos/left/0000.png", "photos/right/0006.png")
+    run = saved(tmp_path / "run", scene)
+    for now in ("photos", "moved"):
+        again = open_saved_splat(
+            run, data=tmp_path if now == "photos" else (tmp_path / "photos").rename(tmp_path / now)
+        )
+        assert again.train.names == scene.train.names
+        assert again.train[3].image.shape == (120, 160, 3)
+    with pytest.raises(InputError, match=r" 0000_\*\.npy "):
+        lift_run(again, export=Export(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
+    (tmp_path / "moved" / "left" / "0001.png").rename(tmp_path / "moved" / "0001.png")
+    (tmp_path / "moved" / "right" / "0001.png").unlink()
+    with pytest.raises(InputError, match=r"moved/0001\.png for both"):
+        open_splat(path, replace(options, images=tmp_path / "moved"))
 
 
 @needs_shared
