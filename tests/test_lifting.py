@@ -7,9 +7,7 @@ import json
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +22,6 @@ from normlift_ns import (
     LiftOptions,
     RasterSettings,
     RefineConfig,
-    View,
     lifting,
     observing,
 )
@@ -42,41 +39,27 @@ from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.stages import cost
 from normlift_ns.team.seen import Export
 from normlift_ns.viewer.pictures import picture_names, training_cameras
-from tests.scenes import generator
+from tests.scenes import Photographs, generator, made_scene
 
 WIDTH, HEIGHT, N = 24, 18, 30
 
 
-@dataclass
-class Photographs:
-    names: Sequence[str]
-    original: tuple[int, int] | None = None
-    mask: torch.Tensor | None = None
-
-    @property
-    def cameras(self) -> list[Camera]:
-        pose = torch.eye(4)
-        pose[2, 3] = 2
-        return [Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), pose, WIDTH, HEIGHT)] * len(self)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: int) -> View:
-        image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator(index), dtype=torch.uint8)
-        return View(self.cameras[index], image, self.mask, self.names[index], self.original)
+_POSE = torch.eye(4)
+_POSE[2, 3] = 2
+CAMERA = Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), _POSE, WIDTH, HEIGHT)
 
 
-def scene(*names: str, count: int = N, held_out: Sequence[str] = (), **more: Any) -> Any:
+def scene(*names: str, count: int = N, held_out: Sequence[str] = (), mask: Any = None, **more: Any) -> Any:
     g = generator(0)
     means = torch.rand(count, 3, generator=g) - 0.5
     gaussians = GaussianScene(
         means, torch.randn(count, 4, generator=g), torch.full((count, 3), 0.05), torch.full((count,), 0.8)
     )
-    return SimpleNamespace(
-        gaussians=gaussians, train=Photographs(names or ("images/a.png",), **more), held_out=Photographs(held_out),
-        rasterize_mode="classic", identity={}, name="made",
-    )  # fmt: skip
+    train, other = (
+        Photographs(some, [CAMERA] * len(some), masks=[mask] * len(some), **more)
+        for some in (names or ("images/a.png",), held_out)
+    )
+    return made_scene(gaussians, train, other)
 
 
 def lifted(source: FeatureSource, cache: Path, made: Any = None, **options: Any) -> Any:

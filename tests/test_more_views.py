@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from normlift_ns import Camera, Evidence, LiftOptions, RasterSettings, View, observing
+from normlift_ns import Evidence, LiftOptions, RasterSettings, observing
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders import RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
@@ -21,35 +19,11 @@ from normlift_ns.encoders.regions import Superpixels
 from normlift_ns.lifting import lift_scene
 from normlift_ns.observing import Block, block_evidence
 from normlift_ns.options import BackendName
-from tests.scenes import generator, orbit_camera, random_scene
+from tests.scenes import Photographs, made_scene, orbit_camera, random_scene
 
 ALL = tuple(range(11))
 OLD = (0, 2, 3, 5, 6, 7, 9, 10)
 """New views stand before, between and behind old ones, so that no block of the second lift is one of the first."""
-
-
-@dataclass
-class Orbit:
-    """Photographs of noise around a scene."""
-
-    numbers: Sequence[int]
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{number:02}.png" for number in self.numbers]
-
-    @property
-    def cameras(self) -> list[Camera]:
-        return [orbit_camera(0.3 * number) for number in self.numbers]
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def __getitem__(self, index: int) -> View:
-        camera, number = self.cameras[index], self.numbers[index]
-        shape = (camera.height, camera.width, 3)
-        image = torch.randint(0, 256, shape, generator=generator(number), dtype=torch.uint8)
-        return View(camera, image, None, self.names[index])
 
 
 @pytest.fixture
@@ -82,10 +56,9 @@ def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 def lifted(numbers: Sequence[int], cache: Path, mode: str = "classic") -> SemanticField:
-    scene: Any = SimpleNamespace(
-        gaussians=random_scene(60, dtype=torch.float32), train=Orbit(numbers), held_out=Orbit(()), rasterize_mode=mode,
-        identity={}, name="made",
-    )  # fmt: skip
+    cameras = [orbit_camera(0.3 * number) for number in numbers]
+    views = Photographs([f"{number:02}.png" for number in numbers], cameras, seeds=numbers)
+    scene = made_scene(random_scene(60, dtype=torch.float32), views, rasterize_mode=mode)
     options = LiftOptions(refine=False, storage="evidence", consensus=False)
     source = RegionFeatures(Superpixels(9), ColourEncoder())
     return lift_scene(scene, source, options, cache, encoder={}).field

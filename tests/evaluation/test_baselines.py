@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from normlift_ns import Camera, InputError, LiftOptions, RasterSettings, SourceOptions, View, rasterize_evidence
+from normlift_ns import Camera, InputError, LiftOptions, RasterSettings, SourceOptions, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks, with_consensus
 from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
@@ -23,38 +23,19 @@ from normlift_ns.evaluation.votes import voting_scalars
 from normlift_ns.lifting import lift_scene
 from normlift_ns.observing import of_regions
 from normlift_ns.raster.backend import Job
-from tests.scenes import dense, generator, orbit, random_scene
+from tests.scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
 OPTIONS = SourceOptions(encoder="colour", regions="grid", region_count=12)
-
-
-@dataclass
-class Photographs:
-    cameras: list[Camera]
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{i}.png" for i in range(len(self.cameras))]
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __getitem__(self, index: int) -> View:
-        image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator(index), dtype=torch.uint8)
-        mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-        mask[: 3 * index] = False
-        return View(self.cameras[index], image, mask, self.names[index])
 
 
 @pytest.fixture(scope="module")
 def lifted(tmp_path_factory) -> EvaluatedRun:
     """A lifted run of a scene made by hand, whose photographs are masked in part."""
     folder = tmp_path_factory.mktemp("cache")
-    scene: Any = SimpleNamespace(
-        gaussians=random_scene(N, dtype=torch.float32, size=0.3), train=Photographs(orbit(VIEWS)),
-        held_out=Photographs([]), rasterize_mode="classic", identity={}, name="made",
-    )  # fmt: skip
+    masks = [torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH) >= 3 * i for i in range(VIEWS)]
+    photographs = Photographs([f"{i}.png" for i in range(VIEWS)], orbit(VIEWS), masks=masks)
+    scene = made_scene(random_scene(N, dtype=torch.float32, size=0.3), photographs)
     options = LiftOptions(refine=False, max_views=4, consensus=False, consensus_least=0.0)  # cells count as things
     found = lift_scene(scene, make_source(OPTIONS), options, folder, encoder={}).field
     manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
@@ -224,31 +205,20 @@ def test_lengths_of_pixels_are_those_of_composited_features(lifted):
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
 
 
-def skip_without_gsplat() -> None:
+@needs_gpu
+def test_channels_through_gsplat_are_the_sums_of_evidence_and_are_timed(lifted):
     from tests.raster.test_gpu import compiled_gsplat  # noqa: PLC0415
 
     if not compiled_gsplat():
         pytest.skip("gsplat's compiled part is missing")
-
-
-@needs_gpu
-def test_channels_through_gsplat_are_the_sums_of_evidence(lifted):
-    skip_without_gsplat()
-    blocks = list(seen_blocks(lifted, "cuda"))
     scene = lifted.scene.gaussians.to("cuda")
     job = Job(scene, False, RasterSettings(), torch.float32)
-    for block in blocks:
-        dimension = block.features[0].shape[1]
-        found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), dimension)
+    for block in seen_blocks(lifted, "cuda"):
+        found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), block.features[0].shape[1])
         counts = [regions.shape[1] for regions in block.regions]
         cells = rasterize_evidence(scene, block.cameras, block.labels, num_regions=counts)
         expected = of_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
         assert torch.allclose(found, expected.float(), rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
-
-
-@needs_gpu
-def test_sfs_way_is_timed_beside_ours(lifted):
-    skip_without_gsplat()
     (row,) = timing([lifted], "cuda")
     assert row["timed_views"] == 4
     assert row["dense512_over_evidence_lift"] == pytest.approx(row["dense512_s"] / row["evidence_lift_s"])

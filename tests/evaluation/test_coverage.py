@@ -21,17 +21,7 @@ from normlift_ns.evaluation.coverage.gain import FAINT, Known, choose_views, gai
 from normlift_ns.evaluation.coverage.photographs import lifted_names
 from normlift_ns.evaluation.coverage.study import Coverage, coverage_of
 from normlift_ns.raster.settings import RasterSettings
-
-
-@dataclass
-class Photographs:
-    """Cameras with names, and no images."""
-
-    names: list[str]
-    cameras: list[Camera]
-
-    def __len__(self) -> int:
-        return len(self.names)
+from tests.scenes import Photographs
 
 
 @dataclass
@@ -188,19 +178,16 @@ def test_gains_are_those_of_a_loop():
         assert sum(x for _, x in chosen[:2]) >= 0.63 * best
 
 
-def test_similar_views_gain_little_after_each_other():
-    known = Known(*(torch.tensor(x, dtype=torch.float64) for x in ([1.0, 1], [0.0, 0], [0.0, 0], [1.0, 1])), beta=1.0)
-    row, column = torch.tensor([0, 0, 1]), torch.tensor([0, 1, 2])
-    views = SparseRows.from_coo(row, column, torch.tensor([1.0, 1.0, 0.9], dtype=torch.float64), 2)
+def test_similar_views_gain_little_after_each_other_and_faint_ones_nothing():
+    def case(norms: int, columns: list[list[float]]) -> tuple[Known, SparseRows]:
+        ones, zeros = torch.ones(norms, dtype=torch.float64), torch.zeros(norms, dtype=torch.float64)
+        row, column, weight = (torch.tensor(part) for part in zip(*columns))
+        sparse = SparseRows.from_coo(row.long(), column.long(), weight.double(), norms)
+        return Known(ones, zeros, zeros, ones, beta=1.0), sparse
+
+    known, views = case(2, [[0, 0, 1.0], [0, 1, 1.0], [1, 2, 0.9]])
     assert [view for view, _ in choose_views(known, views, 3, 3)] == [0, 2, 1]
-
-
-def test_a_view_that_hardly_sees_something_is_no_whole_view():
-    known = Known(*(torch.tensor([x], dtype=torch.float64) for x in (1.0, 0.0, 0.0, 1.0)), beta=1.0)
-    views = SparseRows.from_coo(
-        torch.tensor([0, 0]), torch.tensor([0, 1]), torch.tensor([1.0, 0.001], dtype=torch.float64), 1
-    )
-    clear, faint = gains(known, views, 2).tolist()
+    clear, faint = gains(*case(1, [[0, 0, 1.0], [0, 1, 0.001]]), 2).tolist()
     assert clear == pytest.approx(0.5, abs=0.01)
     assert faint < 1e-3
 

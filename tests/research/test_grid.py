@@ -205,28 +205,6 @@ def test_votes_are_those_of_refine(world):
             assert torch.equal(source, expected[voters.group[:, 0]].long()), (name, delta)
 
 
-def test_a_posterior_vote_is_the_formula(world):
-    observed = observe(world, WORDS, LADDER["hard"], 1)
-    lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)
-    voters = voters_of(neighbors, world.truth, CLASSES)
-    (part,) = _parts(lifted, voters, cosines=True)
-    one = Candidate("posterior", sigma_d=2.0, prior=3.0, delta=0.05)
-    (source,) = part.sources([one], one.tau, one.gamma)
-    u, r = lifted.directions().double(), lifted.scalars.reliability.double()
-    own = (lifted.scalars.norm * lifted.scalars.n_eff).double()
-    gate = torch.sigmoid((u @ u.T - one.tau) / one.gamma)
-    spacing = float(neighbors.spacing.median())
-    for place in range(0, len(voters.group), 7):
-        i, *near = voters.group[place].tolist()
-        d = torch.exp(-0.5 * (neighbors.distance[i].double() / (2 * spacing)) ** 2)
-        share = r[near] * d / (r[near] * d).sum()
-        support = {j: float(r[j] * (own[i] * gate[j, i] + 3 * (share * gate[j, near]).sum())) for j in (i, *near)}
-        best = max(near, key=lambda j: support[j])
-        expected = best if support[best] > support[i] + 0.05 else i
-        chosen = int(source[place])
-        assert chosen == expected or support[chosen] == pytest.approx(support[expected], rel=1e-4)
-
-
 def test_results_are_those_of_the_variants(world):
     observed = observe(world, WORDS, STEPS["arc"], 0)
     lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)

@@ -10,6 +10,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.scenes.saved import checkpoint_of, open_saved_splat
 from normlift_ns.scenes.similarity import read_dataparser_transforms, read_world_transform
 from normlift_ns.scenes.transforms import read_transforms, write_transforms
+from normlift_ns.scenes.unpickling import numbers_allowed
 from tests.hostile import damaged, fuzz, hostile_json, no_files
 from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
 
@@ -340,3 +342,23 @@ def test_damage_is_a_message(tmp_path: Path) -> None:
 
         load()
         fuzz(10, damage(path, kind), path, load)
+
+
+class Stranger:
+    """Of a kind that checkpoints do not hold."""
+
+
+def test_numbers_of_numpy_are_read_and_objects_are_not(tmp_path: Path) -> None:
+    state = {"step": 7, "lr": np.float64(0.1), "many": [np.float32(1), np.int64(3)], "w": torch.arange(3.0)}
+    plain = saved(tmp_path, {**state, "more": OrderedDict(a=1)}, "plain.pt")
+    with numbers_allowed():
+        found = torch.load(plain, weights_only=True)
+        with pytest.raises(pickle.UnpicklingError, match="Stranger"):
+            torch.load(saved(tmp_path, {**state, "stranger": Stranger()}, "stranger.pt"), weights_only=True)
+    assert found["step"] == 7
+    assert torch.equal(found["w"], state["w"])
+    adds = hasattr(torch.serialization, "add_safe_globals")
+    assert (found["lr"], found["many"]) == ((0.1, [1, 3]) if adds else (None, [None, None]))
+    if hasattr(torch.serialization, "safe_globals") or not adds:  # torch 2.4 keeps what was once allowed
+        with pytest.raises(pickle.UnpicklingError, match="numpy"):
+            torch.load(plain, weights_only=True)

@@ -15,24 +15,19 @@ from tests.captures import needs_shared
 
 
 class Changed:
-    """A scene whose training views are changed."""
+    """A scene, and its training views, which are changed."""
 
     def __init__(self, scene, change) -> None:
-        self._scene, self.train = scene, _Views(scene.train, change)
+        self._scene, self._change, self.train = scene, change, self
 
     def __getattr__(self, name: str):
         return getattr(self._scene, name)
 
-
-class _Views:
-    def __init__(self, views, change) -> None:
-        self.views, self.change = views, change
-
     def __len__(self) -> int:
-        return len(self.views)
+        return len(self._scene.train)
 
     def __getitem__(self, index: int) -> View:
-        return self.change(self.views[index])
+        return self._change(self._scene.train[index])
 
 
 def focal(factor: float):
