@@ -33,7 +33,7 @@ from normlift_ns import (
     render,
 )
 from tests.research import quick
-from tests.research.conftest import CLASSES, WORDS
+from tests.research.tiny import CLASSES, WORDS
 from tests.scenes import dense
 
 

@@ -24,7 +24,7 @@ from normlift_ns import RefineConfig, lift, nearest_neighbors
 from normlift_ns.core.ablations import Variant, variant_source
 from normlift_ns.core.metrics import classify
 from tests.research import ROOT, quick
-from tests.research.conftest import CLASSES, WORDS
+from tests.research.tiny import CLASSES, WORDS
 from tests.scenes import generator
 
 PINNED = {
