@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,7 @@ from tests.core.test_digests import example
 
 def field_with(settings: dict[str, Any], features: dict[str, Any]) -> SemanticField:
     field = example("float16")
-    return SemanticField(
-        field.scalars, field.source, field.store, {**field.manifest, "encoder": settings, "features": features}
-    )
+    return replace(field, manifest={**field.manifest, "encoder": settings, "features": features})
 
 
 def lifted(kind: str, tmp_path: Path) -> SemanticField:

@@ -26,7 +26,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, Checkpoint, read_checkpoint
 from normlift_ns.scenes.formats.gsplat_checkpoint import read_gsplat
 from normlift_ns.scenes.formats.ply import read_ply
-from normlift_ns.scenes.frames import Frame, Intrinsics, sized
+from normlift_ns.scenes.frames import Frame, Intrinsics, check_frames, sized
 from normlift_ns.scenes.photographs import PhotographViews
 from normlift_ns.scenes.saved import checkpoint_of, open_saved_splat
 from normlift_ns.scenes.similarity import read_dataparser_transforms, read_world_transform
@@ -293,7 +293,15 @@ def make(kind: str, folder: Path) -> tuple[Path, Callable[[], Any]]:  # noqa: PL
         return path, lambda: (read_world_transform(path, np.eye(4)), read_dataparser_transforms(path))
     saved_splat(folder)
     path = folder / kind
-    return path, lambda: read_transforms(path) if kind == "transforms.json" else open_saved_splat(folder)
+    if kind == "splat.json":
+        return path, lambda: open_saved_splat(folder)
+
+    def frames() -> list[Frame]:
+        found = read_transforms(path).frames
+        check_frames(found, path)
+        return found
+
+    return path, frames
 
 
 def damage(path: Path, kind: str) -> st.SearchStrategy[bytes]:
@@ -341,7 +349,7 @@ def test_damage_is_a_message(tmp_path: Path) -> None:
                 assert {len(found.model[f"gauss_params.{name}"]) for name in GAUSSIAN_PARAMETERS} != {0}
 
         load()
-        fuzz(10, damage(path, kind), path, load)
+        fuzz(20 if kind == "transforms.json" else 10, damage(path, kind), path, load)
 
 
 class Stranger:

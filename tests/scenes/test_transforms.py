@@ -6,14 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given
-from hypothesis import strategies as st
 from PIL import Image
 
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import check_frames
 from normlift_ns.scenes.transforms import read_transforms, write_transforms
-from tests.examples import examples
 
 INTRINSICS = {"fl_x": 50.0, "fl_y": 51.0, "cx": 20.5, "cy": 14.5, "w": 40, "h": 30}
 
@@ -146,25 +143,3 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     for frame, before in zip(again.frames, found.frames):
         assert (frame.file, frame.name, frame.intrinsics) == (before.file, before.name, before.intrinsics)
         assert np.array_equal(frame.pose, before.pose.astype(np.float32))
-
-
-@examples(25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    key=st.sampled_from([*INTRINSICS, "frames", "applied_transform", "applied_scale", "train_filenames", "k1"]),
-    value=st.recursive(
-        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
-        lambda part: st.lists(part, max_size=4) | st.dictionaries(st.text(max_size=3), part, max_size=3),
-        max_leaves=12,
-    ),
-)
-def test_no_content_gets_through_as_another_error(tmp_path: Path, key: str, value: object) -> None:
-    path = tmp_path / "transforms.json"
-    if not path.exists():
-        capture(tmp_path)
-    whole = path.read_text()
-    path.write_text(json.dumps({**json.loads(whole), key: value}))
-    try:
-        check_frames(read_transforms(path).frames, path)
-    except (ValueError, FileNotFoundError) as error:
-        assert "transforms.json" in str(error)
-    path.write_text(whole)
