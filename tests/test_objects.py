@@ -11,6 +11,7 @@ from benchmarks.box_overlap import box_iou, half_spaces
 from normlift_ns import InputError
 from normlift_ns.objects import connected_components
 from normlift_ns.objects.boxes import OrientedBox, oriented_box
+from tests.examples import examples
 from tests.scenes import generator
 
 
@@ -61,6 +62,7 @@ def turned(seed: int) -> np.ndarray:
     return Rotation.random(random_state=seed).as_matrix()
 
 
+@examples(5)
 @given(st.integers(0, 2**16), st.floats(0.01, 100))
 def test_the_box_of_a_turned_cuboid_is_the_cuboid(seed, scale):
     rotation, shift = turned(seed), np.array([3.0, -2, 7])

@@ -316,7 +316,8 @@ def test_camera_path_is_what_nerfstudio_reads(nerfstudio, one_side, tmp_path):
 
 
 def test_poses_and_pictures_are_written(one_side, tmp_path):
-    found, written = one_side, one_side.save(tmp_path / "next.json")
+    found = replace(one_side, poses=one_side.poses[:2], pictures=one_side.pictures[:2])
+    written = found.save(tmp_path / "next.json")
     cameras = [pose.camera for pose in found.poses]
     assert [path.name for path in written][:2] == ["next.json", "next_camera_path.json"]
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in written}

@@ -11,7 +11,7 @@ import torch
 from normlift_ns import Camera, InputError, open_scene
 from normlift_ns.core.scene import View
 from normlift_ns.scenes.match import judge, match_photographs
-from tests.captures import needs_shared
+from tests.captures import SHARED, needs_shared
 
 
 class Changed:
@@ -120,11 +120,8 @@ def test_masked_pixels_do_not_count(scene) -> None:
 
 @needs_shared
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fox", "tabletop"])
-def test_real_captures(name: str) -> None:
-    from benchmarks.captures import SHARED  # noqa: PLC0415
-
-    scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
-    assert judge(match_photographs(scene), own_cameras=True) is None
-    for factor in (0.98, 1.02):
+def test_real_captures() -> None:
+    for name, factor in (("fox", 0.98), ("tabletop", 1.02)):
+        scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
+        assert judge(match_photographs(scene), own_cameras=True) is None
         assert "fit the photographs better" in warning_of(scene, focal(factor))

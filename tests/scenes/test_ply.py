@@ -141,11 +141,11 @@ print(len(splat), float(splat.means[-1, 0]), (after - before) * 2**30 / Path(sys
 
 @pytest.mark.slow
 def test_large_files_are_read_in_less_than_three_times_their_size(tmp_path: Path) -> None:
-    """2 M Gaussians of degree 3, written block by block; the peak is that of a process of its own."""
+    """A million Gaussians of degree 3, written block by block; the peak is that of a process of its own."""
     small = ply_columns(random_splat(100_000))
     path = write_ply(tmp_path / "small.ply", small)
     head, body = path.read_bytes().split(b"end_header\n", 1)
-    blocks = 20
+    blocks = 10
     with (tmp_path / "large.ply").open("wb") as file:
         file.write(head.replace(b"vertex 100000", b"vertex %d" % (100_000 * blocks)) + b"end_header\n")
         for _ in range(blocks):
@@ -154,6 +154,6 @@ def test_large_files_are_read_in_less_than_three_times_their_size(tmp_path: Path
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     (tmp_path / "large.ply").unlink()
     count, last, factor = done.stdout.split()
-    assert int(count) == 2_000_000
+    assert int(count) == 1_000_000
     assert float(last) == small["x"][-1]
     assert float(factor) < 3, factor
