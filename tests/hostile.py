@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from normlift_ns import InputError
+from tests.examples import examples
 
-EXAMPLES = [pytest.param(25, id="fast"), pytest.param(200, id="slow", marks=pytest.mark.slow)]
+EXAMPLES = [pytest.param(10, id="few")]
 """How many files a loader is tried on: `@pytest.mark.parametrize("examples", EXAMPLES)`."""
 VALUES: list[Any] = [
     None, True, False, 0, -1, 1, 2**31, 2**63, 2**64, 10**40, -(10**40), 10**400, 0.5, -0.0, 1e308, 1e-320, "", " ",
@@ -41,10 +42,10 @@ def survives(call: Callable[[], object]) -> None:
             assert error.errno is None, f"the system's message and not ours: {error}"
 
 
-def fuzz(examples: int, contents: st.SearchStrategy[bytes], path: Path, load: Callable[[], object]) -> None:
-    """Tries a loader on files of many contents at one path."""
+def fuzz(number: int, contents: st.SearchStrategy[bytes], path: Path, load: Callable[[], object]) -> None:
+    """Tries a loader on files of many contents at one path; many more of them in `make test-all`."""
 
-    @settings(max_examples=examples, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @examples(number, database=None, suppress_health_check=list(HealthCheck))
     @given(contents)
     def run(content: bytes) -> None:
         path.write_bytes(content)

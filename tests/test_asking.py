@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -25,31 +26,29 @@ from tests.core.test_digests import example
 
 def field_with(settings: dict[str, Any], features: dict[str, Any]) -> SemanticField:
     field = example("float16")
-    return SemanticField(
-        field.scalars, field.source, field.store, {**field.manifest, "encoder": settings, "features": features}
-    )
+    return replace(field, manifest={**field.manifest, "encoder": settings, "features": features})
 
 
-@pytest.fixture(params=["regions", "patches", "langsplat", "version 0.1"])
-def lifted(request: pytest.FixtureRequest, tmp_path: Path) -> SemanticField:
+def lifted(kind: str, tmp_path: Path) -> SemanticField:
     """A field that was lifted with the weight file w.pt."""
     path = tmp_path / "w.pt"
     path.write_bytes(b"weights" * 1000)
     source = SourceOptions(encoder_pretrained=str(path))
     identity = OpenClipEncoder(DEFAULT_MODEL, str(path)).identity
-    if request.param == "version 0.1":
+    if kind == "version 0.1":
         identity["pretrained"] = f"blake2b:{blake2b(path.read_bytes(), digest_size=16).hexdigest()}"
     features = {
         "regions": {"regions": {"kind": "grid"}, "levels": [], "encoder": identity},
         "patches": {"kind": "patches", "count": 4, "encoder": identity},
         "langsplat": {"kind": "langsplat", "level": "l", "texts": identity},
     }
-    return field_with(encoder_settings(source), features.get(request.param, features["regions"]))
+    return field_with(encoder_settings(source), features.get(kind, features["regions"]))
 
 
-def test_replaced_weights_are_refused(lifted: SemanticField, tmp_path: Path) -> None:
-    path = tmp_path / "w.pt"
-    encoder = encoder_of(lifted, cache=tmp_path / "texts")
+@pytest.mark.parametrize("kind", ["regions", "patches", "langsplat", "version 0.1"])
+def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
+    path, field = tmp_path / "w.pt", lifted(kind, tmp_path)
+    encoder = encoder_of(field, cache=tmp_path / "texts")
     assert isinstance(encoder, KeptTexts)
     content = bytearray(path.read_bytes())
     content[77] ^= 1
@@ -57,24 +56,20 @@ def test_replaced_weights_are_refused(lifted: SemanticField, tmp_path: Path) -> 
     path.write_bytes(content)
     os.utime(path, ns=(stamps.st_atime_ns, stamps.st_mtime_ns))  # as old and as large as before
     with pytest.raises(InputError) as caught:
-        encoder_of(lifted, cache=tmp_path / "texts")
-    expected = lifted.manifest["features"].get("encoder", lifted.manifest["features"].get("texts"))["pretrained"]
+        encoder_of(field, cache=tmp_path / "texts")
+    expected = field.manifest["features"].get("encoder", field.manifest["features"].get("texts"))["pretrained"]
     for part in (str(path), file_digest(path, like=expected), expected, "--text-vectors", "lift again"):
         assert part in str(caught.value)
     assert "--encoder-pretrained" not in str(caught.value)  # ns-normlift-query has no such flag
-    template = with_texts(lifted, template="a {}")
-    with pytest.raises(InputError, match="is not what the run was lifted with"):
+    template = with_texts(field, template="a {}")
+    with pytest.raises(InputError, match="lifted with"):
         encoder_of(template)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=rf"weight file {path}, with which .* --text-vectors") as missing:
-        encoder_of(lifted)
+    with pytest.raises(FileNotFoundError, match=rf"{path}.* --text-vectors") as missing:
+        encoder_of(field)
     assert "--encoder-pretrained" not in str(missing.value)
-
-
-def test_texts_of_the_users_choice_need_no_weights(lifted: SemanticField, tmp_path: Path) -> None:
-    (tmp_path / "w.pt").unlink()
-    np.savez(tmp_path / "own.npz", fox=np.ones(12, np.float32))
-    assert isinstance(encoder_of(with_texts(lifted, vectors=tmp_path / "own.npz")), TextVectors)
+    np.savez(tmp_path / "own.npz", fox=np.ones(12, np.float32))  # the user's choice needs no weights
+    assert isinstance(encoder_of(with_texts(field, vectors=tmp_path / "own.npz")), TextVectors)
 
 
 def test_relative_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,11 +122,11 @@ def test_replaced_text_vectors_are_refused_unless_they_are_chosen(tmp_path: Path
     field = field_with(settings, {"kind": "langsplat", "level": "l", "texts": TextVectors(path).identity})
     assert torch.is_tensor(encoder_of(field).text(["fox"]))
     np.savez(path, fox=np.arange(12, dtype=np.float32))
-    with pytest.raises(InputError, match=rf"{path} is not what the run was lifted with.*--text-vectors"):
+    with pytest.raises(InputError, match=rf"{path} .*--text-vectors"):
         encoder_of(field)
     assert torch.is_tensor(encoder_of(with_texts(field, vectors=path)).text(["fox"]))
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=rf"the run's file of text vectors {path} does not exist"):
+    with pytest.raises(FileNotFoundError, match=str(path)):
         encoder_of(field)
 
 

@@ -20,6 +20,7 @@ from normlift_ns.question import Question
 from normlift_ns.raster import rasterize
 from normlift_ns.raster.backend import Job
 from normlift_ns.raster.backends import choose_backend
+from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry, said
 
@@ -27,6 +28,13 @@ from tests.scripts.conftest import run_entry, said
 @pytest.fixture(scope="module")
 def run(lifted: Path) -> nl.LiftedRun:
     return nl.open_run(lifted)
+
+
+@pytest.fixture(scope="module")
+def scene(trained: Path) -> NerfstudioScene:
+    found = nl.open_scene(trained)
+    assert isinstance(found, NerfstudioScene)
+    return found
 
 
 def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None:
@@ -45,11 +53,8 @@ def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None
     ball = red.objects[0]
     assert ball.size > 0.6 * int(truth.sum())
     assert np.all(np.array(ball.box["min"]) <= ball.centroid) and np.all(np.array(ball.centroid) <= ball.box["max"])
-    with pytest.raises(KeyError, match="'blue' was not asked; the texts are 'red', 'yellow'"):
+    with pytest.raises(KeyError, match=r"'blue' .* 'red', 'yellow'"):
         answer["blue"]
-
-
-def test_nothing_found_has_no_place(run: nl.LiftedRun) -> None:
     nothing = run.ask("red", threshold=2.0)["red"]
     assert (nothing.fraction, nothing.centroid, nothing.extent, nothing.objects) == (0.0, None, None, [])
     assert nothing.mean_reliability is None
@@ -66,7 +71,7 @@ def test_parts_are_exported(run: nl.LiftedRun, tmp_path: Path) -> None:
     columns = {name: set(PlyData.read(tmp_path / f"{name}.ply")["vertex"].data.dtype.names) for name in parts}
     assert "relevancy_1" in columns["red"] and "relevancy_1" in columns["both"]
     assert "relevancy_0" not in columns["mask"] | columns["all"]
-    with pytest.raises(FileExistsError, match=r"red\.ply exists; give another name, or overwrite=True"):
+    with pytest.raises(FileExistsError, match=r"red\.ply .*overwrite"):
         run.export(tmp_path / "red.ply", answer)
     assert len(run.export(tmp_path / "red.ply", answer, overwrite=True)) == len(rows["both"])
 
@@ -83,13 +88,12 @@ def test_pictures_show_the_answer(run: nl.LiftedRun) -> None:
     assert torch.equal(run.render(3), plain)
     assert torch.equal(run.render(run.scene.train.cameras[3]), plain)
     assert torch.equal(run.render("images/0003.png"), plain)
-    with pytest.raises(KeyError, match=r"no training image 'x'; there are 12, images/0000\.png to"):
+    with pytest.raises(KeyError, match=r"'x'.* 12, images/0000\.png to"):
         run.render("x")
 
 
-def test_features_of_ones_own(trained: Path, room: DemoRoom, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Path, monkeypatch, capsys) -> None:
     """Masks of the capture with made-up vectors: the run can be asked from Python and on the command line."""
-    scene = nl.open_scene(trained)
     vectors = torch.eye(len(room.names))
     masks = [nl_mask(trained, view.name) for view in scene.train]
     features = [(mask - 1, vectors) for mask in masks]
@@ -122,8 +126,7 @@ def nl_mask(trained: Path, name: str) -> torch.Tensor:
     ).int()
 
 
-def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> None:
-    scene = nl.open_scene(trained)
+def test_features_by_name_and_without_texts(trained: Path, scene: NerfstudioScene, tmp_path: Path) -> None:
     half = (torch.arange(160).expand(120, 160) // 80, np.eye(2, dtype=np.float32))
     some = {name: half for name in scene.train.names[::3]}
     run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
@@ -131,42 +134,36 @@ def test_features_by_name_and_without_texts(trained: Path, tmp_path: Path) -> No
     assert run.field.manifest["statistics"]["left_out"] == 8
     assert list(run.seconds) == ["check", "features", "evidence", "consensus", "lift", "store", "write"]
     assert min(run.seconds.values()) > 0
-    with pytest.raises(ValueError, match=r"features of your own, without texts; name a file of texts"):
+    with pytest.raises(ValueError, match="texts"):
         run.ask("left")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda f: f[:3], "3 pairs of labels and vectors were given for 12 training images"),
-        (lambda f: {"nowhere.png": f[0]}, r"no training image 'nowhere\.png' for the features given"),
-        (
-            lambda f: [(f[0][0][:, :80], f[0][1])] * 12,
-            r"labels of images/0000\.png are \(120, 80\), but the image is \(120, 160\)",
-        ),
-        (
-            lambda f: [(f[0][0] + 1, f[0][1])] * 12,
-            r"labels of images/0000\.png must be .* in -1\.\.1, got .* values in 1\.\.2",
-        ),
-        (lambda f: [(f[0][0], 0 * f[0][1])] * 12, r"vectors of images/0000\.png must be \[regions, D\], finite"),
-        (lambda f: [*f[:11], (f[0][0], torch.eye(3))], r"must have the same length, found \[2, 3\]"),
-    ],
-)
-def test_features_that_do_not_fit_are_named(trained: Path, tmp_path: Path, change, message: str) -> None:
-    half = (torch.arange(160).expand(120, 160) // 80, torch.eye(2))
-    with pytest.raises(ValueError, match=message):
-        nl.lift_run(trained, features=change([half] * 12), output_dir=tmp_path)
-    assert not list(tmp_path.rglob("config.yml"))
+def test_features_that_do_not_fit_are_named(scene: NerfstudioScene, tmp_path: Path) -> None:
+    labels, vectors = torch.arange(160).expand(120, 160) // 80, torch.eye(2)
+    half = (labels, vectors)
+    for features, message in (
+        ([half] * 3, "^3 .* 12 "),
+        ({"nowhere.png": half}, r"nowhere\.png"),
+        ([(labels[:, :80], vectors)] * 12, r"images/0000\.png .*\(120, 80\), .*\(120, 160\)"),
+        ([(labels + 1, vectors)] * 12, r"images/0000\.png .* -1\.\.1, .* 1\.\.2"),
+        ([(labels, 0 * vectors)] * 12, r"images/0000\.png must be \[regions, D\], finite"),
+        ([*[half] * 11, (labels, torch.eye(3))], r"\[2, 3\]"),
+        ([], "^0 .* 12"),
+        ({}, "empty"),
+        ([labels.numpy()] * 12, "got ndarray"),
+        ([(labels * 0.5, vectors)] * 12, "integers, got float32"),
+    ):
+        with pytest.raises(nl.InputError, match=message):
+            nl.lift_run(scene, features=features, output_dir=tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
-    with pytest.raises(FileExistsError, match="exists; give another --timestamp"):
+    with pytest.raises(FileExistsError, match="--timestamp"):
         nl.lift_run(trained, source=nl.SourceOptions(encoder="colour"), timestamp="one")
-    with pytest.raises(
-        TypeError, match=r"lift_run takes the config\.yml of a run or a scene of open_scene or open_splat, got int"
-    ):
+    with pytest.raises(TypeError, match=r"config\.yml .* got int"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
-    with pytest.raises(FileNotFoundError, match="is a run without semantics"):
+    with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)
 
 
@@ -175,109 +172,100 @@ def _held_out(content: dict[str, Any]) -> list[dict[str, Any]]:
     return [frame for frame in content["frames"] if frame["file_path"] in content["test_filenames"]][:2]
 
 
-@pytest.mark.parametrize("change", ["focal", "order", "poses", "one pose", "held out"])
-def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_path: Path, change: str) -> None:
-    room = tmp_path / "room"
-    shutil.copytree(lifted.parents[4] / "room", room)
+def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_path: Path) -> None:
+    room = shutil.copytree(lifted.parents[4] / "room", tmp_path / "room")
+    file = room / "transforms.json"
+    whole = file.read_text()
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         nl.open_run(lifted, data=room)  # a copy has the same cameras
-    file = room / "transforms.json"
-    content = json.loads(file.read_text())
-    frames = content["frames"]
-    if change == "focal":
-        content["fl_x"] *= 1.003
-    elif change in ("order", "held out"):
-        first, second = (frames[1], frames[2]) if change == "order" else _held_out(content)
-        first["transform_matrix"], second["transform_matrix"] = second["transform_matrix"], first["transform_matrix"]
-    else:
-        for frame in frames[1 : 2 if change == "one pose" else None]:
-            frame["transform_matrix"][0][3] += 4e-4
-    file.write_text(json.dumps(content))
-    changed = {"held out": "held-out", "order": "training"}.get(change, "training and held-out")
-    with pytest.warns(UserWarning, match=f"the {changed} cameras of .* are not those that the run was lifted with"):
-        nl.open_run(lifted, data=room)
+    for change, changed in (
+        ("focal", "training and held-out"),
+        ("order", "training"),
+        ("poses", "training and held-out"),
+        ("one pose", "training and held-out"),
+        ("held out", "held-out"),
+    ):
+        content = json.loads(whole)
+        frames = content["frames"]
+        if change == "focal":
+            content["fl_x"] *= 1.003
+        elif change in ("order", "held out"):
+            first, second = (frames[1], frames[2]) if change == "order" else _held_out(content)
+            key = "transform_matrix"
+            first[key], second[key] = second[key], first[key]
+        else:
+            for frame in frames[1 : 2 if change == "one pose" else None]:
+                frame["transform_matrix"][0][3] += 4e-4
+        file.write_text(json.dumps(content))
+        with pytest.warns(UserWarning, match=f"the {changed} cameras"):
+            nl.open_run(lifted, data=room)
 
 
-@pytest.mark.parametrize("config", [None, 5, [], {}, float("nan"), b"x"])
-def test_arguments_of_other_types_are_named(trained: Path, tmp_path: Path, config: Any) -> None:
-    for opened in (nl.open_run, nl.open_scene):
-        with pytest.raises(nl.InputError, match="load_config must be a path"):
-            opened(config)
+def test_arguments_of_other_types_are_named(trained: Path, tmp_path: Path) -> None:
+    for config in (None, 5, [], {}, float("nan"), b"x"):
+        for opened in (nl.open_run, nl.open_scene):
+            with pytest.raises(nl.InputError, match="load_config must be a path"):
+                opened(config)
     for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir", "export", "features"):
         with pytest.raises(nl.InputError, match=name):
             nl.lift_run(trained, **{"output_dir": tmp_path, name: 5})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_names_of_runs_are_names_of_folders(trained: Path, tmp_path: Path) -> None:
+def test_names_of_runs_are_names_of_folders(scene: NerfstudioScene, tmp_path: Path) -> None:
     half = [(torch.zeros(120, 160, dtype=torch.int64), torch.ones(1, 2))] * 12
-    for stamp in (".", "..", "a/b", "/x", "", "../splatfacto/run", ".cache", "x\ny", "\x1b[31m"):
-        with pytest.raises(ValueError, match="is not the name of a folder"):
-            nl.lift_run(trained, features=half, output_dir=tmp_path, timestamp=stamp, overwrite=True)
-    with pytest.raises(ValueError, match="has 300 characters; give at most 200"):
-        nl.lift_run(trained, features=half, output_dir=tmp_path, timestamp="a" * 300)
+    for stamp in (".", "..", "a/b", "/x", "", "../splatfacto/run", ".cache", "x\ny", "\x1b[31m", "a" * 300):
+        with pytest.raises(nl.InputError, match="300 .* 200" if len(stamp) == 300 else "name of a folder"):
+            nl.lift_run(scene, features=half, output_dir=tmp_path, timestamp=stamp, overwrite=True)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("texts", "queries", "message"),
-    [
-        ({"a": np.zeros(2)}, (), r"the vector of text 'a' must be \[D\], finite and not zero"),
-        ({"a": [1.0, float("nan")]}, (), "the vector of text 'a' must be"),
-        ({"a": np.ones((1, 2))}, (), "the vector of text 'a' must be"),
+def test_texts_that_cannot_be_asked_are_refused_before_the_lift(scene: NerfstudioScene, tmp_path: Path) -> None:
+    half = [(np.zeros((120, 160), np.uint16), [[1.0, 2.0]])] * 12
+    for texts, queries, message in (
+        ({"a": np.zeros(2)}, (), r"text 'a' must be \[D\], finite and not zero"),
+        ({"a": [1.0, float("nan")]}, (), "text 'a' must be"),
+        ({"a": np.ones((1, 2))}, (), "text 'a' must be"),
         ({" ": [1, 2]}, (), "cannot be a text"),
         ({"fox.npy": [1, 2]}, (), "cannot be a text"),
-        ({5: [1, 2]}, (), "texts must be a dictionary"),
-        ({"a": ["x", "y"]}, (), "vectors must be numbers"),
-        ({"a": [1j, 2]}, (), "vectors must be of real numbers"),
-        ({"a": [1, 2, 3]}, (), r"must have the same length, found \[2, 3\]"),
-        ({"a": [1, 2]}, ["b"], "text 'b' has no vector in the texts given, which holds 1; near names: a"),
-        (None, ["b"], "which holds none"),
-        ({"a": [1, 2]}, "a", "queries must be a list of texts"),
-    ],
-)
-def test_texts_that_cannot_be_asked_are_refused_before_the_lift(trained: Path, tmp_path: Path, texts, queries, message):
-    half = [(np.zeros((120, 160), np.uint16), [[1.0, 2.0]])] * 12
-    with pytest.raises(ValueError, match=message):
-        nl.lift_run(trained, features=half, texts=texts, queries=queries, output_dir=tmp_path)
+        ({5: [1, 2]}, (), "dictionary"),
+        ({"a": ["x", "y"]}, (), "numbers"),
+        ({"a": [1j, 2]}, (), "real numbers"),
+        ({"a": [1, 2, 3]}, (), r"\[2, 3\]"),
+        ({"a": [1, 2]}, ["b"], "'b' .* 1; near names: a"),
+        (None, ["b"], "none"),
+        ({"a": [1, 2]}, "a", "queries must be a list"),
+    ):
+        with pytest.raises(nl.InputError, match=message):
+            nl.lift_run(scene, features=half, texts=texts, queries=queries, output_dir=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_arguments_that_would_be_ignored_are_refused(trained: Path, run: nl.LiftedRun) -> None:
+def test_arguments_that_would_be_ignored_are_refused(scene: NerfstudioScene) -> None:
     colour, half = nl.SourceOptions(encoder="colour"), [(np.zeros((120, 160), int), np.ones((1, 2)))] * 12
     for arguments, message in (
-        ({"source": colour, "texts": {"a": [1, 2]}}, "texts are for features of your own"),
-        ({"source": colour, "features": half}, "take the place of source"),
-        ({"features": []}, "0 pairs of labels and vectors were given for 12"),
-        ({"features": {}}, "features are empty"),
-        ({"features": [half[0][0]] * 12}, "must be a pair of labels and vectors, got ndarray"),
-        ({"features": [(half[0][0] * 0.5, half[0][1])] * 12}, "must be integers, got float64"),
+        ({"texts": {"a": [1, 2]}}, "texts"),
+        ({"features": half}, "source"),
+        ({"load_step": 3}, "open_scene"),
     ):
-        with pytest.raises(ValueError, match=message):
-            nl.lift_run(trained, **arguments)
-    with pytest.raises(ValueError, match="give them to open_scene"):
-        nl.lift_run(run.scene, source=colour, load_step=3)
-    for wrong in (
-        {"precision": "x"},
-        {"image_source": "x"},
-        {"weight_power": 0},
-        {"storage": "zip"},
-        {"unlabeled": "x"},
-    ):
-        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be one of"):
-            nl.LiftOptions(**wrong)
+        with pytest.raises(nl.InputError, match=message):
+            nl.lift_run(scene, source=colour, **arguments)
+    wrong = {"precision": "x", "image_source": "x", "weight_power": 0, "storage": "zip", "unlabeled": "x"}
+    for name, value in wrong.items():
+        with pytest.raises(nl.InputError, match=f"{name} must be one of"):
+            nl.LiftOptions(**{name: value})
 
 
 def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     answer = run.ask("red")
     assert "red" in answer and "blue" not in answer
     assert answer != run.ask("red") and len(repr(answer)) < 200 and len(repr(run)) < 300
-    with pytest.raises(ValueError, match="ask takes texts one after the other"):
+    with pytest.raises(ValueError, match="ask takes texts"):
         run.ask(["red", "blue"])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"negatives must be a list of texts.*write \['blue'\]"):
+    with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
         run.ask("red", negatives="blue")
-    with pytest.raises(ValueError, match="rule must be auto, cosine, lerf, margin; got 'LERF'"):
+    with pytest.raises(ValueError, match="auto, cosine, lerf, margin; got 'LERF'"):
         run.ask("red", rule="LERF")  # type: ignore[arg-type]
     for wrong in (
         *({"min_reliability": value} for value in (5.0, float("nan"), None, "x")),
@@ -290,7 +278,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     with pytest.raises(nl.InputError, match="NUL"):
         run.ask("red\0")
     for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
-        with pytest.raises(ValueError, match="part must be an answer of this run"):
+        with pytest.raises(ValueError, match="part must be"):
             run.export(tmp_path / "new" / "a.ply", part)
     for path, more in (
         ("", {}),
@@ -304,13 +292,13 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     ):
         with pytest.raises(nl.InputError):
             run.export(path, **more)  # type: ignore[arg-type]
-    with pytest.raises(nl.InputError, match="save takes an answer of this run or its question, got str"):
+    with pytest.raises(nl.InputError, match="got str"):
         run.save("red")  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
     assert len(run.export(tmp_path / "a.ply", answer["red"].mask.numpy())) > 0
-    with pytest.raises(TypeError, match="render draws an answer, or what it says of one text; got str"):
+    with pytest.raises(TypeError, match="got str"):
         run.render(0, "red")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"the question has vectors of 3 numbers, the features of .* have 343"):
+    with pytest.raises(ValueError, match=r" 3 .* 343"):
         run.save(Question(("a",), torch.ones(1, 3)))
     stored = run.ask_stored()
     assert stored is not None

@@ -1,51 +1,29 @@
-"""A lift with more views encodes and rasterizes the new ones only, and finds what a lift of all at once finds."""
+"""A lift with more views encodes and rasterizes the new ones only. Stored evidence is used again only if it is whole
+and that of the same views, rules and backend."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from normlift_ns import Camera, LiftOptions, View, observing
+from normlift_ns import Evidence, LiftOptions, RasterSettings, observing
 from normlift_ns.core.field import SemanticField
 from normlift_ns.encoders import RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Superpixels
 from normlift_ns.lifting import lift_scene
-from tests.scenes import generator, orbit_camera, random_scene
+from normlift_ns.observing import Block, block_evidence
+from normlift_ns.options import BackendName
+from tests.scenes import Photographs, made_scene, orbit_camera, random_scene
 
 ALL = tuple(range(11))
 OLD = (0, 2, 3, 5, 6, 7, 9, 10)
 """New views stand before, between and behind old ones, so that no block of the second lift is one of the first."""
-
-
-@dataclass
-class Orbit:
-    """Photographs of noise around a scene."""
-
-    numbers: Sequence[int]
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{number:02}.png" for number in self.numbers]
-
-    @property
-    def cameras(self) -> list[Camera]:
-        return [orbit_camera(0.3 * number) for number in self.numbers]
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def __getitem__(self, index: int) -> View:
-        camera, number = self.cameras[index], self.numbers[index]
-        shape = (camera.height, camera.width, 3)
-        image = torch.randint(0, 256, shape, generator=generator(number), dtype=torch.uint8)
-        return View(camera, image, None, self.names[index])
 
 
 @pytest.fixture
@@ -78,10 +56,9 @@ def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 def lifted(numbers: Sequence[int], cache: Path, mode: str = "classic") -> SemanticField:
-    scene: Any = SimpleNamespace(
-        gaussians=random_scene(60, dtype=torch.float32), train=Orbit(numbers), held_out=Orbit(()), rasterize_mode=mode,
-        identity={}, name="made",
-    )  # fmt: skip
+    cameras = [orbit_camera(0.3 * number) for number in numbers]
+    views = Photographs([f"{number:02}.png" for number in numbers], cameras, seeds=numbers)
+    scene = made_scene(random_scene(60, dtype=torch.float32), views, rasterize_mode=mode)
     options = LiftOptions(refine=False, storage="evidence", consensus=False)
     source = RegionFeatures(Superpixels(9), ColourEncoder())
     return lift_scene(scene, source, options, cache, encoder={}).field
@@ -124,3 +101,52 @@ def test_a_photograph_given_twice_counts_twice(worked: dict[str, int], tmp_path:
     assert worked["rasterized"] == 4
     expected = lifted((2, 1, 3, 1), tmp_path / "fresh").store.evidence
     assert torch.equal(found.rows.column, expected.rows.column) and torch.equal(found.rows.weight, expected.rows.weight)
+
+
+def evidence_of(shift: int, folder: Path, rules: str = "1.4", backend: BackendName = "numba") -> torch.Tensor:
+    """Of one view of two regions, whose border is somewhere else for every shift."""
+    camera, done = orbit_camera(0.0), []
+    labels = (torch.arange(camera.width) >= 18 + shift).int().expand(camera.height, camera.width)
+    block = Block([camera], [labels], [torch.arange(2).int()[None]], [torch.eye(2)])
+    found = block_evidence(
+        random_scene(30, dtype=torch.float32), block, folder, rasterize_mode="classic",
+        settings=RasterSettings.of_gsplat(rules), backend=backend, weight_power=1, dtype=torch.float32, reuse=True,
+        done=lambda: done.append(1),
+    )  # fmt: skip
+    assert done == [1]
+    return torch.cat([found.rows.offsets.double(), found.rows.column.double(), found.rows.weight.double()])
+
+
+def test_swapped_files_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
+    expected = [evidence_of(shift, tmp_path) for shift in (0, 4)]
+    assert not torch.equal(*expected)
+    assert [torch.equal(evidence_of(shift, tmp_path), x) for shift, x in zip((0, 4), expected)] == [True, True]
+    assert worked["rasterized"] == 2
+    first, second = tmp_path.iterdir()
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    assert [torch.equal(evidence_of(shift, tmp_path), x) for shift, x in zip((0, 4), expected)] == [True, True]
+    assert worked["rasterized"] == 4
+
+
+def test_other_rules_and_backends_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
+    for rules, backend in (("1.4", "numba"), ("1.6", "numba"), ("1.4", "torch")) * 2:
+        evidence_of(0, tmp_path, rules, backend)
+    assert worked["rasterized"] == 3
+
+
+def test_damaged_files_are_rasterized_again(worked: dict[str, int], tmp_path: Path) -> None:
+    expected = evidence_of(0, tmp_path)
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    for turn, bit in enumerate(random.Random(0).sample(range(8 * len(whole)), 10), 2):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        assert torch.equal(evidence_of(0, tmp_path), expected)
+        assert worked["rasterized"] == turn
+    path.write_bytes(whole)
+    Evidence.load(path, key=path.stem).save(path)  # as in version 0.1: no digest tells that it is whole
+    assert torch.equal(evidence_of(0, tmp_path), expected)
+    assert worked["rasterized"] == turn + 1

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from normlift_ns import Camera, LiftOptions, RasterSettings, SourceOptions, View, rasterize_evidence
+from normlift_ns import Camera, InputError, LiftOptions, RasterSettings, SourceOptions, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks, with_consensus
 from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
@@ -23,39 +23,19 @@ from normlift_ns.evaluation.votes import voting_scalars
 from normlift_ns.lifting import lift_scene
 from normlift_ns.observing import of_regions
 from normlift_ns.raster.backend import Job
-from tests.raster.test_gpu import compiled_gsplat
-from tests.scenes import dense, generator, orbit, random_scene
+from tests.scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
 OPTIONS = SourceOptions(encoder="colour", regions="grid", region_count=12)
-
-
-@dataclass
-class Photographs:
-    cameras: list[Camera]
-
-    @property
-    def names(self) -> list[str]:
-        return [f"{i}.png" for i in range(len(self.cameras))]
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __getitem__(self, index: int) -> View:
-        image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator(index), dtype=torch.uint8)
-        mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-        mask[: 3 * index] = False
-        return View(self.cameras[index], image, mask, self.names[index])
 
 
 @pytest.fixture(scope="module")
 def lifted(tmp_path_factory) -> EvaluatedRun:
     """A lifted run of a scene made by hand, whose photographs are masked in part."""
     folder = tmp_path_factory.mktemp("cache")
-    scene: Any = SimpleNamespace(
-        gaussians=random_scene(N, dtype=torch.float32, size=0.3), train=Photographs(orbit(VIEWS)),
-        held_out=Photographs([]), rasterize_mode="classic", identity={}, name="made",
-    )  # fmt: skip
+    masks = [torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH) >= 3 * i for i in range(VIEWS)]
+    photographs = Photographs([f"{i}.png" for i in range(VIEWS)], orbit(VIEWS), masks=masks)
+    scene = made_scene(random_scene(N, dtype=torch.float32, size=0.3), photographs)
     options = LiftOptions(refine=False, max_views=4, consensus=False, consensus_least=0.0)  # cells count as things
     found = lift_scene(scene, make_source(OPTIONS), options, folder, encoder={}).field
     manifest = json.loads(json.dumps({**found.manifest, "source": source_settings(OPTIONS)}))  # as on disk
@@ -105,7 +85,7 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     u = torch.zeros(N, seen[0][2].shape[1], dtype=torch.float64)
     some = [(features != 0).any(1) for *_, features in seen]
     labelled = [(weights[:, i], features[i]) for (_, weights, features), i in zip(seen, some)]
-    for j in range(N):
+    for j in range(0, N, 4):  # the rest would take a second
         views = [(weights[j], features) for weights, features in labelled]
         most = max(float(weight.sum()) for weight, _ in views)
         used = [(weight, features) for weight, features in views if weight.sum() >= VISIBLE * most and most > 0]
@@ -119,22 +99,22 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     return u
 
 
-@pytest.mark.parametrize("method", [sfs, occam, vala, drsplat])
-def test_ideas_are_their_sums_over_pixels(lifted, method: Callable[..., Tensor]):
-    field = baseline_field(method.__name__, lifted, "cpu")
-    expected = method(observations(lifted), lifted.scene.gaussians.means)
-    valid = field.valid(refined=False)
-    assert torch.equal(valid, (expected != 0).any(1))
-    assert valid.float().mean() > 0.5
-    cosine = (field.directions(refined=False).double() * expected).sum(1)[valid]
-    # One pixel's arithmetic may fall to the other side of a border between regions.
-    assert (cosine > 1 - 1e-5).float().mean() > 0.95
-    plain = lifted.field.directions(refined=False).double()
-    assert ((plain * expected).sum(1)[valid] < 1 - 1e-4).float().mean() > 0.1  # another method
-
-
-def test_every_idea_says_whose_implementation_it_is():
-    assert all(text.startswith("our ") for text in BASELINES.values())
+def test_ideas_are_their_sums_over_pixels(lifted):
+    seen, methods = observations(lifted), (sfs, occam, vala, drsplat)
+    assert {method.__name__ for method in methods} == set(BASELINES)
+    for method in methods:
+        field = baseline_field(method.__name__, lifted, "cpu")
+        expected = method(seen, lifted.scene.gaussians.means)
+        valid = field.valid(refined=False)
+        if method is vala:
+            valid &= torch.arange(N) % 4 == 0
+        assert torch.equal(valid, (expected != 0).any(1))
+        assert valid.sum() > 50
+        cosine = (field.directions(refined=False).double() * expected).sum(1)[valid]
+        # One pixel's arithmetic may fall to the other side of a border between regions.
+        assert (cosine > 1 - 1e-5).float().mean() > 0.95, method
+        plain = lifted.field.directions(refined=False).double()
+        assert ((plain * expected).sum(1)[valid] < 1 - 1e-4).float().mean() > 0.1, method  # another method
 
 
 def test_the_views_are_those_of_the_lift(lifted):
@@ -145,20 +125,20 @@ def test_the_views_are_those_of_the_lift(lifted):
     assert [every.index(id(camera)) for camera in few] == [0, 4]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"source": None}, "does not say how its regions and features were made"),
-        ({"source": {"wings": 2}}, "options for its features that this version does not know"),
-        ({"source": [1]}, "options for its features that this version does not know"),
+def changed(lifted: EvaluatedRun, **facts: Any) -> EvaluatedRun:
+    return replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, **facts}))
+
+
+def test_features_that_cannot_be_made_again_are_refused(lifted):
+    for change, message in (
+        ({"source": None}, "does not say"),
+        ({"source": {"wings": 2}}, "does not know"),
+        ({"source": [1]}, "does not know"),
         ({"source": {"encoder": 3}}, "encoder"),
-        ({"features": {"kind": "other"}}, "was lifted from other features than its options give now"),
-    ],
-)
-def test_features_that_cannot_be_made_again_are_refused(lifted, change, message):
-    other = replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, **change}))
-    with pytest.raises(ValueError, match=message):
-        baseline_field("sfs", other, "cpu")
+        ({"features": {"kind": "other"}}, "other features"),
+    ):
+        with pytest.raises(InputError, match=message):
+            baseline_field("sfs", changed(lifted, **change), "cpu")
 
 
 @pytest.mark.parametrize("power", [0.0, 2.0])
@@ -206,10 +186,9 @@ def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
     for ours, theirs in zip(again, rows):
         assert ours["cosine"] == pytest.approx(theirs["cosine"], abs=0.02)
         assert ours["norm"] == pytest.approx(theirs["norm"], abs=1e-5)
-    manifest = {**lifted.field.manifest, "source": None}
-    own = replace(lifted, field=replace(lifted.field, manifest=manifest))
+    own = changed(lifted, source=None)
     assert [row["variant"] for row in study_ablation([own], evaluate, "cpu", told.append)] == names
-    assert len(told) == 1 and told[0].startswith("The ablation leaves out all variants with consensus: ")
+    assert len(told) == 1 and "consensus" in told[0]
 
 
 def test_lengths_of_pixels_are_those_of_composited_features(lifted):
@@ -223,43 +202,36 @@ def test_lengths_of_pixels_are_those_of_composited_features(lifted):
     assert torch.allclose(scaled.flatten(), torch.linalg.vector_norm(features, dim=1), atol=1e-3)
 
 
-def test_sfs_way_is_not_timed_on_a_cpu(lifted):
-    assert why_not_timed(lifted, "cpu") == "it needs a GPU, for which gsplat is compiled; this is --device cpu"
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
-def test_channels_through_gsplat_are_the_sums_of_evidence(lifted):
+@needs_gpu
+def test_channels_through_gsplat_are_the_sums_of_evidence_and_are_timed(lifted):
+    from tests.raster.test_gpu import compiled_gsplat  # noqa: PLC0415
+
     if not compiled_gsplat():
         pytest.skip("gsplat's compiled part is missing")
-    blocks = list(seen_blocks(lifted, "cuda"))
     scene = lifted.scene.gaussians.to("cuda")
     job = Job(scene, False, RasterSettings(), torch.float32)
-    for block in blocks:
-        dimension = block.features[0].shape[1]
-        found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), dimension)
+    for block in seen_blocks(lifted, "cuda"):
+        found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), block.features[0].shape[1])
         counts = [regions.shape[1] for regions in block.regions]
         cells = rasterize_evidence(scene, block.cameras, block.labels, num_regions=counts)
         expected = of_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
         assert torch.allclose(found, expected.float(), rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
-def test_sfs_way_is_timed_beside_ours(lifted):
-    if not compiled_gsplat():
-        pytest.skip("gsplat's compiled part is missing")
     (row,) = timing([lifted], "cuda")
     assert row["timed_views"] == 4
     assert row["dense512_over_evidence_lift"] == pytest.approx(row["dense512_s"] / row["evidence_lift_s"])
     assert row["dense512_all_views_s"] == row["dense512_s"] > 0  # all four
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("name", BASELINES)
-def test_ideas_are_the_same_on_a_gpu(lifted, name):
-    here, there = (baseline_field(name, lifted, device) for device in ("cpu", "cuda"))
-    cosine = (here.directions(refined=False) * there.directions(refined=False)).sum(1)
-    assert (cosine[here.valid(refined=False)] > 1 - 1e-3).float().mean() > 0.98
-    assert (here.valid(refined=False) == there.valid(refined=False)).float().mean() > 0.99
+@needs_gpu
+def test_ideas_are_the_same_on_a_gpu(lifted):
+    for name in BASELINES:
+        here, there = (baseline_field(name, lifted, device) for device in ("cpu", "cuda"))
+        cosine = (here.directions(refined=False) * there.directions(refined=False)).sum(1)
+        assert (cosine[here.valid(refined=False)] > 1 - 1e-3).float().mean() > 0.98
+        assert (here.valid(refined=False) == there.valid(refined=False)).float().mean() > 0.99
 
 
 def test_what_is_left_out_is_said(lifted):
@@ -267,12 +239,9 @@ def test_what_is_left_out_is_said(lifted):
     (row,) = timing([lifted], "cpu", told.append)
     assert "dense512_s" not in row
     assert row["total_s"] == pytest.approx(sum(value for key, value in row.items() if key.endswith("_s")) / 2)
-    assert told == [
-        "The timing of made leaves out SFS's way (512 channels through gsplat): it needs a GPU, for which gsplat is "
-        "compiled; this is --device cpu"
-    ]
+    assert len(told) == 1 and why_not_timed(lifted, "cpu") in told[0] and "--device cpu" in told[0]
     cost = {key: value for key, value in lifted.field.manifest["cost"].items() if key != "store_s"}
-    older = replace(lifted, field=replace(lifted.field, manifest={**lifted.field.manifest, "cost": cost}))
+    older = changed(lifted, cost=cost)
     table = timing([lifted, older], "cpu")
     assert [row["scene"] for row in table] == ["made", "made", "mean"]
     assert table[2]["store_s"] == lifted.field.manifest["cost"]["store_s"]  # the other does not say

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 from typing import Any
@@ -20,17 +21,7 @@ from normlift_ns.evaluation.coverage.gain import FAINT, Known, choose_views, gai
 from normlift_ns.evaluation.coverage.photographs import lifted_names
 from normlift_ns.evaluation.coverage.study import Coverage, coverage_of
 from normlift_ns.raster.settings import RasterSettings
-
-
-@dataclass
-class Photographs:
-    """Cameras with names, and no images."""
-
-    names: list[str]
-    cameras: list[Camera]
-
-    def __len__(self) -> int:
-        return len(self.names)
+from tests.scenes import Photographs
 
 
 @dataclass
@@ -49,7 +40,7 @@ class Wall:
         return torch.full((len(self.gaussians), 3), 0.5)
 
 
-def looking(eye: tuple[float, float, float], target=(0.0, 0.0, 0.0), width=96, height=72) -> Camera:
+def looking(eye: tuple[float, float, float], target=(0.0, 0.0, 0.0), width=64, height=48) -> Camera:
     """A camera at a place, z up."""
     eye_, target_ = torch.tensor(eye).double(), torch.tensor(target).double()
     forward = torch.nn.functional.normalize(target_ - eye_, dim=0)
@@ -170,41 +161,33 @@ def looped(known: Known, columns: Tensor, view: int, chosen: list[int]) -> float
     return total / float(known.surface.sum())
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_gains_are_those_of_a_loop(seed):
-    known, views, columns = random_case(seed)
-    expected = [looped(known, columns, v, []) for v in range(5)]
-    assert gains(known, views, 5).tolist() == pytest.approx(expected, rel=1e-12)
-    chosen = choose_views(known, views, 5, 3)
-    before: list[int] = []
-    for view, found in chosen:
-        rest = {v: looped(known, columns, v, before) for v in range(5) if v not in before}
-        assert found == pytest.approx(max(rest.values()), rel=1e-12)
-        assert view == max(rest, key=rest.__getitem__)
-        before.append(view)
-
-
-def test_greedy_comes_close_to_the_best_of_all_choices():
-    """At least 1 - 1 / e of the best pair, as greedy choices under diminishing returns do."""
-    for seed in range(20):
+def test_gains_are_those_of_a_loop():
+    """Greedy choices under diminishing returns reach at least 1 - 1 / e of the best pair."""
+    for seed in range(5):
         known, views, columns = random_case(seed)
+        expected = [looped(known, columns, v, []) for v in range(5)]
+        assert gains(known, views, 5).tolist() == pytest.approx(expected, rel=1e-12)
+        chosen = choose_views(known, views, 5, 3)
+        before: list[int] = []
+        for view, found in chosen:
+            rest = {v: looped(known, columns, v, before) for v in range(5) if v not in before}
+            assert found == pytest.approx(max(rest.values()), rel=1e-12)
+            assert view == max(rest, key=rest.__getitem__)
+            before.append(view)
         best = max(looped(known, columns, a, []) + looped(known, columns, b, [a]) for a, b in permutations(range(5), 2))
-        assert sum(x for _, x in choose_views(known, views, 5, 2)) >= 0.63 * best
+        assert sum(x for _, x in chosen[:2]) >= 0.63 * best
 
 
-def test_similar_views_gain_little_after_each_other():
-    known = Known(*(torch.tensor(x, dtype=torch.float64) for x in ([1.0, 1], [0.0, 0], [0.0, 0], [1.0, 1])), beta=1.0)
-    row, column = torch.tensor([0, 0, 1]), torch.tensor([0, 1, 2])
-    views = SparseRows.from_coo(row, column, torch.tensor([1.0, 1.0, 0.9], dtype=torch.float64), 2)
+def test_similar_views_gain_little_after_each_other_and_faint_ones_nothing():
+    def case(norms: int, columns: list[list[float]]) -> tuple[Known, SparseRows]:
+        ones, zeros = torch.ones(norms, dtype=torch.float64), torch.zeros(norms, dtype=torch.float64)
+        row, column, weight = (torch.tensor(part) for part in zip(*columns))
+        sparse = SparseRows.from_coo(row.long(), column.long(), weight.double(), norms)
+        return Known(ones, zeros, zeros, ones, beta=1.0), sparse
+
+    known, views = case(2, [[0, 0, 1.0], [0, 1, 1.0], [1, 2, 0.9]])
     assert [view for view, _ in choose_views(known, views, 3, 3)] == [0, 2, 1]
-
-
-def test_a_view_that_hardly_sees_something_is_no_whole_view():
-    known = Known(*(torch.tensor([x], dtype=torch.float64) for x in (1.0, 0.0, 0.0, 1.0)), beta=1.0)
-    views = SparseRows.from_coo(
-        torch.tensor([0, 0]), torch.tensor([0, 1]), torch.tensor([1.0, 0.001], dtype=torch.float64), 1
-    )
-    clear, faint = gains(known, views, 2).tolist()
+    clear, faint = gains(*case(1, [[0, 0, 1.0], [0, 1, 0.001]]), 2).tolist()
     assert clear == pytest.approx(0.5, abs=0.01)
     assert faint < 1e-3
 
@@ -220,14 +203,9 @@ def test_weights_are_shares_of_the_picture():
 
 
 def test_everything_reliable_is_said():
-    scene = wall()
-    scene = replace(scene, held_out=Photographs([], []))
+    scene = replace(wall(), held_out=Photographs([], []))
     found = coverage_of(scene, lifted(scene, list(range(8))))
-    assert found.regions == []
-    assert found.photographs == []
-    assert found.left_out == {}
-    assert found.remarks[0].startswith("No region lacks evidence")
-    assert "No photograph was left out" in found.remarks[1]
+    assert (found.regions, found.photographs, found.left_out, len(found.remarks)) == ([], [], {}, 2)
 
 
 def test_one_camera():
@@ -237,23 +215,19 @@ def test_one_camera():
     n_eff = 1 / (1 + FAINT**2)
     assert found.regions[0].reliability == pytest.approx(n_eff / (n_eff + 1))
     assert found.regions[0].lifted_reliability == pytest.approx(0.5)  # one view that agrees with itself
-    assert any("a single camera" in remark for remark in found.remarks)
+    assert any("single camera" in remark for remark in found.remarks)
 
 
-def test_old_manifests():
+def test_records_of_what_was_lifted():
     scene = wall()
     old = {"statistics": {"views": 3, "left_out": 0}, "options": {"max_views": 3}}
     assert lifted_names(scene, old) == ({"0.png", "4.png", "7.png"}, set())
     for facts in ({}, {"statistics": {"views": 6, "left_out": 2}}, {"statistics": {"views": 4, "left_out": 0}}):
-        with pytest.raises(InputError, match="does not tell which photographs were lifted"):
+        with pytest.raises(InputError, match="does not tell"):
             lifted_names(scene, facts)
     with pytest.raises(InputError, match="no longer has"):
         lifted_names(scene, {"views_lifted": ["gone.png"]})
-
-
-@pytest.mark.parametrize(
-    "facts",
-    [
+    for facts in (
         {"views_lifted": "0.png"},
         {"views_lifted": [3]},
         {"views_lifted": [["0.png"]]},
@@ -262,26 +236,20 @@ def test_old_manifests():
         {"statistics": {"views": 8.5, "left_out": 0}},
         {"statistics": {"views": 8, "left_out": 0}, "options": {"max_views": 0}},
         {"statistics": {"views": 8, "left_out": 0}, "options": []},
-    ],
-)
-def test_damaged_records(facts):
-    with pytest.raises(InputError, match="damaged"):
-        lifted_names(wall(), facts)
+    ):
+        with pytest.raises(InputError, match="damaged"):
+            lifted_names(scene, facts)
 
 
-def test_cameras_that_see_nothing():
+def test_cameras_that_see_nothing_and_wrong_bounds_are_refused(unchecked):
     scene, field_ = wall(), lifted(wall(), [0, 1])
+    for wrong in (-0.1, 1.1, float("nan"), True):
+        with pytest.raises(InputError, match="min_reliability"):
+            coverage_of(scene, field_, min_reliability=wrong)
     away = [looking((-3.0, 0.0, 0.0), (-9.0, 0.0, 0.0)) for _ in range(8)]
     blind = replace(scene, train=Photographs(scene.train.names, away), held_out=Photographs([], []))
     with pytest.raises(InputError, match="no photograph shows a Gaussian"):
         coverage_of(blind, field_)
-
-
-@pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), True])
-def test_bounds(wrong, unchecked):
-    scene = wall()
-    with pytest.raises(InputError, match="min_reliability"):
-        coverage_of(scene, lifted(scene, [0]), min_reliability=wrong)
 
 
 def test_many_photographs_are_sampled(monkeypatch):
@@ -289,7 +257,7 @@ def test_many_photographs_are_sampled(monkeypatch):
     scene = wall()
     found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert [photograph.name for photograph in found.photographs] in (["4.png", "h.png"], ["h.png", "4.png"])
-    assert "Of 5 photographs left out, 2, evenly spread, were looked at." in found.remarks
+    assert any("5" in remark and "2" in remark for remark in found.remarks)
 
 
 def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
@@ -334,21 +302,35 @@ def test_free_places():
     assert dict(zip(places, found.tolist())) == {name: free for name, (_, free) in places.items()}
 
 
-def test_camera_path_is_what_nerfstudio_reads(one_side, tmp_path):
-    paths = pytest.importorskip("nerfstudio.cameras.camera_paths")
-    found = one_side
-    written = found.save(tmp_path / "next.json")
-    assert [path.name for path in written][:2] == ["next.json", "next_camera_path.json"]
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in written}
-    read = paths.get_path_from_json(json.loads(written[1].read_text()))
-    cameras = [pose.camera for pose in found.poses]
-    assert len(read) == len(cameras) == len(written) - 2
-    for i, camera in enumerate(cameras):
+@pytest.mark.slow
+def test_camera_path_is_what_nerfstudio_reads(nerfstudio, one_side, tmp_path):
+    from nerfstudio.cameras import camera_paths  # noqa: PLC0415
+
+    written = one_side.save(tmp_path / "next.json")
+    read = camera_paths.get_path_from_json(json.loads(written[1].read_text()))
+    for i, camera in enumerate(pose.camera for pose in one_side.poses):
         flipped = camera.world_to_camera.inverse() * torch.tensor([1.0, -1, -1, 1])
         torch.testing.assert_close(read.camera_to_worlds[i], flipped[:3], rtol=0, atol=1e-5)
-        K = read.get_intrinsics_matrices()[i]
-        torch.testing.assert_close(K, camera.K, rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(read.get_intrinsics_matrices()[i], camera.K, rtol=1e-5, atol=1e-4)
         assert (int(read.width[i]), int(read.height[i])) == (camera.width, camera.height)
+
+
+def test_poses_and_pictures_are_written(one_side, tmp_path):
+    found = replace(one_side, poses=one_side.poses[:2], pictures=one_side.pictures[:2])
+    written = found.save(tmp_path / "next.json")
+    cameras = [pose.camera for pose in found.poses]
+    assert [path.name for path in written][:2] == ["next.json", "next_camera_path.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in written}
+    assert len(written) == len(cameras) + 2
+    path = json.loads(written[1].read_text())
+    assert (path["camera_type"], path["fps"], path["seconds"]) == ("perspective", 1, len(cameras))
+    for entry, camera in zip(path["camera_path"], cameras, strict=True):
+        flipped = camera.world_to_camera.inverse() * torch.tensor([1.0, -1, -1, 1])
+        assert entry["camera_to_world"] == pytest.approx(flipped.flatten().tolist(), abs=1e-5)
+        half = math.tan(math.radians(entry["fov"]) / 2)
+        assert path["render_height"] / 2 / half == pytest.approx(float(camera.K[1, 1]), rel=1e-5)
+        assert (path["render_width"], path["render_height"]) == (camera.width, camera.height)
+        assert entry["aspect"] == pytest.approx(camera.width / camera.height)
     document = json.loads(written[0].read_text())
     assert document["regions"][0]["size"] == found.regions[0].size
     assert "pictures" not in document
@@ -368,11 +350,11 @@ def test_a_camera_that_looks_straight_down():
     assert there.tolist() == pytest.approx([0, 0, 2, 1], abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["", ".", ".."])
-def test_a_name_is_needed(one_side, name, tmp_path, monkeypatch):
+def test_a_name_is_needed(one_side, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="no name of a file"):
-        one_side.save(name)
+    for name in ("", ".", ".."):
+        with pytest.raises(InputError, match="name"):
+            one_side.save(name)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -23,22 +23,15 @@ def test_names_join_equal_classes(tmp_path):
     assert names.class_of == {1: 0, 2: 1, 7: 0}
     path.write_text('{"3": "cup"}')
     assert read_names(path).class_of == {3: 0}
-    for content in ("[1]", '{"labels": {}}', '{"labels": {"a": "b"}}', "{"):
-        path.write_text(content)
-        with pytest.raises(ValueError, match="names no masks"):
-            read_names(path)
-    with pytest.raises(FileNotFoundError, match="do not exist"):
+    with pytest.raises(FileNotFoundError, match="none"):
         read_names(tmp_path / "none.json")
 
 
 def test_masks_become_classes(tmp_path):
-    (tmp_path / "m").mkdir()
-    (tmp_path / "labels.json").write_text('{"labels": {"1": "a", "2": "b", "7": "a"}}')
-    Image.fromarray(np.array([[0, 1], [2, 7], [9, 1]], dtype=np.uint8)).save(tmp_path / "m" / "0001.png")
-    masks, names = LabelFiles(tmp_path / "m"), read_names(tmp_path / "labels.json")
+    (tmp_path / "labels.json").write_text('{"1": "a", "2": "b", "7": "a"}')
+    Image.fromarray(np.array([[0, 1], [2, 7], [9, 1]], dtype=np.uint8)).save(tmp_path / "0001.png")
+    masks, names = LabelFiles(tmp_path), read_names(tmp_path / "labels.json")
     assert read_classes(masks, "images/0001.jpg", names, 3, 2).tolist() == [[-1, 0], [1, 0], [-1, 0]]
-    with pytest.raises(ValueError, match=r"0001\.png has shape \(3, 2\), its image .* is 4 x 2"):
-        read_classes(masks, "images/0001.jpg", names, 4, 2)
     with pytest.raises(FileNotFoundError, match="0002"):
         read_classes(masks, "images/0002.jpg", names, 3, 2)
 

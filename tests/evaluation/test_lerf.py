@@ -6,14 +6,8 @@ import math
 import pytest
 import torch
 
-from normlift_ns.evaluation.lerf import (
-    FrameScores,
-    box_filtered,
-    found_mask,
-    frame_rows,
-    in_boxes,
-    summarize_lerf,
-)
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.lerf import FrameScores, box_filtered, found_mask, frame_rows, in_boxes, summarize_lerf
 from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
 
 
@@ -30,11 +24,8 @@ def square(category, x, y, size=5, **more):
 
 
 def test_polygons_are_filled_joined_and_scaled(tmp_path):
-    file = write_frame(
-        tmp_path / "ramen",
-        "frame_00006",
-        [square("egg", 2, 3), square("egg", 20, 10, bbox=[20, 10, 25, 15]), square("bowl", 4, 4)],
-    )
+    egg = square("egg", 20, 10, bbox=[20, 10, 25, 15])
+    file = write_frame(tmp_path / "ramen", "frame_00006", [square("egg", 2, 3), egg, square("bowl", 4, 4)])
     frame = read_frame(file, 40, 30)
     assert list(frame.masks) == ["egg", "bowl"]
     egg = torch.zeros(30, 40, dtype=torch.bool)
@@ -44,27 +35,24 @@ def test_polygons_are_filled_joined_and_scaled(tmp_path):
     half = read_frame(file, 20, 15)
     assert half.masks["egg"].shape == (15, 20)
     assert half.boxes["egg"][1] == (10, 5, 12.5, 7.5)
-    with pytest.raises(ValueError, match="labels an image of 40 x 30 pixels, the run's is 40 x 40"):
+    with pytest.raises(InputError, match=r"40 x 30 .* 40 x 40"):
         read_frame(file, 40, 40)
 
 
-def test_a_segmentation_outside_of_its_image_is_refused(tmp_path):
-    file = write_frame(tmp_path, "frame_3", [square("bowl", 4, 4), square("egg", -20, 3)])
-    with pytest.raises(ValueError, match=r"frame_3\.json: a segmentation of 'egg' lies wholly outside"):
-        read_frame(file, 40, 30)
-
-
 def test_files_that_do_not_fit(tmp_path):
-    with pytest.raises(FileNotFoundError, match="holds no label files"):
+    with pytest.raises(FileNotFoundError, match="no label files"):
         read_frames(tmp_path)
+    file = write_frame(tmp_path, "frame_3", [square("bowl", 4, 4), square("egg", -20, 3)])
+    with pytest.raises(InputError, match=r"frame_3\.json: .* 'egg' .*outside"):
+        read_frame(file, 40, 30)
     good = write_frame(tmp_path, "frame_1", [square("egg", 0, 0)])
     bad = write_frame(tmp_path, "frame_2", [{"category": "egg", "segmentation": [[1, 2]]}])
-    with pytest.raises(ValueError, match=r"frame_2\.json is no label file of LERF-OVS"):
+    with pytest.raises(InputError, match=r"frame_2\.json"):
         read_frame(bad, 40, 30)
     assert match_views([good, bad], ["images/frame_1.jpg"]) == ({good: "images/frame_1.jpg"}, ["frame_2"])
-    with pytest.raises(ValueError, match="none of the 2 label files"):
+    with pytest.raises(InputError, match="none of the 2 label files"):
         match_views([good, bad], ["other.jpg"])
-    with pytest.raises(ValueError, match=r"frame_1\.json labels one image, but a/frame_1\.jpg and b/frame_1\.jpg"):
+    with pytest.raises(InputError, match=r"frame_1\.json .*a/frame_1\.jpg and b/frame_1\.jpg"):
         match_views([good], ["a/frame_1.jpg", "b/frame_1.jpg"])
     assert match_views([good], ["a/frame_1.jpg", "a/frame_2.jpg", "b/frame_2.jpg"])[1] == []
 
@@ -91,11 +79,8 @@ def test_langsplat_reading():
     assert float(average.max()) == pytest.approx(1, abs=1e-5)
     assert float(mixed[45, 31]) == pytest.approx((1 + float(average[45, 31])) / 2)
     truth = relevancy.bool()
-    scores = FrameScores(
-        frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]}),
-        relevancy[..., None],
-        relevancy[..., None][..., :0],
-    )
+    frame = frame_of({"egg": truth}, {"egg": [(30.0, 30.0, 59.0, 59.0)]})
+    scores = FrameScores(frame, relevancy[..., None], relevancy[..., None][..., :0])
     (row,) = frame_rows(scores, "langsplat", margin=0, clean=False)
     assert 0.8 < row["iou"] < 0.87  # corners, where the mean is below 0.4, are cut off: 15 % of the square
     assert row["localized"] == 1
@@ -115,15 +100,15 @@ def smoothed(mask):
     return found
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_majority_is_langsplats_up_to_the_border(seed):
-    g = torch.Generator().manual_seed(seed)
-    height, width = (int(x) for x in torch.randint(2, 30, (2,), generator=g))
-    relevancy = torch.rand(height, width, generator=g)
-    scaled = (relevancy - relevancy.min()) / (relevancy - relevancy.min()).max()
-    expected = smoothed(2 * scaled - 1 > 0.4)
-    none = relevancy[..., None][..., :0]
-    assert torch.equal(found_mask(relevancy, none, "langsplat", margin=0, instances=1), expected)
+def test_the_majority_is_langsplats_up_to_the_border():
+    for seed in range(4):
+        g = torch.Generator().manual_seed(seed)
+        height, width = (int(x) for x in torch.randint(2, 30, (2,), generator=g))
+        relevancy = torch.rand(height, width, generator=g)
+        scaled = (relevancy - relevancy.min()) / (relevancy - relevancy.min()).max()
+        expected = smoothed(2 * scaled - 1 > 0.4)
+        none = relevancy[..., None][..., :0]
+        assert torch.equal(found_mask(relevancy, none, "langsplat", margin=0, instances=1), expected)
     inside = torch.zeros(20, 20)
     inside[-2:] = 1.0
     assert not found_mask(inside, none, "langsplat", margin=0, instances=1)[-3].any()
@@ -152,10 +137,8 @@ def test_order_of_averages_by_hand():
 def test_scenes_are_averaged_as_the_paper_does_and_pooled_beside_it():
     rows = [row("s", "a", "egg", 1.0), row("t", "a", "egg", 0.0), row("t", "b", "egg", 0.5), row("t", "b", "cup", 0.5)]
     frames = summarize_lerf(rows, "frames", {})
-    assert [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes] == [
-        ("s", 1, 1),
-        ("t", 2, 1 / 4),
-    ]
+    found = [(scene["scene"], scene["frames"], scene["miou"]) for scene in frames.scenes]
+    assert found == [("s", 1, 1), ("t", 2, 1 / 4)]
     assert frames.results["miou"] == (1 + 1 / 4) / 2
     assert frames.results["miou_pooled"] == (1 + 0 + 1 / 2) / 3  # three frames
     pairs = summarize_lerf(rows, "pairs", {}).results

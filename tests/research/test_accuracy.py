@@ -1,10 +1,6 @@
 """The controlled benchmark: what damage is, that no damage is none, and that its shortcuts are exact."""
 
-import json
-import subprocess
-import sys
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +8,6 @@ import torch
 from benchmarks.accuracy import Bench
 from benchmarks.accuracy_report import METHODS, summarize
 from benchmarks.damage import LADDER, STEPS, Damage, observe
-from benchmarks.features import LENGTHS, mask_features
 from benchmarks.fit import MOST, observation
 from benchmarks.losses import coarse_evidence
 from benchmarks.report import Report
@@ -26,7 +21,7 @@ from benchmarks.variants import (
     refined_scores,
     top_evidence,
 )
-from benchmarks.worlds import World, cell_evidence, made_words, truth_of, with_floaters
+from benchmarks.worlds import truth_of, with_floaters
 from normlift_ns import (
     GaussianScene,
     RefineConfig,
@@ -37,32 +32,9 @@ from normlift_ns import (
     refine_variant,
     render,
 )
-from tests.scenes import dense, generator, orbit, random_scene
-
-ROOT = Path(__file__).resolve().parents[1]
-CLASSES = 4
-WORDS = made_words(CLASSES, dimension=128)
-
-
-def exact_maps(cameras, seed: int) -> torch.Tensor:
-    """Quarters of the image, in an order of their own in every view, and a strip of nothing."""
-    g, maps = generator(seed), []
-    for camera in cameras:
-        y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-        quarter = (y > camera.height / 2).long() * 2 + (x > camera.width / 2).long()
-        classes = torch.randperm(CLASSES, generator=g)[quarter]
-        classes[:2] = -1
-        maps.append(classes)
-    return torch.stack(maps)
-
-
-@pytest.fixture(scope="module")
-def world() -> World:
-    scene, cameras, held_out = random_scene(300, dtype=torch.float32), orbit(6), orbit(2, distance=5.0)
-    maps = exact_maps(cameras, 0)
-    evidence, cells = cell_evidence(scene, cameras, maps)
-    truth = torch.randint(-1, CLASSES, (300,), generator=generator(1))
-    return World("tiny", scene, cameras, evidence, cells, truth, CLASSES, held_out, exact_maps(held_out, 1))
+from tests.research import quick
+from tests.research.tiny import CLASSES, WORDS
+from tests.scenes import dense
 
 
 def test_without_damage_cells_become_the_exact_masks(world):
@@ -83,21 +55,6 @@ def test_truth_is_the_class_of_pure_and_heavy_gaussians(world):
     expected = torch.where((total >= 1) & (by_class.max(1).values >= 0.75 * total), by_class.argmax(1), -1)
     assert (truth == expected).float().mean() > 0.99
     assert set(truth.tolist()) == {-1, 0, 1, 2, 3}
-
-
-def test_features_have_the_geometry_that_is_documented():
-    words, g = made_words(12), generator(0)
-    masks = torch.arange(12).repeat(40)
-    rows = mask_features(words, masks, torch.full_like(masks, -1), 0.0, 1.2, LENGTHS["clip"], g).view(40, 12, -1)
-    same = torch.einsum("vkd,wkd->vwk", rows, rows)[torch.triu_indices(40, 40, 1).unbind()].mean()
-    other = torch.einsum("vkd,vld->vkl", rows, rows)[
-        :, torch.triu_indices(12, 12, 1)[0], torch.triu_indices(12, 12, 1)[1]
-    ].mean()
-    text = rows @ words.classes.T
-    own = text.diagonal(dim1=1, dim2=2).mean()
-    off = (text.sum() - text.diagonal(dim1=1, dim2=2).sum()) / (40 * 12 * 11)
-    assert (float(same), float(other)) == (pytest.approx(0.83, abs=0.01), pytest.approx(0.64, abs=0.01))
-    assert (float(own), float(off)) == (pytest.approx(0.34, abs=0.01), pytest.approx(0.25, abs=0.01))
 
 
 def test_each_damage_does_what_its_name_says(world):
@@ -180,8 +137,7 @@ def test_coarse_evidence_is_that_of_smaller_images(world):
 def test_mistakes_of_the_middle_tenths():
     reliability = torch.linspace(0.01, 1, 100)
     truth, answer = torch.zeros(100, dtype=torch.int64), torch.zeros(100, dtype=torch.int64)
-    truth[55:60], answer[:50] = 1, 2  # five of the sixth tenth are called 0, the largest class; low ones do not count
-    truth[99] = -1
+    truth[55:60], answer[:50], truth[99] = 1, 2, -1  # five of the sixth tenth are called 0, the largest class
     found = mistakes(reliability, truth, answer)
     assert found == {"middle.wrong": pytest.approx(1 / 6, abs=0.01), "middle.wrong_largest": 1.0}
 
@@ -218,38 +174,34 @@ def test_rows_and_their_summary(world):
     values = {metric.key: metric.value for metric in report.metrics}
     ladder = [row for row in rows if row["damage"] in ("mild", "noise only")]
     three = [row for row in rows if row["damage"] == "mild, 3 views"]
+
+    def mean(some: list, method: str, figure: str = "miou") -> float:
+        return sum(row[method][figure] for row in some) / len(some)
+
     for method in METHODS:
-        expected = sum(row[method]["miou"] for row in ladder) / 4
-        assert values[f"ablation.{method}.miou"] == pytest.approx(expected)
-        assert values[f"tiny.ablation.{method}.miou"] == pytest.approx(expected)
-        clean = [row[method]["miou"] for row in ladder if row["damage"] == "noise only"]
-        assert values[f"undamaged.{method}.miou"] == pytest.approx(sum(clean) / 2)
-        assert values[f"views3.ablation.{method}.miou"] == pytest.approx(sum(row[method]["miou"] for row in three) / 2)
         gains = [row[method]["miou"] - row["none"]["miou"] for row in ladder]
-        assert values[f"ablation.{method}.worst"] == pytest.approx(min(gains))
-        assert values[f"ablation.{method}.share_worse"] == sum(gain < -1 for gain in gains) / 4
-        assert values[f"ablation.{method}.copied"] == pytest.approx(sum(row[method]["copied"] for row in ladder) / 4)
+        expected = {
+            f"ablation.{method}.miou": mean(ladder, method),
+            f"tiny.ablation.{method}.miou": mean(ladder, method),
+            f"undamaged.{method}.miou": mean([row for row in ladder if row["damage"] == "noise only"], method),
+            f"views3.ablation.{method}.miou": mean(three, method),
+            f"ablation.{method}.worst": min(gains),
+            f"ablation.{method}.share_worse": sum(gain < -1 for gain in gains) / 4,
+            f"ablation.{method}.copied": mean(ladder, method, "copied"),
+        }
+        assert {key: values[key] for key in expected} == pytest.approx(expected)
     assert values["consensus.share_worse"] == values["ablation.consensus.share_worse"]
     assert values["ablation.none.copied"] == values["ablation.none.gain"] == 0 < values["ablation.paper.copied"]
     assert values["ladder.arc.none.miou"] == pytest.approx(
-        sum(r["none"]["miou"] for r in rows if r["damage"] == "arc") / 2
+        mean([row for row in rows if row["damage"] == "arc"], "none")
     )
-    for other in ("sfs", "occam", "vala", "drsplat"):
-        assert 0 < values[f"baseline.{other}.miou"] <= 100
-    assert values["ablation.paper_minus_none.miou"] == pytest.approx(
-        values["ablation.paper.miou"] - values["ablation.none.miou"]
-    )
-    assert 0 <= values["ablation.paper.miou_2d"] <= 100
+    assert all(0 < values[f"baseline.{other}.miou"] <= 100 for other in ("sfs", "occam", "vala", "drsplat"))
+    assert values["ablation.paper_minus_none.miou"] == pytest.approx(mean(ladder, "paper") - mean(ladder, "none"))
     assert values["preset.half.miou"] == pytest.approx(values["ablation.paper.miou"], abs=1)
 
 
-@pytest.mark.slow
 def test_quick_accuracy_benchmark(tmp_path):
-    command = [sys.executable, "-m", "benchmarks.accuracy", "--quick", "--output", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    print(done.stdout)
-    values = {m["key"]: m["value"] for m in json.loads((tmp_path / "accuracy.json").read_text())["metrics"]}
+    values = {key: metric["value"] for key, metric in quick("accuracy", tmp_path).items()}
     assert values["ladder.few views.paper.miou"] > values["ladder.few views.none.miou"]
     assert values["ablation.paper.miou"] > values["ablation.norm_only.miou"]
     assert values["reliability.spearman_bins_mean"] > 0.7

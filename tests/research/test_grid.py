@@ -1,10 +1,7 @@
 """The grid: what its damages, features, regions and votes are, and that a run goes on where it stopped."""
 
-import json
 import subprocess
 import sys
-from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,48 +10,33 @@ from benchmarks.ballots import _parts, results, voters_of
 from benchmarks.candidates import CANDIDATES, Candidate
 from benchmarks.damage import GROUP, LADDER, STEPS, Damage, observe
 from benchmarks.features import LENGTHS, as_features, mask_features, mixture_features, orthogonal_words, world_looks
-from benchmarks.grid import QUICK, QUICK_CELLS, chunks, finished, run_cells
+from benchmarks.grid import QUICK, chunks, finished, run_cells
 from benchmarks.grid_report import report_of
 from benchmarks.pieces import KINDS, blurred, label_map, observe_pieces, pieces, shares_of
 from benchmarks.rows import RowsError, append, read_rows
 from benchmarks.rule import Cell, cells_of
 from benchmarks.second_room import parts, second, walk
-from benchmarks.sites import Place, Site
+from benchmarks.sites import Place
 from benchmarks.third_room import third, turns
 from benchmarks.variants import lifted_scores, only, refined_scores
-from benchmarks.worlds import World, cell_evidence, made_words
+from benchmarks.worlds import World, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors
 from normlift_ns.core.ablations import Variant, variant_source
 from normlift_ns.core.metrics import classify
-from tests.scenes import generator, orbit, random_scene
-from tests.test_accuracy import CLASSES, WORDS, exact_maps
+from tests.research import ROOT, quick
+from tests.research.tiny import CLASSES, WORDS
+from tests.scenes import generator
 
-ROOT = Path(__file__).resolve().parents[1]
 PINNED = {
     "noise only": (24, 4335172, 0.97888, 3397.190),
     "mild": (22, 3596355, -3.87753, 3168.727),
-    "noise": (18, 2589038, -3.78423, 2831.101),
-    "wrong classes": (19, 2876014, -5.46072, 2960.699),
     "merged masks": (15, 2071634, -0.48616, 2760.616),
     "split masks": (33, 5005464, -2.77079, 2672.476),
     "shifted masks": (22, 3537593, -4.48879, 3039.818),
-    "dropped masks": (5, -168647, 0.11247, 747.843),
-    "few views": (13, 1243823, -1.42105, 1934.851),
     "dominant view": (20, 2919573, 6.05680, 27594.662),
     "pose noise": (19, 2933120, 0.94737, 3057.612),
-    "floaters": (20, 3057647, 5.83240, 2914.216),
     "hard": (17, 1999422, -2.06203, 2467.121),
 }
-"""Of version 0.1: masks, a checksum of their cells, sums of features and of weights."""
-
-
-@pytest.fixture(scope="module")
-def world() -> World:
-    scene, cameras, held_out = random_scene(300, dtype=torch.float32), orbit(6), orbit(2, distance=5.0)
-    maps = exact_maps(cameras, 0)
-    evidence, cells = cell_evidence(scene, cameras, maps)
-    truth = torch.randint(-1, CLASSES, (300,), generator=generator(1))
-    return World("tiny", scene, cameras, evidence, cells, truth, CLASSES, held_out, exact_maps(held_out, 1))
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +44,14 @@ def room() -> World:
     return second(4000, views=10, width=160)
 
 
-@pytest.mark.parametrize("step", LADDER)
-def test_the_steps_of_version_0_1_keep_their_numbers(world, step):
-    observed = observe(world, WORDS, LADDER[step], list(LADDER).index(step))
-    columns = observed.columns.double()
-    checksum = int((columns * (torch.arange(1, columns.numel() + 1).double() % 97)).sum())
-    masks, expected, features, weights = PINNED[step]
-    assert (len(observed.features), checksum) == (masks, expected)
-    assert float(observed.features[:, :7].double().sum()) == pytest.approx(features, abs=2e-4)
-    assert float(observed.evidence.rows.weight.double().sum()) == pytest.approx(weights, rel=1e-4)
+def test_the_steps_of_version_0_1_keep_their_numbers(world):
+    """Masks, a checksum of their cells, sums of features and of weights."""
+    for step, expected in PINNED.items():
+        observed = observe(world, WORDS, LADDER[step], list(LADDER).index(step))
+        columns = observed.columns.double()
+        checksum = int((columns * (torch.arange(1, columns.numel() + 1).double() % 97)).sum())
+        sums = float(observed.features[:, :7].double().sum()), float(observed.evidence.rows.weight.double().sum())
+        assert (len(observed.features), checksum, *sums) == pytest.approx(expected, rel=1e-4, abs=2e-4), step
 
 
 def test_a_group_shares_one_mask_in_some_views(room):
@@ -155,24 +136,18 @@ def test_histograms_are_square_roots_of_shares():
     assert torch.allclose(as_features(sums)[0], expected)
 
 
-def test_the_second_room_is_another_one(room):
-    assert (len(room.scene), room.classes, len(room.cameras), len(room.held_out)) == (4000, 16, 10, 5)
+def test_rooms_are_others_and_as_they_were_when_the_rule_was_written(room):
+    third_room = third(6000, views=10, width=160)
+    for found, gaussians, classes in ((room, 4000, 16), (third_room, 6000, 20)):
+        assert (len(found.scene), found.classes, len(found.cameras), len(found.held_out)) == (gaussians, classes, 10, 5)
+        assert set(found.truth.unique().tolist()) == set(range(-1, classes)) and bool(found.scene.drawable.all())
+        assert int((found.cells.maps[..., None] == torch.arange(classes)).flatten(0, 2).any(0).sum()) == classes
     assert len(parts()) == 16 and int((room.truth < 0).sum()) == 120
-    assert set(room.truth.unique().tolist()) == set(range(-1, 16)) and bool(room.scene.drawable.all())
-    # as it was when the rule was written
-    eyes = torch.stack([camera.world_to_camera.double().inverse()[:3, 3] for camera in walk()])
-    assert eyes[7].tolist() == pytest.approx([0.1986, 0.1559, 0.9904], abs=1e-3)
-    assert int((room.cells.maps[..., None] == torch.arange(16)).flatten(0, 2).any(0).sum()) == 16
-
-
-def test_the_third_room_is_another_one():
-    room = third(6000, views=10, width=160)
-    assert (len(room.scene), room.classes, len(room.cameras), len(room.held_out)) == (6000, 20, 10, 5)
-    assert set(room.truth.unique().tolist()) == set(range(-1, 20)) and bool(room.scene.drawable.all())
-    # as it was when the rule was changed
-    eyes = torch.stack([camera.world_to_camera.double().inverse()[:3, 3] for camera in turns()])
-    assert eyes.unique(dim=0).shape[0] <= 30 and eyes[1].tolist() == pytest.approx([1.5, -1.4, 1.35], abs=1e-3)
-    assert int((room.cells.maps[..., None] == torch.arange(20)).flatten(0, 2).any(0).sum()) == 20
+    walked, turned = (
+        torch.stack([camera.world_to_camera.double().inverse()[:3, 3] for camera in path]) for path in (walk(), turns())
+    )
+    assert walked[7].tolist() == pytest.approx([0.1986, 0.1559, 0.9904], abs=1e-3)
+    assert turned.unique(dim=0).shape[0] <= 30 and turned[1].tolist() == pytest.approx([1.5, -1.4, 1.35], abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -230,28 +205,6 @@ def test_votes_are_those_of_refine(world):
             assert torch.equal(source, expected[voters.group[:, 0]].long()), (name, delta)
 
 
-def test_a_posterior_vote_is_the_formula(world):
-    observed = observe(world, WORDS, LADDER["hard"], 1)
-    lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)
-    voters = voters_of(neighbors, world.truth, CLASSES)
-    (part,) = _parts(lifted, voters, cosines=True)
-    one = Candidate("posterior", sigma_d=2.0, prior=3.0, delta=0.05)
-    (source,) = part.sources([one], one.tau, one.gamma)
-    u, r = lifted.directions().double(), lifted.scalars.reliability.double()
-    own = (lifted.scalars.norm * lifted.scalars.n_eff).double()
-    gate = torch.sigmoid((u @ u.T - one.tau) / one.gamma)
-    spacing = float(neighbors.spacing.median())
-    for place in range(0, len(voters.group), 7):
-        i, *near = voters.group[place].tolist()
-        d = torch.exp(-0.5 * (neighbors.distance[i].double() / (2 * spacing)) ** 2)
-        share = r[near] * d / (r[near] * d).sum()
-        support = {j: float(r[j] * (own[i] * gate[j, i] + 3 * (share * gate[j, near]).sum())) for j in (i, *near)}
-        best = max(near, key=lambda j: support[j])
-        expected = best if support[best] > support[i] + 0.05 else i
-        chosen = int(source[place])
-        assert chosen == expected or support[chosen] == pytest.approx(support[expected], rel=1e-4)
-
-
 def test_results_are_those_of_the_variants(world):
     observed = observe(world, WORDS, STEPS["arc"], 0)
     lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)
@@ -294,7 +247,6 @@ def test_cells_of_one_place_stay_together():
     assert Place("demo", "masks", floaters=True) in {Place.of(some[0]) for some in parts_of}
 
 
-@pytest.mark.slow
 def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
     path = tmp_path / "rows.jsonl"
     cells = [
@@ -326,34 +278,11 @@ def test_a_run_skips_what_is_done_and_ends_in_a_report(tmp_path):
     )
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: it compares a GPU with a CPU")
-def test_a_gpu_finds_what_a_cpu_finds():
-    """But for cosines in half precision.
-
-    Where R is 1 for all, as in plain_knn, Gaussians of one direction tie, and rounding says who copies; nothing that is
-    answered depends on that.
-    """
-    sizes = replace(QUICK, voters=None)
-    candidates = [one for one in CANDIDATES if one.delta == 0]
-    for cell in cells_of("second"):
-        if cell[1:4] in QUICK_CELLS and cell.views == "all":
-            on = {device: Site(Place.of(cell), replace(sizes, device=device)) for device in ("cpu", "cuda")}
-            found = {device: site.run(cell, 3, candidates) for device, site in on.items()}
-            for name, result in found["cpu"].items():
-                assert found["cuda"][name].miou == pytest.approx(result.miou, abs=1.5), (cell, name)
-                if name != "plain_knn":
-                    assert found["cuda"][name].copied == pytest.approx(result.copied, abs=0.03), (cell, name)
-
-
-@pytest.mark.slow
 def test_quick_grid(tmp_path):
-    command = [sys.executable, "-m", "benchmarks.grid", "--quick", "--rows", str(tmp_path / "rows.jsonl")]
-    command += ["--output", str(tmp_path)]
-    begun = subprocess.run([*command, "--minutes", "0"], cwd=ROOT, capture_output=True, text=True, check=False)
+    flags = ("--rows", str(tmp_path / "rows.jsonl"))
+    command = [sys.executable, "-m", "benchmarks.grid", "--quick", *flags, "--minutes", "0"]
+    begun = subprocess.run([*command, "--output", tmp_path], cwd=ROOT, capture_output=True, text=True, check=False)
     assert begun.returncode == 1 and "no cell is done" in begun.stderr
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    values = {m["key"]: m["value"] for m in json.loads((tmp_path / "grid.json").read_text())["metrics"]}
-    assert values["cells"] == 12 and any(key.startswith("decision.default.") for key in values)
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert "12 of them done before" in again.stdout
+    values = quick("grid", tmp_path, *flags)
+    assert values["cells"]["value"] == 12 and any(key.startswith("decision.default.") for key in values)
+    assert quick("grid", tmp_path, *flags) == values  # from the rows

@@ -69,11 +69,11 @@ def test_a_tie_goes_to_the_simpler_and_none_is_the_fallback():
     assert set(everything_fails.verdicts["one"].broken) == {"undamaged", "3 views", "overall", "column"}
 
 
-@pytest.mark.parametrize(("loss", "holds"), [(0.2, True), (0.21, False)])
-def test_clause_1_undamaged(loss, holds):
-    found = verdict(table(one=lambda cell: -loss if cell.undamaged else 5.0), "one")
-    assert found.undamaged == pytest.approx(loss)
-    assert found.broken == (() if holds else ("undamaged",))
+def test_clause_1_undamaged():
+    for loss, broken in ((0.2, ()), (0.21, ("undamaged",))):
+        found = verdict(table(one=lambda cell, loss=loss: -loss if cell.undamaged else 5.0), "one")
+        assert found.undamaged == pytest.approx(loss)
+        assert found.broken == broken
 
 
 @pytest.mark.parametrize(("loss", "holds"), [(1.0, True), (1.01, False)])

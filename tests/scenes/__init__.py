@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from normlift_ns import Camera, Evidence, GaussianScene
+from normlift_ns import Camera, Evidence, GaussianScene, View
 from normlift_ns.core.sparse import SparseRows
 
 
@@ -76,3 +80,29 @@ def dense(rows: SparseRows, columns: int) -> Tensor:
     out = torch.zeros(len(rows), columns, dtype=torch.float64, device=rows.weight.device)
     out[rows.row_index(), rows.column.long()] = rows.weight.double()
     return out
+
+
+@dataclass
+class Photographs:
+    """Images of noise from cameras."""
+
+    names: Sequence[str]
+    cameras: Sequence[Camera]
+    seeds: Sequence[int] = range(99)
+    masks: Sequence[Tensor | None] = (None,) * 99
+    original: tuple[int, int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> View:
+        camera = self.cameras[index]
+        shape = (camera.height, camera.width, 3)
+        image = torch.randint(0, 256, shape, generator=generator(self.seeds[index]), dtype=torch.uint8)
+        return View(camera, image, self.masks[index], self.names[index], self.original)
+
+
+def made_scene(gaussians: GaussianScene, train: Photographs, held_out: Any = (), **more: Any) -> Any:
+    """What a lift reads of a scene."""
+    facts = {"rasterize_mode": "classic", "identity": {}, "name": "made", **more}
+    return SimpleNamespace(gaussians=gaussians, train=train, held_out=held_out or Photographs([], []), **facts)

@@ -48,13 +48,12 @@ def write_ply(
     comments: Sequence[str] = (),
     text: bool = False,
     byte_order: str = "<",
-    element: str = "vertex",
 ) -> Path:
     names = list(columns) if order is None else list(order)
     table = np.empty(len(columns[names[0]]), [(name, columns[name].dtype.newbyteorder(byte_order)) for name in names])
     for name in names:
         table[name] = columns[name]
-    described = PlyElement.describe(table, element)
+    described = PlyElement.describe(table, "vertex")
     PlyData([described], text=text, byte_order=byte_order, comments=list(comments)).write(str(path))
     return path
 

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.colmap import intrinsics_of, model_folder, pose_of, read_model, read_points
 from normlift_ns.scenes.frames import Frame, Intrinsics
+from tests.examples import examples
 from tests.scenes.made import write_colmap
 
 DISTORTED = Intrinsics(500.5, 500.5, 320.25, 240.75, 640, 480, k1=0.05, k2=-0.01, p1=1e-3, p2=-2e-3)
@@ -39,56 +40,55 @@ def frames(count: int = 5) -> list[Frame]:
     ]
 
 
-@pytest.mark.parametrize("binary", [False, True])
-@pytest.mark.parametrize("model", KEPT)
-def test_projects_are_read(tmp_path: Path, model: str, binary: bool) -> None:
+def test_projects_are_read(tmp_path: Path) -> None:
     points = np.random.default_rng(1).normal(size=(9, 3))
-    folder = model_folder(write_colmap(tmp_path, frames(), model, binary=binary, points=points))
-    cameras, images = read_cameras(folder), read_images(folder)
-    assert [image.name for image in images] == [f"photo {i}.jpg" for i in range(5)]
-    for image, frame in zip(images, frames()):
-        assert np.allclose(pose_of(image), frame.pose, atol=1e-12)
-        lost = {name: 0.0 for name in ("k1", "k2", "p1", "p2") if name not in KEPT[model]}
-        assert cameras[image.camera] == DISTORTED._replace(**lost)
-    assert np.array_equal(read_points(folder), points)
+    for model, kept in KEPT.items():
+        for binary in (False, True):
+            project = write_colmap(tmp_path / f"{model}{binary}", frames(), model, binary=binary, points=points)
+            folder = model_folder(project)
+            cameras, images = read_cameras(folder), read_images(folder)
+            assert [image.name for image in images] == [f"photo {i}.jpg" for i in range(5)]
+            lost = {name: 0.0 for name in ("k1", "k2", "p1", "p2") if name not in kept}
+            for image, frame in zip(images, frames()):
+                assert np.allclose(pose_of(image), frame.pose, atol=1e-12)
+                assert cameras[image.camera] == DISTORTED._replace(**lost), (model, binary)
+            assert np.array_equal(read_points(folder), points)
 
 
 def test_the_project_is_found_where_it_lies(tmp_path: Path) -> None:
     write_colmap(tmp_path / "a", frames())
     found = tmp_path / "a" / "sparse" / "0"
-    assert model_folder(tmp_path / "a") == found
-    assert model_folder(found) == found
+    assert model_folder(tmp_path / "a") == found == model_folder(found)
     (tmp_path / "b").mkdir()
-    with pytest.raises(FileNotFoundError, match="holds no reconstruction of COLMAP"):
-        model_folder(tmp_path / "b")
-    with pytest.raises(FileNotFoundError, match="There is no folder"):
-        model_folder(tmp_path / "c")
+    for name, message in (("b", "COLMAP"), ("c", "no folder")):
+        with pytest.raises(FileNotFoundError, match=message):
+            model_folder(tmp_path / name)
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_camera_models_that_cannot_be_undistorted_are_refused_by_name(tmp_path: Path, binary: bool) -> None:
-    folder = model_folder(write_colmap(tmp_path, frames(), "OPENCV_FISHEYE", binary=binary))
-    with pytest.raises(ValueError, match="has the model OPENCV_FISHEYE; read are SIMPLE_PINHOLE, PINHOLE"):
-        read_cameras(folder)
-
-
-def test_unknown_numbers_and_missing_files_are_named(tmp_path: Path) -> None:
+def test_unknown_models_and_missing_files_are_named(tmp_path: Path) -> None:
+    for binary in (False, True):
+        folder = model_folder(write_colmap(tmp_path / str(binary), frames(), "OPENCV_FISHEYE", binary=binary))
+        with pytest.raises(InputError, match=r"OPENCV_FISHEYE; .* SIMPLE_PINHOLE, PINHOLE"):
+            read_cameras(folder)
     folder = model_folder(write_colmap(tmp_path, frames()))
     data = bytearray((folder / "cameras.bin").read_bytes())
     data[12] = 77
     (folder / "cameras.bin").write_bytes(data)
-    with pytest.raises(ValueError, match=r"cameras\.bin is damaged .*model number 77"):
+    with pytest.raises(InputError, match=r"cameras\.bin .* 77"):
         read_cameras(folder)
-    data[12] = 4
-    (folder / "cameras.bin").write_bytes(data)
+    write_colmap(tmp_path / "whole", frames())
+    folder = model_folder(tmp_path / "whole")
     (folder / "images.bin").unlink()
-    with pytest.raises(FileNotFoundError, match=r"neither images.bin nor images.txt"):
+    with pytest.raises(FileNotFoundError, match=r"images\.bin nor images\.txt"):
+        read_images(folder)
+    os.mkfifo(folder / "images.txt")
+    with pytest.raises(FileNotFoundError, match=r"images\.bin nor images\.txt"):
         read_images(folder)
 
 
-@pytest.mark.parametrize(
-    ("name", "line", "read"),
-    [
+def test_lines_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+    folder = model_folder(write_colmap(tmp_path, frames(), binary=False))
+    for name, line, read in (
         ("cameras", "1 PINHOLE 640 480 500 500 320", read_cameras),
         ("cameras", "1 PINHOLE 640", read_cameras),
         ("cameras", "1 PINHOLE wide 480 500 500 320 240", read_cameras),
@@ -97,48 +97,43 @@ def test_unknown_numbers_and_missing_files_are_named(tmp_path: Path) -> None:
         ("images", "1 0 0 0 0 0 0 0 1 a.jpg", read_images),
         ("points3D", "1 2 3", read_points),
         ("points3D", "1 nan 3 4 0 0 0 1", read_points),
-    ],
-)
-def test_lines_that_make_no_sense_are_refused(tmp_path: Path, name: str, line: str, read) -> None:
-    folder = model_folder(write_colmap(tmp_path, frames(), binary=False))
-    (folder / f"{name}.txt").write_text(line + "\n")
-    with pytest.raises(ValueError, match=str(folder)):
-        read(folder)
+    ):
+        whole = (folder / f"{name}.txt").read_text()
+        (folder / f"{name}.txt").write_text(line + "\n")
+        with pytest.raises(InputError, match=str(folder)):
+            read(folder)
+        (folder / f"{name}.txt").write_text(whole)
 
 
 def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
     folder = model_folder(write_colmap(tmp_path, frames(), "PINHOLE", binary=False))
     cameras, images = (folder / "cameras.txt").read_text(), (folder / "images.txt").read_text()
     for changed, message in (
-        (cameras + cameras.splitlines()[-1], "stands there twice"),
-        (cameras.replace("640", "1000000000"), "sides that are not 1 to 65,536 pixels"),
-        (cameras.replace("500.5", "inf"), "has parameters .*inf"),
-        ("# nothing", "was taken with camera 5, which is missing"),
+        (cameras + cameras.splitlines()[-1], "twice"),
+        (cameras.replace("640", "1000000000"), "65,536"),
+        (cameras.replace("500.5", "inf"), "inf"),
+        ("# nothing", "camera 5"),
     ):
         (folder / "cameras.txt").write_text(changed)
         with pytest.raises(InputError, match=message):
             read_model(folder)
     (folder / "cameras.txt").write_text(cameras)
     (folder / "images.txt").write_text(images + "\n".join(images.splitlines()[-2:]))
-    with pytest.raises(InputError, match="two images of the same number"):
+    with pytest.raises(InputError, match="same number"):
         read_model(folder)
     (folder / "images.txt").write_text("# none")
-    with pytest.raises(InputError, match="0 registered images: no image"):
+    with pytest.raises(InputError, match="0 registered images"):
         read_model(folder)
 
 
-def test_counts_beyond_the_file_and_pipes_are_refused_at_once(tmp_path: Path) -> None:
+def test_counts_beyond_the_file_are_refused(tmp_path: Path) -> None:
     folder = model_folder(write_colmap(tmp_path, frames()))
     for name in ("cameras", "images"):
         whole = (folder / f"{name}.bin").read_bytes()
         (folder / f"{name}.bin").write_bytes(struct.pack("<Q", 10**12) + whole[8:])
-        with pytest.raises(InputError, match=r"1,000,000,000,000 entries"):
+        with pytest.raises(InputError, match="1,000,000,000,000"):
             read_model(folder)
         (folder / f"{name}.bin").write_bytes(whole)
-    (folder / "images.bin").unlink()
-    os.mkfifo(folder / "images.txt")
-    with pytest.raises(FileNotFoundError, match=r"neither images\.bin nor images\.txt"):
-        read_model(folder)
 
 
 def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> None:
@@ -149,13 +144,21 @@ def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> No
     (folder / "images.txt").write_text("\n".join([*lines[:2], *pairs]), "utf-8-sig")
     assert [image.name for image in read_images(folder)] == [image.name for image in expected]
     (folder / "images.txt").write_text("\n".join(lines[2::2]))  # without the lines of points
-    with pytest.raises(ValueError, match=r"the line after that of .* holds no points"):
+    with pytest.raises(ValueError, match="points"):
         read_images(folder)
 
 
-def _no_other_error(folder: Path, name: str, place: int, value: bytes, cut: int | None, binary: bool) -> None:
-    write_colmap(folder, frames(), binary=binary, points=np.eye(3))
-    model = model_folder(folder)
+@examples(25)
+@given(
+    name=st.sampled_from(["cameras", "images", "points3D"]),
+    place=st.integers(0, 600),
+    value=st.binary(min_size=1, max_size=8),
+    cut=st.none() | st.integers(0, 600),
+    binary=st.booleans(),
+)
+def test_no_damage_gets_through_as_another_error(tmp_path_factory, name, place, value, cut, binary) -> None:
+    folder = tmp_path_factory.mktemp("c")
+    model = model_folder(write_colmap(folder, frames(2), binary=binary, points=np.eye(3)))
     path = model / f"{name}.{'bin' if binary else 'txt'}"
     data = bytearray(path.read_bytes())
     data[place : place + len(value)] = value
@@ -164,25 +167,3 @@ def _no_other_error(folder: Path, name: str, place: int, value: bytes, cut: int 
         read_points(model) if name == "points3D" else (read_cameras(model), [pose_of(i) for i in read_images(model)])
     except (InputError, FileNotFoundError) as error:
         assert str(folder) in str(error)
-
-
-DAMAGE = {
-    "name": st.sampled_from(["cameras", "images", "points3D"]),
-    "place": st.integers(0, 600),
-    "value": st.binary(min_size=1, max_size=8),
-    "cut": st.none() | st.integers(0, 600),
-    "binary": st.booleans(),
-}
-
-
-@settings(max_examples=25, deadline=None)
-@given(**DAMAGE)
-def test_no_damage_gets_through_as_another_error(tmp_path_factory: pytest.TempPathFactory, **damage) -> None:
-    _no_other_error(tmp_path_factory.mktemp("c"), **damage)
-
-
-@pytest.mark.slow
-@settings(max_examples=200, deadline=None)
-@given(**DAMAGE)
-def test_no_damage_gets_through_as_another_error_ever(tmp_path_factory: pytest.TempPathFactory, **damage) -> None:
-    _no_other_error(tmp_path_factory.mktemp("c"), **damage)

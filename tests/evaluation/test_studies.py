@@ -1,0 +1,131 @@
+"""Studies: what R knows, on Gaussians made by hand, against SciPy and plain loops; which votes are tried; figures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy import stats
+
+from normlift_ns.core.lift import Scalars
+from normlift_ns.core.metrics import NO_CLASS
+from normlift_ns.evaluation.signals import SceneSignals, signals
+from normlift_ns.evaluation.studies import POOLED, signal_rows
+from normlift_ns.evaluation.votes import BETA, SWEEPS, own_vote, sweeps
+from normlift_ns.options import RefineConfig
+
+
+def scene(seed: int, n: int = 400) -> SceneSignals:
+    """A third has no evidence, a fifth no truth; the vote mends some."""
+    g = torch.Generator().manual_seed(seed)
+    r = torch.rand(n, generator=g) * (torch.arange(n) % 3 > 0)
+    zeros = torch.zeros(n)
+    scalars = Scalars(r.sqrt(), zeros, zeros, zeros, r, zeros, torch.randint(1, 9, (n,), generator=g).int())
+    truth = torch.randint(0, 4, (n,), generator=g)
+    unrefined = torch.where(torch.rand(n, generator=g) < r, truth, NO_CLASS)
+    refined = torch.where(torch.rand(n, generator=g) < 0.8, truth, unrefined)
+    counted = torch.where(torch.rand(n, generator=g) < 0.2, NO_CLASS, truth)
+    opacity = (r + 0.3 * torch.rand(n, generator=g)).clamp(0, 1)
+    return SceneSignals(scalars, opacity, counted, {"unrefined": unrefined, "refined": refined})
+
+
+def test_groups_name_refined_and_unrefined_answers():
+    one = scene(0)
+    found, zero = signals(one), one.scalars.reliability == 0
+    counted = one.truth != NO_CLASS
+    for name, group in (("zero", zero), ("seen", ~zero), ("all", zero | ~zero)):
+        chosen = (group & counted).nonzero().squeeze(1).tolist()
+        for kind, answer in one.answers.items():
+            right = sum(int(answer[i]) == int(one.truth[i]) for i in chosen)
+            assert found[f"{name}.accuracy_{kind}"] == pytest.approx(right / len(chosen))
+        assert found[f"{name}.share"] == pytest.approx(float(group.double().mean()))
+    assert found["zero.accuracy_refined"] > 0.5 > found["zero.accuracy_unrefined"] == 0
+    assert "zero.accuracy" not in found
+
+
+def test_correlations_are_of_all_gaussians_with_their_p_values():
+    one = scene(1, n=30_000)  # of which 20,000 have R > 0
+    found, seen = signals(one), one.scalars.reliability > 0
+    r, o = (x[seen].double().numpy() for x in (one.scalars.reliability, one.opacity))
+    for name, expected in (("spearman", stats.spearmanr(r, o)), ("kendall", stats.kendalltau(r, o))):
+        assert found[f"opacity.{name}"] == pytest.approx(expected.statistic, abs=1e-12)
+        assert found[f"opacity.{name}_p"] == pytest.approx(expected.pvalue, abs=1e-12)
+    assert found["reliability.spearman_bins_p"] < 0.05
+
+
+def test_scenes_are_pooled_gaussian_by_gaussian():
+    scenes = [scene(2, n=300), scene(3, n=900)]
+    rows = signal_rows(["a", "b"], scenes)
+    assert [row["scene"] for row in rows] == ["a", "b", POOLED]
+    of_a, of_b, pooled = rows
+    assert pooled["zero.share"] == pytest.approx((300 * of_a["zero.share"] + 900 * of_b["zero.share"]) / 1200)
+    r = torch.cat([s.scalars.reliability for s in scenes])
+    o = torch.cat([s.opacity for s in scenes])
+    assert pooled["opacity.kendall"] == pytest.approx(stats.kendalltau(r[r > 0].double(), o[r > 0].double()).statistic)
+    assert pooled["opacity.kendall"] not in (of_a["opacity.kendall"], of_b["opacity.kendall"])
+    assert [row["scene"] for row in signal_rows(["a"], scenes[:1])] == ["a"]
+
+
+def test_without_a_truth_there_are_no_accuracies():
+    one = scene(4)
+    found = signals(SceneSignals(one.scalars, one.opacity))
+    assert not any("accuracy" in key or "bin" in key for key in found)
+    assert math.isfinite(found["opacity.kendall_p"])
+    assert not any("accuracy" in key for key in signals(one, SceneSignals(one.scalars, one.opacity)))
+
+
+def test_sweeps_contain_and_mark_the_default_and_the_run():
+    config = replace(RefineConfig(), k=17, tau=0.123)
+    own = own_vote({"options": {"beta": 3.5, "vote": vars(config)}})
+    labels = [each[0].label for each in sweeps([own])]
+    for parameter, values in SWEEPS.items():
+        some = [label for label in labels if label["parameter"] == parameter]
+        numbers = {"beta": BETA, "k": RefineConfig().k, **RefineConfig().numbers._asdict()}
+        used = {"beta": 3.5, "k": 17, "tau": 0.123}.get(parameter, numbers[parameter])
+        assert [label["value"] for label in some] == sorted({*values, numbers[parameter], used})
+        assert [label["value"] for label in some if label["default"]] == [numbers[parameter]]
+        assert [label["value"] for label in some if label["own"]] == [used]
+
+
+def test_runs_lifted_differently_are_swept_over_the_same_values():
+    owns = [own_vote({"options": {"vote": vars(replace(RefineConfig(), sigma_d=s))}}) for s in (0.77, 1.33)]
+    every = list(sweeps(owns))
+    of_sigma = [each for each in every if each[0].label["parameter"] == "sigma_d"]
+    assert {0.77, 1.33} <= {each[0].label["value"] for each in of_sigma}
+    assert all(each[0].config.sigma_d == each[1].config.sigma_d == each[0].label["value"] for each in of_sigma)
+    of_k = [each for each in every if each[0].label["parameter"] == "k"]
+    assert all((each[0].config.sigma_d, each[1].config.sigma_d) == (0.77, 1.33) for each in of_k)
+
+
+def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
+    from normlift_ns.evaluation.plots import plot_sweeps, sweeps_figure  # noqa: PLC0415
+
+    rows = [{"parameter": "$\\frac{$", "value": x, "$\\frac{$": x} for x in (1.0, 2.0)]  # not mathematics
+    plot_sweeps(rows, "$\\frac{$", "$\\frac{$", tmp_path / "a.svg")
+    assert (tmp_path / "a.svg").stat().st_size > 1000
+    values = [("k", 12.0, False, True, 0.4), ("k", 36.0, True, False, 0.5), ("beta", 1.0, True, True, 0.4)]
+    rows = [{"parameter": p, "value": v, "default": d, "own": o, "miou": y} for p, v, d, o, y in values]
+    of_k, of_beta = sweeps_figure(rows[::-1], "miou", "miou", 0.45).axes[::-1]
+    assert [x.get_xlabel() for x in (of_k, of_beta)] == ["k", "beta"]
+    curve, default, own, result = of_k.lines
+    assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([0, 1], [0.4, 0.5])
+    assert [x.get_text() for x in of_k.get_xticklabels()] == ["12", "36"]
+    assert (list(default.get_xdata()), list(default.get_ydata())) == ([1], [0.5])
+    assert (list(own.get_xdata()), list(own.get_ydata())) == ([0], [0.4])
+    assert list(result.get_ydata()) == [0.45, 0.45]
+    assert {x.get_text() for x in of_beta.get_legend().get_texts()} == {"default", "of the run", "result"}
+
+
+def test_every_scene_has_its_signals_drawn():
+    from normlift_ns.evaluation.plots import signals_figure  # noqa: PLC0415
+
+    one = {"zero.share": 0.5, "histogram.0.00": 0.2, "histogram.0.50": 0.3}
+    rows = [{"scene": "a$", **one, "reliability.bin1": 0.1, "reliability.bin2": 0.9}, {"scene": "b", **one}]
+    figure = signals_figure(rows)
+    assert len(figure.axes) == 4
+    assert [axes.get_title() for axes in figure.axes[::2]] == ["a$", "b"]
+    assert list(figure.axes[0].lines[0].get_ydata()) == [10, 90]
+    assert len(figure.axes[2].lines) == 0
+    assert [bar.get_height() for bar in figure.axes[3].patches] == [20, 30, 50]
