@@ -1,4 +1,4 @@
-"""How many examples hypothesis tries: few in `make test` and `make test-slow`, twenty times as many in `make test-all`."""
+"""Numbers of examples that hypothesis tries: few by default, 20 times as many in `make test-all`."""
 
 from __future__ import annotations
 
