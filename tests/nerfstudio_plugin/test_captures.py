@@ -44,6 +44,7 @@ def test_the_run_is_loaded_whole(capture: Path, tmp_path: Path, monkeypatch: pyt
     assert abs(np.mean(measured) - EXPECTED[name]["psnr"]) < 0.9
 
 
+@pytest.mark.parametrize("capture", ["tabletop"], indirect=True)
 def test_a_lift_is_written_and_loaded_by_stock_nerfstudio(capture: Path, tmp_path: Path, registered: None) -> None:
     run = opened(capture)
     run_dir = write(run, lifted_field(run, views=5), output_dir=tmp_path)
