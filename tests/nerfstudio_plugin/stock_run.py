@@ -75,7 +75,7 @@ def write_dataset(
 
     Args:
         masks: with a mask per image that is 0 in its left quarter.
-        channels: 3: JPEG without loss of size, 4: PNG with an alpha channel that is 0 in the right quarter.
+        channels: 3: JPEG, 4: PNG with an alpha channel that is 0 in the right quarter.
         halved: also with images of half the size in images_2/, as ns-process-data makes them.
     """
     (folder / "images").mkdir(parents=True)
