@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,9 @@ def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
     assert set(range(1, 14)) <= set(seen.tolist())
     here, there = (torch.stack([c.world_to_camera.inverse()[:3, 3] for c in x]) for x in (held_out, demo_cameras()))
     assert torch.cdist(here, there).min() > 0.15
+    sizes = [(len(cameras), cameras[0].width, cameras[0].height) for cameras in (demo_cameras(), held_out_cameras())]
+    assert sizes == [(24, 400, 300), (4, 400, 300)]
+    assert signature(demo_room).parameters["num_gaussians"].default == 45_000
     empty = DemoRoom(room.scene, room.colors, torch.full_like(room.labels, -1), room.names)
     assert not view_labels(empty, held_out[0]).any()
 

@@ -69,8 +69,14 @@ def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPa
     return train
 
 
-def test_the_run_is_lifted_in_place(train: Callable[..., StockRun], registered: None, module: Any) -> None:
+def test_the_run_is_lifted_in_place(
+    train: Callable[..., StockRun], workspace: Path, registered: None, module: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turned, exif = workspace / "scene" / "images" / "002.jpg", Image.Exif()
+    exif[0x0112] = 6
+    Image.open(turned).save(turned, exif=exif)
     trained = train("whole", queries=("red", "sky blue"))
+    assert "Warning: 1 of 9 photographs carry an EXIF rotation" in capsys.readouterr().out
     run_dir = trained.config.parent
     assert sorted(p.name for p in run_dir.iterdir() if not p.name.startswith("events")) == [
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",

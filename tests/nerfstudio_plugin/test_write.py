@@ -143,14 +143,13 @@ def test_a_full_disk_is_an_os_error(copied: Path, field: SemanticField, monkeypa
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # what is imported now would be cut off in Python's cache
     source = opened(copied)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for limit in (500, 4000):  # the first file, the checkpoint
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-        try:
-            with pytest.raises(OSError, match=r"cannot be written|too large"):
-                write(source, field, timestamp="now")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        assert os.listdir(source.runs_dir / "scene" / "normlift") == []
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, hard))  # in the checkpoint
+    try:
+        with pytest.raises(OSError, match=r"cannot be written|too large"):
+            write(source, field, timestamp="now")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert os.listdir(source.runs_dir / "scene" / "normlift") == []
 
 
 def test_a_field_of_another_run_is_refused(copied: Path, stock: StockRun, field: SemanticField) -> None:
@@ -214,9 +213,8 @@ def test_of_two_lifts_with_the_same_timestamp_one_is_refused(copied: Path, field
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exchanged", [True, False])
 def test_a_lift_that_is_killed_while_it_replaces_a_run_loses_nothing(
-    copied: Path, field: SemanticField, exchanged: bool, monkeypatch: pytest.MonkeyPatch
+    copied: Path, field: SemanticField, monkeypatch
 ) -> None:
     """At every 15th access to the disk, and at each one around the moment when the new run takes its place; the command
     that opens the run completes what was under way."""
@@ -225,8 +223,7 @@ def test_a_lift_that_is_killed_while_it_replaces_a_run_loses_nothing(
     source = opened(copied)
     run_dir = write(source, field, question=asking("old"), timestamp="now")
     (run_dir.parent / ".cache" / "features").mkdir(parents=True)
-    if not exchanged:
-        monkeypatch.setattr(atomic, "_rename", lambda *_: False)
+    monkeypatch.setattr(atomic, "_rename", lambda *_: False)  # where a system cannot exchange two folders
 
     def lift() -> None:
         write(source, field, question=asking("new"), timestamp="now", overwrite=True)
@@ -244,7 +241,7 @@ def test_a_lift_that_is_killed_while_it_replaces_a_run_loses_nothing(
         else:
             step += 15 if swapped == 0 else 1 if step < swapped else 5
     assert set(seen) == {"old", "new"}
-    assert (gone == 0) == exchanged
+    assert gone > 0
     lift()
     assert sorted(os.listdir(run_dir.parent)) == [".cache", "now"]
 
