@@ -116,13 +116,9 @@ def set_up(config: Path) -> Any:
     return eval_setup(config, update_config_callback=lambda loaded: rerooted(loaded, config))[1]
 
 
-def lifted_field(run: NerfstudioScene, views: int | None = None) -> SemanticField:
-    """A field of a run: the left half of every image shows one object, the right half another.
-
-    Args:
-        views: lift that many, spread over all; None: all.
-    """
-    cameras = run.train.cameras[:: 1 if views is None else len(run.train) // views]
+def lifted_field(run: NerfstudioScene) -> SemanticField:
+    """A field of a run: the left half of every image shows one object, the right half another."""
+    cameras = run.train.cameras
     labels = [(torch.arange(c.width) >= c.width // 2).int().expand(c.height, c.width) for c in cameras]
     evidence = rasterize_evidence(run.gaussians, cameras, labels, rasterize_mode=run.rasterize_mode)
     features = torch.eye(8)[:2].repeat(len(cameras), 1)

@@ -173,9 +173,7 @@ def test_values_of_other_types_and_ranges_are_named(tmp_path: Path, texts: tuple
     assert "sh_degree" in refusal(tmp_path, re.sub(r"sh_degree: \d", "sh_degree: 9", texts[1]))
 
 
-def test_keys_that_are_missing_are_named_and_those_that_an_older_version_lacks_are_not_missed(
-    tmp_path: Path, texts: tuple[str, str]
-) -> None:
+def test_missing_keys_are_named_unless_an_older_version_lacks_them(tmp_path: Path, texts: tuple[str, str]) -> None:
     text = texts[0]
     for key in ("  datamanager", "  model", "viewer", "machine", "optimizers"):
         block = re.search(rf"^{key}:.*\n((?:{' ' * (len(key) - len(key.lstrip()) + 1)}.*\n)*)", text, re.MULTILINE)

@@ -10,7 +10,7 @@ import torch
 
 from benchmarks.captures import SHARED
 from normlift_ns.raster.rasterize import render_picture
-from tests.nerfstudio_plugin.conftest import field_of, lifted_field, opened, set_up, write
+from tests.nerfstudio_plugin.conftest import opened
 
 pytestmark = pytest.mark.slow
 
@@ -42,16 +42,3 @@ def test_the_run_is_loaded_whole(capture: Path, tmp_path: Path, monkeypatch: pyt
     views = [run.train[i] for i in range(0, len(run.train), 9)]
     measured = [_psnr(render_picture(run, view.camera), view.image) for view in views]
     assert abs(np.mean(measured) - EXPECTED[name]["psnr"]) < 0.9
-
-
-@pytest.mark.parametrize("capture", ["tabletop"], indirect=True)
-def test_a_lift_is_written_and_loaded_by_stock_nerfstudio(capture: Path, tmp_path: Path, registered: None) -> None:
-    run = opened(capture)
-    run_dir = write(run, lifted_field(run, views=5), output_dir=tmp_path)
-    pipeline = set_up(run_dir / "config.yml")
-    assert torch.equal(pipeline.model.means, run.gaussians.means)
-    assert torch.equal(field_of(opened(run_dir / "config.yml")).source, pipeline.model.field.source)
-    camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[0]
-    outputs = pipeline.model.get_outputs_for_camera(camera)
-    assert _psnr(outputs["rgb"] * 255, batch["image"]) > 25
-    assert 0.1 < float(outputs["reliability"].mean()) < 1

@@ -285,9 +285,7 @@ def _pretend_lpips(monkeypatch: pytest.MonkeyPatch, replacement: Any) -> None:
     monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", replacement)
 
 
-def test_loading_builds_no_lpips_reads_no_seed_points_and_makes_no_gaussians_of_chance(
-    stock_lifted: Path, registered: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_loading_builds_no_lpips_and_reads_no_seed_points(stock_lifted: Path, registered: None, monkeypatch) -> None:
     from nerfstudio.models.splatfacto import SplatfactoModel  # noqa: PLC0415
 
     def fail(*args, **kwargs) -> None:
@@ -325,9 +323,7 @@ def test_eval_with_lpips(pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> None
     assert not any("lpips" in name for name in pipeline.state_dict())
 
 
-def test_a_stock_checkpoint_loads_whole_and_a_field_of_other_gaussians_does_not(
-    stock_lifted: Path, stock: StockRun
-) -> None:
+def test_a_stock_checkpoint_loads_and_a_field_of_other_gaussians_does_not(stock_lifted: Path, stock: StockRun) -> None:
     from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig  # noqa: PLC0415
 
     how: Any = {"scene_box": None, "num_train_data": 9}

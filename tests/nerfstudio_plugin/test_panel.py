@@ -167,9 +167,7 @@ def until(true: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def test_the_panel_is_the_first_tab_and_shows_the_stored_question_without_an_encoder(
-    pipeline: Any, viewer: Any
-) -> None:
+def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: Any, viewer: Any) -> None:
     from nerfstudio.viewer.utils import parse_object  # noqa: PLC0415
     from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement  # noqa: PLC0415
 
@@ -439,7 +437,7 @@ def test_floaters_are_selected(panel: Any, pipeline: Any, monkeypatch: pytest.Mo
         assert torch.equal(chosen(pipeline), expected)
 
 
-def test_why_shows_the_images_says_what_is_missing_and_drops_what_is_stale(
+def test_why_shows_images_or_what_is_missing_and_drops_what_is_stale(
     stock: StockRun, tmp_path: Path, panel: Any
 ) -> None:
     import normlift_ns as nl  # noqa: PLC0415

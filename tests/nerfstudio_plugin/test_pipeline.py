@@ -136,9 +136,7 @@ def test_a_failing_lift_leaves_the_training_whole(
         field_of(run)
 
 
-def test_mistakes_show_before_the_training(
-    train: Callable[..., StockRun], workspace: Path, methods: dict[str, Any], module: Any, monkeypatch
-) -> None:
+def test_mistakes_show_before_the_training(train: Any, workspace: Path, methods: Any, module: Any, monkeypatch) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: PLC0415
 
     class Other(NerfstudioDataParserConfig):
@@ -167,9 +165,7 @@ def test_mistakes_show_before_the_training(
         train("palette")
 
 
-def test_the_features_of_lerf_ovs_lie_in_the_scene(
-    train: Callable[..., StockRun], workspace: Path, methods: dict[str, Any], tmp_path: Path
-) -> None:
+def test_the_features_of_lerf_ovs_lie_in_the_scene(train: Any, workspace: Path, methods: Any, tmp_path: Path) -> None:
     options = methods["normlift-lerf-ovs"].pipeline.source
     assert options == SourceOptions(features="langsplat")
     with pytest.raises(FileNotFoundError) as caught:

@@ -29,9 +29,7 @@ def asking(text: str) -> Question:
     return Question((text,), torch.eye(8)[:1])
 
 
-def test_a_lifted_run_is_its_source_with_another_method_and_model(
-    copied: Path, field: SemanticField, tmp_path: Path
-) -> None:
+def test_a_lifted_run_is_its_source_with_another_model(copied: Path, field: SemanticField, tmp_path: Path) -> None:
     source, before = opened(copied), copied.read_bytes()
     run_dir = write(source, field, timestamp="now", question=asking("a"))
     assert run_dir == tmp_path / "moved" / "outputs" / "scene" / "normlift" / "now"
@@ -61,7 +59,7 @@ def test_a_lifted_run_is_its_source_with_another_method_and_model(
     assert stored.pipeline.datamanager.dataparser.load_3D_points
 
 
-def test_stock_nerfstudio_and_our_loader_read_it_and_it_can_be_lifted_again(
+def test_it_is_read_and_can_be_lifted_again(
     copied: Path, field: SemanticField, tmp_path: Path, registered: None
 ) -> None:
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
@@ -84,9 +82,7 @@ def test_stock_nerfstudio_and_our_loader_read_it_and_it_can_be_lifted_again(
     assert torch.equal(field_of(opened(second / "config.yml")).source, field.source)
 
 
-def test_with_an_output_directory_elsewhere_all_paths_become_absolute(
-    copied: Path, field: SemanticField, tmp_path: Path, registered: None
-) -> None:
+def test_paths_become_absolute_elsewhere(copied: Path, field: SemanticField, tmp_path: Path, registered: None) -> None:
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
 
     data, source = tmp_path / "moved" / "scene", opened(copied)
@@ -120,9 +116,7 @@ def test_an_existing_directory_is_kept_unless_told(copied: Path, field: Semantic
     assert torch.equal(opened(run_dir / "config.yml").gaussians.means, source.gaussians.means)
 
 
-def test_a_failure_leaves_nothing_and_keeps_what_was_there(
-    copied: Path, field: SemanticField, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_leaves_nothing_and_keeps_what_was_there(copied: Path, field: SemanticField, monkeypatch) -> None:
     source = opened(copied)
     run_dir = write(source, field, timestamp="now")
     for failure in (OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()):
@@ -213,9 +207,7 @@ def test_of_two_lifts_with_the_same_timestamp_one_is_refused(copied: Path, field
 
 
 @pytest.mark.slow
-def test_a_lift_that_is_killed_while_it_replaces_a_run_loses_nothing(
-    copied: Path, field: SemanticField, monkeypatch
-) -> None:
+def test_a_lift_killed_while_it_replaces_a_run_loses_nothing(copied: Path, field: SemanticField, monkeypatch) -> None:
     """At every 15th access to the disk, and at each one around the moment when the new run takes its place; the command
     that opens the run completes what was under way."""
     from normlift_ns import open_run  # noqa: PLC0415
