@@ -63,8 +63,7 @@ def test_run_is_complete(run: Path, small: DemoRoom):
     assert (run.parent / "dataparser_transforms.json").is_file()
     [path] = (run.parent / "nerfstudio_models").iterdir()
     assert path.name == "step-000000000.ckpt"
-    with pytest.raises(Exception, match="numpy"):  # as for every stock checkpoint
-        torch.load(path, weights_only=True)
+    assert b"numpy" in path.read_bytes()  # scalars, as in every stock checkpoint
     checkpoint = torch.load(path, weights_only=False)
     assert set(checkpoint) == {"step", "pipeline", "optimizers", "schedulers", "scalers"}
     groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities"}

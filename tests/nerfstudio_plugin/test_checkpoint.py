@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import pickle
 import random
 import zipfile
 from pathlib import Path
@@ -21,8 +20,9 @@ def full(stock: StockRun) -> Path:
 
 
 def test_a_full_stock_checkpoint_is_read(stock: StockRun, full: Path) -> None:
-    with pytest.raises(pickle.UnpicklingError, match="numpy"):  # it does hold numpy scalars
-        torch.load(full, weights_only=True)
+    with zipfile.ZipFile(full) as content:
+        (name,) = (name for name in content.namelist() if name.endswith("data.pkl"))
+        assert b"numpy" in content.read(name)  # it does hold numpy scalars
     stored = torch.load(full, weights_only=False)
     assert all(len(optimizer["state"]) > 0 for optimizer in stored["optimizers"].values())
     assert any(name.startswith("_model.lpips.") for name in stored["pipeline"])

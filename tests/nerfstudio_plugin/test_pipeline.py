@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ def methods() -> dict[str, Any]:
 
 
 @pytest.fixture
-def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., StockRun]:
+def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable]:
     """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
     monkeypatch.setattr("normlift_ns.raster.gsplat.composite", None)  # splatfacto's is replaced, ours not wanted
 
@@ -66,7 +66,12 @@ def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPa
         how: dict[str, Any] = {"configure": configure, "prepare": prepare, "steps": steps, "timestamp": timestamp}
         return train_splatfacto(workspace, Path("scene"), method=methods[method], **how)
 
-    return train
+    serialization: Any = torch.serialization
+    allowed = serialization.get_safe_globals() if hasattr(serialization, "get_safe_globals") else None
+    yield train
+    if allowed is not None:  # our pipeline has allowed numpy's numbers in the whole process
+        serialization.clear_safe_globals()
+        serialization.add_safe_globals(allowed)
 
 
 def test_the_run_is_lifted_in_place(
