@@ -1,13 +1,24 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import pytest
 
-from normlift_ns.demo import DemoRoom, demo_room
+if TYPE_CHECKING:
+    from normlift_ns.demo import DemoRoom
 
 
 @pytest.fixture(scope="session")
 def room() -> DemoRoom:
-    return demo_room(20_000)
+    """The room that people see, with few Gaussians."""
+    from normlift_ns.demo import demo_room  # noqa: PLC0415
+
+    return demo_room(6000)
 
 
 @pytest.fixture(scope="session")
 def small() -> DemoRoom:
-    return demo_room(2000)
+    """A room that is built in a moment."""
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+
+    return plain_room(2000)

@@ -1,37 +1,60 @@
+from __future__ import annotations
+
+from inspect import signature
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from matplotlib.colors import XKCD_COLORS, to_rgb
-from skimage.color import rgb2lab
 
-from benchmarks.plain_room import plain_room
 from normlift_ns import lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras, view_image, view_labels
-from normlift_ns.encoders.texts.colours import ColourTexts, shading_coordinates
 
 
-def own_colors(room: DemoRoom) -> np.ndarray:
-    """Of the classes, as the colour encoder compares them."""
-    return shading_coordinates(rgb2lab(np.array([to_rgb(f"xkcd:{name}") for name in room.names])))
+@pytest.fixture(scope="module")
+def coordinates() -> Any:
+    """Turns colors into what the color encoder compares: `coordinates(rgb)`."""
+    from skimage.color import rgb2lab  # noqa: PLC0415
+
+    from normlift_ns.encoders.texts.colours import shading_coordinates  # noqa: PLC0415
+
+    return lambda rgb: shading_coordinates(rgb2lab(rgb))
 
 
-def test_same_arguments_same_room():
-    one, two, other = plain_room(2000), plain_room(2000, seed=0), plain_room(2000, seed=4)  # built as the demo's is
+@pytest.fixture(scope="module")
+def own(room: DemoRoom, coordinates: Any) -> np.ndarray:
+    """Coordinates of the colors that the classes are named after."""
+    from matplotlib.colors import to_rgb  # noqa: PLC0415
+
+    return coordinates(np.array([to_rgb(f"xkcd:{name}") for name in room.names]))
+
+
+@pytest.fixture(scope="module")
+def labels(room: DemoRoom) -> list[torch.Tensor]:
+    """True classes in the views of `demo_cameras(6, 160, 120)`."""
+    return [view_labels(room, camera) for camera in demo_cameras(6, 160, 120)]
+
+
+def test_same_arguments_same_room(small: DemoRoom):
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415 (built as the demo's is, but faster)
+
+    again, other = plain_room(2000, seed=0), plain_room(2000, seed=4)
     for name in ("means", "quats", "scales", "opacities"):
-        assert torch.equal(getattr(one.scene, name), getattr(two.scene, name))
-    assert torch.equal(one.colors, two.colors)
-    assert torch.equal(one.labels, two.labels)
-    assert not torch.equal(one.scene.means, other.scene.means)
+        assert torch.equal(getattr(small.scene, name), getattr(again.scene, name)), name
+    assert torch.equal(small.colors, again.colors)
+    assert torch.equal(small.labels, again.labels)
+    assert not torch.equal(small.scene.means, other.scene.means)
+    with pytest.raises(ValueError, match=r"2000.*1999"):
+        demo_room(1999)
 
 
 def test_contents(room: DemoRoom):
-    assert len(room.scene) == 20_000
-    assert tuple(room.colors.shape) == (20_000, 3)
+    assert len(room.scene) == len(room.colors) == 6000
     assert bool(room.scene.drawable.all())
     counts = torch.bincount(room.labels + 1)
     assert len(counts) == len(room.names) + 1 == 14
-    assert counts[0] == 400  # floaters
-    assert counts[1:].min() > 200
+    assert counts[0] == 120  # floaters
+    assert counts[1:].min() > 60
     assert room.colors.min() >= 0 and room.colors.max() <= 1
     never_drawn = (room.scene.opacities < 1 / 255).float().mean().item()
     assert 0.02 < never_drawn < 0.06
@@ -46,25 +69,26 @@ def test_flat_gaussians_lie_along_the_surface(room: DemoRoom):
     assert (room.scene.scales[floor, 2] < 0.2 * room.scene.scales[floor, 0]).float().mean() > 0.9
 
 
-def test_names_are_distinct_colours_of_the_survey(room: DemoRoom):
-    assert all(f"xkcd:{name}" in XKCD_COLORS for name in room.names)
-    lab = own_colors(room)
-    distance = np.linalg.norm(lab[:, None] - lab, axis=2) + np.diag(np.full(len(lab), np.inf))
-    assert distance.min() > 25
-
-
 def test_surfaces_are_opaque(room: DemoRoom):
-    for camera in demo_cameras(4, 160, 120):
+    for camera in demo_cameras(4, 80, 60):
         _, alpha = render(room.scene, camera, room.colors)
         assert alpha.median() > 0.98
         assert alpha.min() > 0.7
 
 
-def test_every_thing_is_seen_in_its_own_colour(room: DemoRoom):
-    cameras = demo_cameras(8, 240, 180)
-    pixels = np.concatenate([view_image(room, camera).reshape(-1, 3) for camera in cameras]) / 255
-    truth = np.concatenate([view_labels(room, camera).flatten() for camera in cameras])
-    seen, own = shading_coordinates(rgb2lab(pixels)), own_colors(room)
+def test_names_are_distinct_colors_of_the_survey(room: DemoRoom, own: np.ndarray):
+    from normlift_ns.encoders.texts.colours import ColourTexts  # noqa: PLC0415
+
+    distance = np.linalg.norm(own[:, None] - own, axis=2) + np.diag(np.full(len(own), np.inf))
+    assert distance.min() > 25
+    vectors = ColourTexts().rows(room.names)  # and the encoder tells them apart
+    assert (vectors @ vectors.T - np.eye(len(vectors))).max() < 0.72
+
+
+def test_every_thing_is_seen_in_its_own_color(room: DemoRoom, labels: list[torch.Tensor], own, coordinates):
+    cameras = demo_cameras(6, 160, 120)
+    seen = coordinates(np.concatenate([view_image(room, camera).reshape(-1, 3) for camera in cameras]) / 255)
+    truth = torch.cat([view.flatten() for view in labels]).numpy()
     nearest = np.linalg.norm(seen[:, None] - own, axis=2).argmin(axis=1)
     for index, name in enumerate(room.names):
         shown = truth == index + 1
@@ -72,20 +96,16 @@ def test_every_thing_is_seen_in_its_own_colour(room: DemoRoom):
         assert distance.argmin() == index, name
         assert distance[index] < 20, name
         assert (nearest[shown] == index).mean() > 0.7, name
-        per_view = shown.reshape(len(cameras), -1).sum(axis=1)
-        assert (per_view > 100).sum() >= 3, name
+        assert (shown.reshape(len(cameras), -1).sum(axis=1) > 40).sum() >= 3, name
 
 
 def test_things_have_texture_and_shadow(room: DemoRoom):
+    from skimage.color import rgb2lab  # noqa: PLC0415
+
     lightness = rgb2lab(room.colors.numpy())[:, 0]
     for index, name in enumerate(room.names):
         mine = lightness[(room.labels == index).numpy()]
         assert np.quantile(mine, 0.9) - np.quantile(mine, 0.1) > 5, name
-
-
-def test_the_colour_encoder_tells_the_names_apart(room: DemoRoom):
-    vectors = ColourTexts().rows(room.names)
-    assert (vectors @ vectors.T - np.eye(len(vectors))).max() < 0.72
 
 
 def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
@@ -94,32 +114,31 @@ def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
     assert set(range(1, 14)) <= set(seen.tolist())
     here, there = (torch.stack([c.world_to_camera.inverse()[:3, 3] for c in x]) for x in (held_out, demo_cameras()))
     assert torch.cdist(here, there).min() > 0.15
-
-
-def test_labels_are_zero_where_nothing_is(room: DemoRoom):
+    sizes = [(len(cameras), cameras[0].width, cameras[0].height) for cameras in (demo_cameras(), held_out_cameras())]
+    assert sizes == [(24, 400, 300), (4, 400, 300)]
+    assert signature(demo_room).parameters["num_gaussians"].default == 45_000
     empty = DemoRoom(room.scene, room.colors, torch.full_like(room.labels, -1), room.names)
-    assert not view_labels(empty, demo_cameras(1, 64, 48)[0]).any()
+    assert not view_labels(empty, held_out[0]).any()
 
 
-def test_lift_finds_the_classes_and_refinement_repairs(room: DemoRoom):
-    cameras, generator = demo_cameras(9, 240, 180), torch.Generator().manual_seed(0)
-    labels = [view_labels(room, camera).long() - 1 for camera in cameras]
+def test_lift_finds_the_classes_and_refinement_repairs(room: DemoRoom, labels: list[torch.Tensor]):
+    generator = torch.Generator().manual_seed(0)
     classes = torch.nn.functional.normalize(torch.randn(len(room.names), 32, generator=generator), dim=1)
-    noise = torch.randn(len(cameras), *classes.shape, generator=generator) / 32**0.5
-    features = torch.nn.functional.normalize(classes + 0.5 * noise, dim=2).flatten(0, 1)
-    evidence = rasterize_evidence(room.scene, cameras, labels, num_regions=[len(classes)] * len(cameras))
+    noise = torch.randn(len(labels), *classes.shape, generator=generator) / 32**0.5
+    features = torch.nn.functional.normalize(classes + 1.5 * noise, dim=2).flatten(0, 1)
+    regions = [view.long() - 1 for view in labels]
+    counts = [len(classes)] * len(labels)
+    evidence = rasterize_evidence(room.scene, demo_cameras(6, 160, 120), regions, num_regions=counts)
     lifted = lift(evidence, features)
-    directions = lifted.directions()
-    neighbors = nearest_neighbors(room.scene.means, 36)
-    own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
-    source = refine(room.scene.means, directions, reliability, own=own, neighbors=neighbors).long()
+    directions, scalars = lifted.directions(), lifted.scalars
+    how = {"own": scalars.own_evidence, "neighbors": nearest_neighbors(room.scene.means, 36)}
+    source = refine(room.scene.means, directions, scalars.reliability, **how).long()
     before, after = mean_iou(room, directions @ classes.T), mean_iou(room, directions[source] @ classes.T)
     print(f"mIoU {before:.3f}, refined {after:.3f}")
-    assert 0.8 < before < 0.9
-    assert after > before + 0.005
-    assert after > 0.84
+    assert 0.65 < before < 0.75
+    assert after > before + 0.015
     known = room.labels >= 0
-    assert 0.02 < (lifted.scalars.norm[known] == 0).float().mean() < 0.08
+    assert 0.02 < (scalars.norm[known] == 0).float().mean() < 0.08
 
 
 def mean_iou(room: DemoRoom, scores: torch.Tensor) -> float:
@@ -127,8 +146,3 @@ def mean_iou(room: DemoRoom, scores: torch.Tensor) -> float:
     predicted = torch.where(scores.any(dim=1), scores.argmax(dim=1), -1)[known]
     pairs = [(predicted == c, room.labels[known] == c) for c in range(len(room.names))]
     return float(np.mean([((p & t).sum() / (p | t).sum()).item() for p, t in pairs]))
-
-
-def test_too_small_a_room_is_refused():
-    with pytest.raises(ValueError, match=r"at least 2000.*got 1999"):
-        demo_room(1999)

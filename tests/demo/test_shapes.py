@@ -5,17 +5,21 @@ import pytest
 
 from normlift_ns.demo import shapes
 
-SOLIDS = {
-    "sphere": (shapes.sphere(0.5), math.pi),
-    "box": (shapes.box(1.0, 0.8, 0.6), 2 * (0.8 + 0.6 + 0.48)),
-    "cylinder": (shapes.cone(0.3, 0.3, 1.0), math.pi * (0.6 + 2 * 0.09)),
-    "frustum": (shapes.cone(0.4, 0.1, 0.4), math.pi * (0.5 * 0.5 + 0.16 + 0.01)),
-    "torus": (shapes.torus(0.5, 0.1), 4 * math.pi**2 * 0.05),
-    "capsule": (shapes.capsule((0, 0, 0), (0.5, 0, 0), 0.2), math.pi * 0.4 * 0.9),
-    "moved": (shapes.place(shapes.box(1.0, 0.8, 0.6), 0.1, -0.2, 0.05, 30), 2 * (0.8 + 0.6 + 0.48)),
-    "apart": (shapes.union(shapes.sphere(0.25), shapes.place(shapes.sphere(0.25), 0.6, 0, 0)), math.pi / 2),
-}
 LOW, HIGH = np.full(3, -1.0), np.full(3, 1.0)
+
+
+def solids() -> dict[str, tuple[shapes.Distance, float]]:
+    """Shapes, and their surfaces."""
+    return {
+        "sphere": (shapes.sphere(0.5), math.pi),
+        "box": (shapes.box(1.0, 0.8, 0.6), 2 * (0.8 + 0.6 + 0.48)),
+        "cylinder": (shapes.cone(0.3, 0.3, 1.0), math.pi * (0.6 + 2 * 0.09)),
+        "frustum": (shapes.cone(0.4, 0.1, 0.4), math.pi * (0.5 * 0.5 + 0.16 + 0.01)),
+        "torus": (shapes.torus(0.5, 0.1), 4 * math.pi**2 * 0.05),
+        "capsule": (shapes.capsule((0, 0, 0), (0.5, 0, 0), 0.2), math.pi * 0.4 * 0.9),
+        "moved": (shapes.place(shapes.box(1.0, 0.8, 0.6), 0.1, -0.2, 0.05, 30), 2 * (0.8 + 0.6 + 0.48)),
+        "apart": (shapes.union(shapes.sphere(0.25), shapes.place(shapes.sphere(0.25), 0.6, 0, 0)), math.pi / 2),
+    }
 
 
 def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
@@ -23,23 +27,21 @@ def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
     return shapes.projected(shape, near, LOW, HIGH)
 
 
-@pytest.mark.parametrize("name", SOLIDS)
-def test_surface_points_are_on_the_surface_and_even(name: str):
-    shape, area = SOLIDS[name]
-    points = sampled(shape, 5000)
-    assert np.abs(shape(points)).max() < shapes.ON_SURFACE
-    assert len(points) == pytest.approx(5000 * area, rel=0.05)
+def test_surface_points_are_on_the_surface_and_even():
+    for name, (shape, area) in solids().items():
+        points = sampled(shape, 5000)
+        assert np.abs(shape(points)).max() < shapes.ON_SURFACE, name
+        assert len(points) == pytest.approx(5000 * area, rel=0.05), name
 
 
-@pytest.mark.parametrize("name", SOLIDS)
-def test_normals_point_outward(name: str):
-    shape, _ = SOLIDS[name]
-    points = sampled(shape, 500)
-    normals = shapes.normals(shape, points)
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
-    outward, inward = shape(points + 0.01 * normals), shape(points - 0.01 * normals)
-    assert (outward > 0.009).mean() > 0.99
-    assert (inward < -0.009).mean() > 0.85  # not near sharp edges
+def test_normals_point_outward():
+    for name, (shape, _) in solids().items():
+        points = sampled(shape, 500)
+        normals = shapes.normals(shape, points)
+        assert np.linalg.norm(normals, axis=1) == pytest.approx(1), name
+        outward, inward = shape(points + 0.01 * normals), shape(points - 0.01 * normals)
+        assert (outward > 0.009).mean() > 0.99, name
+        assert (inward < -0.009).mean() > 0.85, name  # not near sharp edges
 
 
 def test_distances():

@@ -1,53 +1,87 @@
-"""Runs that the plugin's tests share. Importing nerfstudio takes 20 s, so all of them belong in one process."""
+"""Runs that the plugin's tests share."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from nerfstudio.configs.method_configs import all_methods
 
 from benchmarks.captures import SHARED
 from normlift_ns import SemanticField, lift, rasterize_evidence
-from normlift_ns.method_configs.normlift import normlift_method
+from normlift_ns.options import SourceOptions
+from normlift_ns.question import Question
 from normlift_ns.runs.files import load_field, run_directory
 from normlift_ns.runs.write import write_run
 from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
+from normlift_ns.text_encoders import ENCODER_KEYS
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
 
 
-@pytest.fixture(scope="session")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The directory of a user: a dataset in scene/, runs below outputs/. Tests that change files take `copied`."""
-    folder = tmp_path_factory.mktemp("user")
-    write_dataset(folder / "scene")
-    return folder
+@pytest.fixture(scope="session", autouse=True)
+def _imported(nerfstudio: Any) -> None:
+    """Imports nerfstudio the fast way, before anything else imports it."""
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """The directory of a user, with a dataset in scene/."""
+    write_dataset(tmp_path / "user" / "scene")
+    return tmp_path / "user"
 
 
 @pytest.fixture(scope="session")
-def stock(workspace: Path) -> StockRun:
-    """A stock run with view-dependent colours."""
+def stock(made_once: Callable[..., Path], _imported: None) -> StockRun:
+    """A stock run with view-dependent colors; tests that change its files take `copied`."""
 
-    def prepare(trainer) -> None:
+    def prepare(trainer: Any) -> None:
         rest = trainer.pipeline.model.features_rest.data
         rest.copy_(0.2 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(0)))
 
-    return train_splatfacto(workspace, Path("scene"), prepare=prepare, steps=3)
+    def make(folder: Path) -> None:
+        write_dataset(folder / "scene")
+        train_splatfacto(folder, Path("scene"), prepare=prepare, steps=3)
+
+    folder = made_once("stock", make)
+    return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
 
 
 @pytest.fixture
 def copied(stock: StockRun, tmp_path: Path) -> Path:
     """config.yml of a copy of the stock run, in a copy of its workspace."""
-    shutil.copytree(stock.workspace, tmp_path / "moved", ignore=shutil.ignore_patterns("normlift"))
+    shutil.copytree(stock.workspace, tmp_path / "moved")
     return tmp_path / "moved" / stock.config.relative_to(stock.workspace)
 
 
+@pytest.fixture(scope="session")
+def field(stock: StockRun) -> SemanticField:
+    """A field of the stock run."""
+    return lifted_field(opened(stock.config))
+
+
+@pytest.fixture(scope="session")
+def stock_lifted(stock: StockRun, field: SemanticField, made_once: Callable[..., Path]) -> Path:
+    """config.yml of a lifted copy of the stock run with two stored queries."""
+    encoder = {key: getattr(SourceOptions(encoder="colour"), key) for key in ENCODER_KEYS}
+    colored = replace(field, manifest={**field.manifest, "encoder": encoder})
+    question = Question(("left", "right"), torch.eye(8)[:2])
+
+    def make(folder: Path) -> None:
+        write(opened(stock.config), colored, question=question, output_dir=folder, timestamp="run")
+
+    return made_once("stock-lifted", make) / "scene" / "normlift" / "run" / "config.yml"
+
+
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+def registered(nerfstudio: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Method normlift in nerfstudio's list, as the entry point of the installed package puts it there."""
-    monkeypatch.setitem(all_methods, "normlift", normlift_method.config)
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
 
 
 @pytest.fixture(params=["fox", "tabletop"])
@@ -59,13 +93,32 @@ def capture(request: pytest.FixtureRequest) -> Path:
     return config
 
 
-def lifted_field(run: NerfstudioScene, views: int | None = None) -> SemanticField:
-    """A field of a run: the left half of every photograph shows one thing, the right half another.
+def opened(config: Path, **how: Any) -> Any:
+    """The scene of a run."""
+    from normlift_ns.front_door import open_scene  # noqa: PLC0415
 
-    Args:
-        views: lift that many, spread over all; None: all.
-    """
-    cameras = run.train.cameras[:: 1 if views is None else len(run.train) // views]
+    return open_scene(config, **how)
+
+
+def read(path: Path) -> Any:
+    """config.yml in nerfstudio's classes."""
+    from normlift_ns.nerfstudio_plugin.config import read_config  # noqa: PLC0415
+
+    return read_config(path)
+
+
+def set_up(config: Path) -> Any:
+    """The pipeline that stock nerfstudio's `eval_setup` makes of a run, from any directory; takes `registered`."""
+    from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
+
+    from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
+
+    return eval_setup(config, update_config_callback=lambda loaded: rerooted(loaded, config))[1]
+
+
+def lifted_field(run: NerfstudioScene) -> SemanticField:
+    """A field of a run: the left half of every image shows one object, the right half another."""
+    cameras = run.train.cameras
     labels = [(torch.arange(c.width) >= c.width // 2).int().expand(c.height, c.width) for c in cameras]
     evidence = rasterize_evidence(run.gaussians, cameras, labels, rasterize_mode=run.rasterize_mode)
     features = torch.eye(8)[:2].repeat(len(cameras), 1)
@@ -78,7 +131,7 @@ def write(
     *,
     output_dir: Path | None = None,
     timestamp: str | None = None,
-    **rest,
+    **rest: Any,
 ) -> Path:
     """Writes a lifted run where ns-normlift would; returns its directory."""
     run_dir = run_directory(output_dir or scene.runs_dir, scene.name, timestamp)

@@ -1,6 +1,6 @@
-"""A splatfacto run as `ns-train splatfacto` writes it, made by nerfstudio's own Trainer on a CPU in seconds.
+"""A splatfacto run as `ns-train splatfacto` writes it, made by nerfstudio's own Trainer on a CPU in a second.
 
-Recipe. `write_dataset` writes a nerfstudio dataset of small pictures with lens distortion and a seed point cloud.
+`write_dataset` writes a nerfstudio dataset of small images with lens distortion and a seed point cloud.
 `train_splatfacto` takes nerfstudio's registered configuration and runs `Trainer.setup()` and `Trainer.train()`; they
 write config.yml, dataparser_transforms.json and the checkpoint (optimizers, schedulers with numpy scalars, LPIPS).
 What splatfacto cannot do without a GPU, internet or system libraries is replaced while it trains (`splatfacto_on_cpu`):
@@ -21,15 +21,15 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import torch
-from nerfstudio.configs.method_configs import method_configs
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils import writer
+import yaml
 from PIL import Image
 from torch import Tensor
 
@@ -40,29 +40,43 @@ from normlift_ns.raster.projection import assign_tiles, project, to_world
 from normlift_ns.raster.settings import RasterSettings
 
 WIDTH, HEIGHT, FOCAL, K1 = 48, 36, 40.0, 0.06
-"""Of the pictures in the dataset, before undistortion."""
+"""Of the images in the dataset, before undistortion."""
 
 
-class StockRun(NamedTuple):
+@dataclass
+class StockRun:
     """What is left of a training."""
 
     workspace: Path
     """Its working directory."""
     config: Path
     """Its config.yml."""
-    trainer: Any
-    """nerfstudio's Trainer, with pipeline, model and datamanager."""
+    trainer: Any = None
+    """nerfstudio's Trainer; None if another process may have trained."""
+
+    @cached_property
+    def pipeline(self) -> Any:
+        """nerfstudio's pipeline with model and datamanager, of the training or as nerfstudio loads them."""
+        if self.trainer is not None:
+            return self.trainer.pipeline
+        with working_directory(self.workspace), splatfacto_on_cpu():
+            pipeline = yaml.load(self.config.read_text(), Loader=yaml.Loader).pipeline.setup(device="cpu")
+            (file,) = (self.config.parent / "nerfstudio_models").iterdir()
+            stored = torch.load(file, weights_only=False)
+            pipeline.load_pipeline(stored["pipeline"], stored["step"])
+            _ = pipeline.datamanager.cached_train  # undistorts images and cameras
+        return pipeline
 
 
 def write_dataset(
     folder: Path, *, count: int = 10, masks: bool = False, channels: int = 3, halved: bool = False
 ) -> None:
-    """Writes transforms.json, `count` pictures from a circle around the origin, and sparse_pc.ply.
+    """Writes transforms.json, `count` images from a circle around the origin, and sparse_pc.ply.
 
     Args:
-        masks: with a mask per picture that is 0 in its left quarter.
-        channels: 3: JPEG without loss of size, 4: PNG with an alpha channel that is 0 in the right quarter.
-        halved: also with pictures of half the size in images_2/, as ns-process-data makes them.
+        masks: with a mask per image that is 0 in its left quarter.
+        channels: 3: JPEG, 4: PNG with an alpha channel that is 0 in the right quarter.
+        halved: also with images of half the size in images_2/, as ns-process-data makes them.
     """
     (folder / "images").mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -118,26 +132,29 @@ def train_splatfacto(
     workspace: Path,
     data: Path,
     *,
-    method: str = "splatfacto",
+    method: Any = "splatfacto",
     timestamp: str = "run",
     steps: int = 1,
-    configure: Callable[[TrainerConfig], None] = lambda config: None,
-    prepare: Callable[[Trainer], None] = lambda trainer: None,
+    configure: Callable[[Any], object] = lambda config: None,
+    prepare: Callable[[Any], object] = lambda trainer: None,
 ) -> StockRun:
     """`ns-train METHOD --data DATA` in the directory `workspace`.
 
     Args:
         data: the dataset, relative to the workspace or absolute.
+        method: its name, or its configuration.
         configure: changes the configuration, like flags of ns-train.
         prepare: changes the Trainer between setup and training.
     """
-    config = deepcopy(method_configs[method])
-    assert isinstance(config, TrainerConfig)
+    from nerfstudio.configs.method_configs import method_configs  # noqa: PLC0415
+    from nerfstudio.utils import writer  # noqa: PLC0415
+
+    config: Any = deepcopy(method_configs[method] if isinstance(method, str) else method)
     config.machine.device_type = "cpu"
     config.timestamp = timestamp
     config.max_num_iterations = steps
     config.data = config.pipeline.datamanager.data = data
-    model: Any = config.pipeline.model
+    model = config.pipeline.model
     model.num_downscales = 0  # from the start at full resolution
     model.stop_split_at = 0  # neither densify nor cull
     configure(config)
