@@ -1,8 +1,8 @@
 """The refinement's variants and other methods on one damaged observation, as scores of every class.
 
 Classes need no [N, 512] array: u_j t = sum_s E_js F_s t / (W_j ||f_j||). Votes copy rows of these scores; linear
-averaging of directions averages them, up to the length, which no arg-max sees (`tests/research/test_accuracy.py` compares both
-with `refine_variant`).
+averaging of directions averages them, up to the length, which no arg-max sees (`tests/research/test_accuracy.py`
+compares both with `refine_variant`).
 """
 
 from __future__ import annotations
