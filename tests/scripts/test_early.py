@@ -55,6 +55,10 @@ def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
 COLOUR = ("--encoder", "colour")
 LIFT = [
     ("--encoder colour --beta nan", "--beta", "got nan"),
+    ("--encoder words", "'words'", "--encoder"),
+    ("--queries oragne", "oragne", "orange"),
+    ("--max-views 0", "--max-views must be at least 1, got 0"),
+    ("--tau 2", "--tau must be in -1..1", "got 2"),
     ("--threshold 0.5", "--threshold"),
     ("--device cuda:x:", "--device must be auto, cpu or cuda, got 'cuda:x:'"),
     ("--timestamp ../x", "'../x'", "name of a folder"),
