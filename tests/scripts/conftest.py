@@ -8,11 +8,15 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 
 from normlift_ns.scripts.shared import run_command
+from tests.conftest import import_nerfstudio
+
+if TYPE_CHECKING:
+    from normlift_ns.demo import DemoRoom
 
 SMALL = ("--encoder", "colour", "--k", "12")
 """Flags that lift the small demo room in a moment."""
@@ -70,9 +74,47 @@ def ended(
     return run
 
 
+@pytest.fixture(scope="session")
+def little_room() -> DemoRoom:
+    """The room of `little`."""
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+
+    return plain_room(3000)
+
+
+@pytest.fixture(scope="session")
+def little(little_room: DemoRoom, made_once: Any) -> Path:
+    """config.yml of a trained run with few Gaussians and 6 small photographs, for tests that lift or evaluate."""
+
+    def make(folder: Path) -> None:
+        import_nerfstudio()
+        from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+
+        write_capture(little_room, folder / "room", views=6, held_out=2, width=96, height=72)
+        write_splatfacto_run(little_room, folder / "room", folder / "outputs")
+
+    return next(made_once("little", make).glob("outputs/*/splatfacto/*/config.yml"))
+
+
+@pytest.fixture(scope="session")
+def little_lifted(little: Path, made_once: Any) -> Path:
+    """config.yml of a lifted run of it."""
+
+    def make(folder: Path) -> None:
+        import_nerfstudio()
+        from normlift_ns.scripts import lift  # noqa: PLC0415
+
+        with pytest.MonkeyPatch.context() as patch:
+            flags = ("--load-config", little, *QUICK, "--region-count", "300", "--timestamp", "t")
+            assert run_entry(patch, lift.entrypoint, *flags) == 0
+
+    made_once("little_lifted", make)
+    return little.parents[2] / "normlift" / "t" / "config.yml"
+
+
 @pytest.fixture
-def own(lifted: Path, tmp_path: Path) -> Path:
-    """config.yml of the trained run, in a copy of everything that the test may change; `lifted` is in it too."""
-    shutil.copytree(lifted.parents[4], tmp_path / "own")
+def own(little_lifted: Path, tmp_path: Path) -> Path:
+    """config.yml of `little`, in a copy of everything that the test may change; `little_lifted` is in it too."""
+    shutil.copytree(little_lifted.parents[4], tmp_path / "own")
     (config,) = (tmp_path / "own").glob("outputs/room/splatfacto/*/config.yml")
     return config

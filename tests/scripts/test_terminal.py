@@ -106,9 +106,9 @@ def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_
     assert str(tmp_path) in lines[1]  # one line, at the left, however long
 
 
-def test_the_next_command_is_a_line_of_its_own(trained: Path, monkeypatch, capsys, tmp_path: Path) -> None:
+def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys, tmp_path: Path) -> None:
     places = ("--output-dir", tmp_path / ("deep-" * 20), "--timestamp", "next", "--queries", "red mug", "blue")
-    flags = ("--load-config", trained, *SMALL, *places, "--max-views", "3")
+    flags = ("--load-config", little, *SMALL, *places, "--max-views", "3")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     shown = capsys.readouterr().out
     config = next(tmp_path.glob("deep-*/*/normlift/next/config.yml"))
