@@ -106,7 +106,7 @@ def little_lifted(little: Path, made_once: Any) -> Path:
 
         with pytest.MonkeyPatch.context() as patch:
             flags = ("--load-config", little, *QUICK, "--region-count", "300", "--timestamp", "t")
-            assert run_entry(patch, lift.entrypoint, *flags) == 0
+            assert run_entry(patch, lift.entrypoint, *flags, "--queries", "red", "yellow") == 0
 
     made_once("little_lifted", make)
     return little.parents[2] / "normlift" / "t" / "config.yml"

@@ -55,14 +55,8 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
 
 
 def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
-    outputs = (
-        "--json",
-        tmp_path / "a.json",
-        "--output-path",
-        tmp_path / "a.npz",
-        "--render-dir",
-        tmp_path / "pictures",
-    )
+    places = {"--json": tmp_path / "a.json", "--output-path": tmp_path / "a.npz", "--render-dir": tmp_path / "pictures"}
+    outputs = [word for pair in places.items() for word in pair]
     flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = capsys.readouterr().out
@@ -70,14 +64,11 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     document = json.loads((tmp_path / "a.json").read_text())
     red, blue = document["queries"]
     assert {"text", "fraction", "centroid", "peak", "mean_reliability"} <= set(red)
-    assert 0.005 < red["fraction"] < 0.1
-    assert red["peak"] > 0.9
-    assert 0.3 < red["mean_reliability"] < 1
+    assert 0.005 < red["fraction"] < 0.1 and red["peak"] > 0.9 and 0.3 < red["mean_reliability"] < 1
     run = open_scene(lifted)
     scores = np.load(tmp_path / "a.npz")
     assert scores["relevancy"].shape == (len(run.gaussians), 2)
-    assert scores["names"].tolist() == ["red", "sky blue"]
-    assert scores["valid"].dtype == bool
+    assert scores["names"].tolist() == ["red", "sky blue"] and scores["valid"].dtype == bool
     chosen = (scores["relevancy"][:, 0] > document["threshold"]) & scores["valid"]
     assert chosen.mean() == pytest.approx(red["fraction"])
     assert np.allclose(red["centroid"], np.average(run.gaussians.means[chosen], axis=0), atol=0.1)
@@ -122,27 +113,19 @@ def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     for path in before:
         for flag in ("--json", "--output-path"):
             assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red", flag, path) == 1
-    shown = said(capsys)
-    assert shown.count("--overwrite True") == 2 * len(before)
+    assert said(capsys).count("--overwrite True") == 2 * len(before)
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
 
 
 def test_a_damaged_run_is_refused_with_a_message(lifted, tmp_path, monkeypatch, capsys):
     run = tmp_path / "outputs" / "room" / "normlift" / "one"
     shutil.copytree(lifted.parent, run)
-    flags = (
-        "--load-config",
-        run / "config.yml",
-        "--data",
-        lifted.parents[4] / "room",
-        "--output-dir",
-        tmp_path / "out",
-    )
+    given = ("--load-config", run / "config.yml", "--data", lifted.parents[4] / "room")
     for name in ("field.safetensors", "manifest.json", "queries.safetensors"):
         path = run / "normlift" / name
         whole = path.read_bytes()
         path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
-        assert run_entry(monkeypatch, export.entrypoint, *flags) == 1
+        assert run_entry(monkeypatch, export.entrypoint, *given, "--output-dir", tmp_path / "out") == 1
         shown = said(capsys)
         assert "is damaged" in shown and name in shown and "ns-normlift" in shown
         assert not (tmp_path / "out").exists()
@@ -170,19 +153,8 @@ class Clock:
 def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
     monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
     monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", None)
-    flags = (
-        "--load-config",
-        own,
-        *QUICK,
-        "--region-count",
-        "300",
-        "--timestamp",
-        "two",
-        "--beta",
-        "2.0",
-        "--refine",
-        "False",
-    )
+    given = (*QUICK, "--region-count", "300", "--refine", "False")
+    flags = ("--load-config", own, *given, "--timestamp", "two", "--beta", "2.0")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     first, second = (field_of(own.parents[3], t) for t in ("t", "two"))
     assert torch.equal(first.scalars.norm, second.scalars.norm)
@@ -192,8 +164,7 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
 
 def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("normlift_ns.observing._LARGEST_CHUNK", 2)
-    rasterize = seen.block_evidence
-    calls = []
+    rasterize, calls = seen.block_evidence, []
 
     def interrupted(*args, **kwargs):
         calls.append(1)
@@ -201,21 +172,16 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, mon
             raise KeyboardInterrupt
         return rasterize(*args, **kwargs)
 
-    small = (*QUICK, "--refine", "False")
-    flags = ("--load-config", little, *small, "--output-dir", tmp_path / "out", "--timestamp", "t")
+    flags = ("--load-config", little, *QUICK, "--refine", "False", "--output-dir", tmp_path / "out", "--timestamp", "t")
     monkeypatch.setattr(seen, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
     assert "rerun the command to resume" in capsys.readouterr().err
     written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
-    assert {p.suffix for p in written} == {".safetensors"}
-    assert all(".cache" in p.parts for p in written)
-
-    fresh = []
+    assert {p.suffix for p in written} == {".safetensors"} and all(".cache" in p.parts for p in written)
+    fresh: list[Any] = []
     monkeypatch.setattr(seen, "block_evidence", rasterize)
-    original = seen.Evidence.save
-    monkeypatch.setattr(
-        seen.Evidence, "save", lambda self, path, **rest: (fresh.append(path), original(self, path, **rest))[1]
-    )
+    save = seen.Evidence.save
+    monkeypatch.setattr(seen.Evidence, "save", lambda self, *a, **how: (fresh.append(a), save(self, *a, **how))[1])
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
 
@@ -269,16 +235,14 @@ def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path,
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     config = tmp_path / "room" / "normlift" / "t" / "config.yml"
     manifest = open_run(config).field.manifest
-    assert manifest["features"]["kind"] == "patches"
-    assert manifest["encoder"]["text_template"] == "{}"
+    assert (manifest["features"]["kind"], manifest["encoder"]["text_template"]) == ("patches", "{}")
     ask = ("--load-config", config, "--text", "table", "--json")
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
     monkeypatch.setattr("normlift_ns.encoders.clip.encoder.load_clip", None)
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
     plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
-    assert again == plain
-    assert ensemble["peak"] != plain["peak"]
+    assert again == plain and ensemble["peak"] != plain["peak"]
 
 
 def test_levels_of_sam(little, clip, tmp_path, monkeypatch, capsys):

@@ -45,10 +45,8 @@ def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
 
 
 def test_the_file_is_that_of_ns_export_and_more(
-    scene_ply: Path, lifted: Path, ns_export, monkeypatch, tmp_path
+    scene_ply: Path, lifted: Path, nerfstudio, ns_export, monkeypatch, tmp_path
 ) -> None:
-    from nerfstudio.configs.method_configs import all_methods  # noqa: PLC0415
-
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
     from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
 
@@ -59,7 +57,7 @@ def test_the_file_is_that_of_ns_export_and_more(
         return config, pipeline, *rest
 
     monkeypatch.setattr(ns_export, "eval_setup", spoiled)
-    monkeypatch.setitem(all_methods, "normlift", normlift_method.config)
+    monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
     ns_export.ExportGaussianSplat(load_config=lifted, output_dir=tmp_path).main()
     theirs, ours = (PlyData.read(path)["vertex"] for path in (tmp_path / "splat.ply", scene_ply))
     names = [p.name for p in theirs.properties]
