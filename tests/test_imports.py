@@ -37,10 +37,10 @@ FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
 TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
-    **dict.fromkeys(("errors", "crash", "ranges", "options", "text_encoders", "plugin"), set()),
+    **dict.fromkeys(("errors", "crash", "ranges", "options", "text_encoders", "plugin"), frozenset()),
     **dict.fromkeys(("team", "lifting", "asking", "segmenting", "planning", "together", "front_door"), TENSORS),
-    **dict.fromkeys(("stages", "rehearsal"), {"torch"}),
-    **dict.fromkeys(("selection", "question"), {"numpy", "jaxtyping"}),
+    **dict.fromkeys(("stages", "rehearsal"), frozenset({"torch"})),
+    **dict.fromkeys(("selection", "question"), frozenset({"numpy", "jaxtyping"})),
     **dict.fromkeys(("insight", "session"), BASE),
     "kernels": TENSORS | {"triton"},
     "core": BASE | {"xxhash", "msgspec"},
