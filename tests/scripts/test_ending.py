@@ -13,14 +13,23 @@ from pathlib import Path
 from typing import NoReturn
 
 import pytest
+from rich.console import Console
 from rich.panel import Panel
 
 import normlift_ns
 from normlift_ns.core.files import new_file
 from normlift_ns.errors import InputError
-from normlift_ns.scripts.shared import CONSOLE, plain, say
+from normlift_ns.scripts import shared
+from normlift_ns.scripts.shared import plain, say
 
 NO_SPACE = OSError(28, "No space left on device", "a.ply")
+
+
+@pytest.fixture(autouse=True)
+def console(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What could not be written stays in a console, and would be printed by the next test."""
+    fresh = Console(width=120, markup=False, emoji=False, highlight=False)
+    monkeypatch.setattr(shared, "CONSOLE", fresh)
 
 
 def fail(error: BaseException) -> NoReturn:
@@ -62,7 +71,7 @@ def test_flags_that_cannot_be_read_are_mistakes_of_the_user(ended):
 def test_what_cannot_be_encoded_is_replaced(ended, monkeypatch):
     def body(_: str) -> None:
         say("a 🎉 中 \u202e " + chr(0xDC80))
-        CONSOLE.print(Panel(plain("🎉")))
+        shared.CONSOLE.print(Panel(plain("🎉")))
         raise InputError("no 中")
 
     for encoding in ("cp1252", "ascii", "latin-1"):
@@ -107,7 +116,6 @@ def test_a_closed_pipe_ends_quietly(ended, monkeypatch):
             say(f"line {i}")
         raise AssertionError("nobody reads")
 
-    monkeypatch.setattr(CONSOLE, "quiet", False)  # as before, afterwards
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as pipe, monkeypatch.context() as patch:
