@@ -382,4 +382,4 @@ def test_double_precision_differs_from_the_default_by_rounding(little, tmp_path,
     difference = (double.scalars.reliability - single.scalars.reliability).abs()
     assert 0 < float(difference.quantile(0.99)) < 1e-6
     assert float(difference.max()) < 1e-2  # where a pixel of a faint Gaussian is on the other side of alpha = 1 / 255
-    assert (double.source != single.source).float().mean() < 0.01
+    assert (double.source != single.source).float().mean() < 0.03
