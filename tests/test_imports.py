@@ -4,7 +4,6 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -36,159 +35,133 @@ LAYERS = (
 """From the ground up: a module imports from its own package and from lower layers only."""
 FLOOR = {name: floor for floor, names in enumerate(LAYERS) for name in names}
 BASE = {"torch", "numpy", "scipy", "jaxtyping", "safetensors"}
+TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
-    "errors": set(),
-    "crash": set(),
-    "ranges": set(),
-    "options": set(),
-    "kernels": {"torch", "jaxtyping", "triton"},
+    **dict.fromkeys(("errors", "crash", "ranges", "options", "text_encoders", "plugin"), frozenset()),
+    **dict.fromkeys(("team", "lifting", "asking", "segmenting", "planning", "together", "front_door"), TENSORS),
+    **dict.fromkeys(("stages", "rehearsal"), frozenset({"torch"})),
+    **dict.fromkeys(("selection", "question"), frozenset({"numpy", "jaxtyping"})),
+    **dict.fromkeys(("insight", "session"), BASE),
+    "kernels": TENSORS | {"triton"},
     "core": BASE | {"xxhash", "msgspec"},
-    "raster": {"torch", "numpy", "jaxtyping", "numba", "gsplat"},
+    "raster": TENSORS | {"numpy", "numba", "gsplat"},
     "encoders": BASE | {"xxhash", "open_clip", "skimage", "PIL", "huggingface_hub", "torchvision"},
-    "colors": {"torch", "jaxtyping", "matplotlib"},
-    "observing": {"torch", "jaxtyping", "xxhash"},
+    "colors": TENSORS | {"matplotlib"},
+    "observing": TENSORS | {"xxhash"},
     "objects": BASE | {"trimesh", "plyfile"},
-    "insight": BASE,
-    "team": {"torch", "jaxtyping"},
-    "lifting": {"torch", "jaxtyping"},
-    "stages": {"torch"},
-    "rehearsal": {"torch"},
     "scenes": BASE | {"msgspec", "cv2", "PIL", "plyfile", "yaml"},
-    "selection": {"numpy", "jaxtyping"},
-    "text_encoders": set(),
-    "question": {"numpy", "jaxtyping"},
     "quick": {"numpy", "scipy", "jaxtyping"},
-    "asking": {"torch", "jaxtyping"},
-    "segmenting": {"torch", "jaxtyping"},
     "runs": BASE | {"plyfile", "msgspec"},
-    "planning": {"torch", "jaxtyping"},
-    "session": BASE,
-    "viewer": {"torch", "numpy", "jaxtyping", "matplotlib", "PIL", "msgspec", "viser"},
+    "viewer": TENSORS | {"numpy", "matplotlib", "PIL", "msgspec", "viser"},
     "nerfstudio_plugin": BASE | {"nerfstudio", "gsplat", "torchmetrics", "yaml", "viser"},
-    "lifted_run": {"torch", "numpy", "jaxtyping"},
-    "together": {"torch", "jaxtyping"},
-    "front_door": {"torch", "jaxtyping"},
+    "lifted_run": TENSORS | {"numpy"},
     "method_configs": {"nerfstudio"},
-    "plugin": set(),
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "scripts": {
-        "torch",
-        "numpy",
-        "jaxtyping",
-        "PIL",
-        "plyfile",
-        "tyro",
-        "rich",
-        "docstring_parser",
-        "yaml",
-        "prompt_toolkit",
-    },
+    "scripts": TENSORS | {"numpy", "PIL", "plyfile", "yaml", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "demo/run.py")
-FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
-MOST_MODULES = 19
-
-
-def layer(path: Path) -> str:
-    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+UNIX_ONLY = {"resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton"}
+FOR_A_GPU = ("kernels", "raster/triton", "raster/gsplat")
+"""May import Triton when they are loaded."""
 
 
 def module(path: Path) -> str:
     return ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
-MODULES = {module(file) for file in FILES}
-
-
-@cache
-def imports(path: Path) -> tuple[tuple[str, bool], ...]:
+def imports(path: Path, modules: set[str]) -> Iterator[tuple[str, bool]]:
     """Modules that a file imports, wherever it does, and whether while it is itself imported."""
-    return tuple(_imports(path))
 
-
-def _imports(path: Path) -> Iterator[tuple[str, bool]]:
-    tree = ast.parse(path.read_text())
-    for node in ast.walk(tree):
-        for child in ast.iter_child_nodes(node):
-            child.parent = node  # type: ignore[attr-defined]
-    for node in ast.walk(tree):
-        names = []
+    def walk(node: ast.AST, now: bool) -> Iterator[tuple[str, bool]]:
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            yield from ((alias.name, now) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path} uses a relative import"
             found = [f"{node.module}.{alias.name}" for alias in node.names]
-            names = [name if name in MODULES else node.module or "" for name in found]
-        parent, now = node, True
-        while parent is not tree:
-            parent = parent.parent  # type: ignore[attr-defined]
-            typing = isinstance(parent, ast.If) and ast.unparse(parent.test) == "TYPE_CHECKING"
-            now &= not (typing or isinstance(parent, ast.FunctionDef))
-        yield from ((name, now) for name in names)
+            yield from ((name if name in modules else node.module or "", now) for name in found)
+        typing = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        later = typing or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for child in ast.iter_child_nodes(node):
+            if not isinstance(child, ast.expr):
+                yield from walk(child, now and not later)
+
+    yield from walk(ast.parse(path.read_text("utf8")), True)
 
 
-@pytest.mark.parametrize("path", FILES, ids=module)
-def test_imports_go_downwards(path):
-    here = layer(path)
-    for name, _ in imports(path):
-        top, *rest = name.split(".")
-        if top == "normlift_ns":
-            there = rest[0] if len(rest) > 0 else "__init__"  # the face of the package, which hands names on
-            assert there == here or FLOOR[there] < FLOOR[here], f"{module(path)} imports {name} from above"
-        elif top not in sys.stdlib_module_names:
-            assert top in FOREIGN[here], f"{module(path)} imports {name}"
+def test_imports_go_downwards_in_no_circle_and_only_the_plugin_knows_nerfstudio():
+    files = {module(path): path for path in sorted(ROOT.rglob("*.py")) if path != ROOT / "__init__.py"}
+    needs: dict[str, set[str]] = {}
+    wrong = []
+    for here, path in files.items():
+        place = path.relative_to(ROOT).as_posix()
+        layer = place.split("/")[0].removesuffix(".py")
+        found = list(imports(path, set(files)))
+        needs[here] = {name for name, _ in found} & set(files) - {here}
+        for name, now in found:
+            top, *rest = name.split(".")
+            if top == "normlift_ns":
+                there = rest[0] if len(rest) > 0 else "__init__"  # the face of the package, which hands names on
+                right = there == layer or FLOOR[there] < FLOOR[layer]
+            else:
+                right = top in sys.stdlib_module_names or top in FOREIGN[layer]
+                right &= top != "nerfstudio" or place.startswith(KNOW_NERFSTUDIO)
+                right &= top not in UNIX_ONLY or not now or place.startswith(FOR_A_GPU)
+            if not right:
+                wrong.append(f"{here} imports {name}")
+    assert wrong == []
+    while leaves := {name for name, needed in needs.items() if len(needed) == 0}:
+        needs = {name: needed - leaves for name, needed in needs.items() if name not in leaves}
+    assert needs == {}, "these import each other in a circle"
 
 
-@pytest.mark.parametrize("path", FILES, ids=module)
-def test_only_the_plugin_knows_nerfstudio(path):
-    known = path.relative_to(ROOT).as_posix().startswith(KNOW_NERFSTUDIO)
-    found = [name for name, _ in imports(path) if name.split(".")[0] == "nerfstudio"]
-    assert known or found == []
+STAGES = """
+import sys
+HEAVY = {"torch", "numpy", "nerfstudio", "scipy", "open_clip", "gsplat", "numba", "matplotlib", "triton", "viser"}
+def check(stage, names):
+    assert not (found := names & set(sys.modules)), (stage, found)
+import normlift_ns
+normlift_ns.__version__
+check("version", HEAVY)
+from normlift_ns.scripts import batch, check as _, demo, evaluate, export, lift, query, view
+check("scripts", HEAVY)
+missing = ["--load-config", "nowhere/config.yml"]
+mistakes = [
+    (lift, missing), (lift, ["--load-config", "config.yml", "--encoder", "colour", "--sigma-d", "nan"]),
+    (lift, ["--load-config", "config.yml", "--encoder", "colour", "--output-dir", "config.yml"]),
+    (query, [*missing, "--text", "a"]), (query, ["--load-config", "config.yml", "--text", "a", "--json", "no.txt/x"]),
+    (export, ["--load-config", "config.yml", "--output-dir", "config.yml"]), (view, missing),
+    (evaluate, ["--load-config", "config.yml", "--protocol", "masks", "--labels", "nowhere"]), (batch, ["nowhere.txt"]),
+]
+for command, words in mistakes:
+    sys.argv = ["command", *words]
+    try:
+        command.entrypoint()
+    except SystemExit as stop:
+        assert stop.code == 1, (words, stop.code)
+    else:
+        sys.exit(f"{words} were accepted")
+    check(words, HEAVY)
+normlift_ns.lift, normlift_ns.render
+check("functions", HEAVY - {"torch", "numpy", "scipy"})
+import normlift_ns.front_door, normlift_ns.encoders.build as build
+build.make_source(normlift_ns.SourceOptions(encoder="colour")).text(["red"])
+check("colours", {"nerfstudio", "open_clip", "gsplat", "torchvision", "sympy", "torch._dynamo", "scipy.stats", "viser"})
+"""
 
 
-def test_no_modules_import_each_other_in_a_circle():
-    arrows = {module(path): {name for name, _ in imports(path)} for path in FILES}
-    open_modules = {name: arrows[name] & set(arrows) - {name} for name in arrows}
-    while leaves := [name for name, needs in open_modules.items() if len(needs) == 0]:
-        for name in leaves:
-            del open_modules[name]
-        for needs in open_modules.values():
-            needs -= set(leaves)
-    assert open_modules == {}
-
-
-def test_no_folder_is_crowded():
-    folders = {path.parent for path in FILES}
-    crowded = {str(f.relative_to(ROOT)): n for f in folders if (n := len(list(f.glob("*.py")))) > MOST_MODULES}
-    assert crowded == {}
-
-
-def loaded(code: str, names: set[str]) -> str:
-    """Which of the modules a program has imported."""
-    program = f"import sys; {code}; print(sorted({names!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    return done.stdout.strip().splitlines()[-1]
-
-
-def test_importing_the_package_costs_nothing():
-    heavy = {"torch", "numpy", "nerfstudio", "scipy", "open_clip", "gsplat", "numba", "matplotlib", "triton"}
-    assert loaded("import normlift_ns; normlift_ns.__version__", heavy) == "[]"
-    assert loaded("import normlift_ns.scripts.lift", heavy) == "[]"
-    assert (
-        loaded("import normlift_ns; normlift_ns.lift, normlift_ns.render", heavy - {"torch", "numpy", "scipy"}) == "[]"
-    )
-    others = {"nerfstudio", "open_clip", "gsplat", "torchvision", "sympy", "torch._dynamo", "scipy.stats", "viser"}
-    lifting = "import normlift_ns.front_door, normlift_ns.encoders.build as b; from normlift_ns import SourceOptions"
-    assert loaded(f"{lifting}; b.make_source(SourceOptions(encoder='colour')).text(['red'])", others) == "[]"
+def test_help_and_mistakes_load_nothing_heavy_nor_does_a_lift_load_what_it_does_not_need(tmp_path):
+    (tmp_path / "config.yml").write_text("method_name: splatfacto\n")
+    done = subprocess.run([sys.executable, "-c", STAGES], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr and done.stderr.count("Error\n") == 9
 
 
 def test_public_names_exist_and_have_docstrings_with_examples():
     assert set(normlift_ns.__all__) <= set(dir(normlift_ns))
     for name in normlift_ns.__all__:
         member = getattr(normlift_ns, name)
-        if not isinstance(member, tuple):
-            assert ">>>" in member.__doc__, name
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        assert isinstance(member, tuple) or ">>>" in member.__doc__, name
+    with pytest.raises(AttributeError, match="nothing"):
         _ = normlift_ns.nothing

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
+
+from normlift_ns.scripts.shared import run_command
+from tests.conftest import import_nerfstudio
+
+if TYPE_CHECKING:
+    from normlift_ns.demo import DemoRoom
 
 SMALL = ("--encoder", "colour", "--k", "12")
 """Flags that lift the small demo room in a moment."""
@@ -26,3 +38,83 @@ def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> in
     except SystemExit as stop:
         return int(stop.code or 0)
     return 0
+
+
+@dataclass
+class Command:
+    """A command."""
+
+    word: str = "x"
+    """A word."""
+    body: ClassVar[Callable[[str], Any]]
+
+    def main(self) -> None:
+        type(self).body(self.word)
+
+
+@pytest.fixture
+def ended(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., tuple[int, str, str]]:
+    """Runs a command in this process, whose main is a function of --word: exit code, output and errors.
+
+    Logs are in the folder state of tmp_path.
+    """
+
+    def show(message: Any, category: Any, filename: str, line: int, *_: object) -> None:
+        sys.stderr.write(warnings.formatwarning(message, category, filename, line, ""))
+
+    def run(body: Callable[[str], Any], *flags: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(Command, "body", staticmethod(body), raising=False)
+        code = run_entry(monkeypatch, lambda: run_command(Command), *flags)
+        return code, *capsys.readouterr()
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(warnings, "showwarning", show)  # as without pytest
+    return run
+
+
+@pytest.fixture(scope="session")
+def little_room() -> DemoRoom:
+    """The room of `little`."""
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+
+    return plain_room(3000)
+
+
+@pytest.fixture(scope="session")
+def little(little_room: DemoRoom, made_once: Any) -> Path:
+    """config.yml of a trained run with few Gaussians and 6 small photographs, for tests that lift or evaluate."""
+
+    def make(folder: Path) -> None:
+        import_nerfstudio()
+        from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+
+        write_capture(little_room, folder / "room", views=6, held_out=2, width=96, height=72)
+        write_splatfacto_run(little_room, folder / "room", folder / "outputs")
+
+    return next(made_once("little", make).glob("outputs/*/splatfacto/*/config.yml"))
+
+
+@pytest.fixture(scope="session")
+def little_lifted(little: Path, made_once: Any) -> Path:
+    """config.yml of a lifted run of it."""
+
+    def make(folder: Path) -> None:
+        import_nerfstudio()
+        from normlift_ns.scripts import lift  # noqa: PLC0415
+
+        with pytest.MonkeyPatch.context() as patch:
+            flags = ("--load-config", little, *QUICK, "--region-count", "300", "--timestamp", "t")
+            assert run_entry(patch, lift.entrypoint, *flags, "--queries", "red", "yellow") == 0
+
+    made_once("little_lifted", make)
+    return little.parents[2] / "normlift" / "t" / "config.yml"
+
+
+@pytest.fixture
+def own(little_lifted: Path, tmp_path: Path) -> Path:
+    """config.yml of `little`, in a copy of everything that the test may change; `little_lifted` is in it too."""
+    shutil.copytree(little_lifted.parents[4], tmp_path / "own")
+    (config,) = (tmp_path / "own").glob("outputs/room/splatfacto/*/config.yml")
+    return config

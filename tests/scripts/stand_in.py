@@ -13,8 +13,8 @@ from pathlib import Path
 FACTS = {"schema_version": 1, "num_gaussians": 1, "dimension": 1, "means_fingerprint": "", "form": "evidence"}
 
 
-def main() -> None:
-    words = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+def main(flags: list[str]) -> None:
+    words = dict(zip(flags[::2], flags[1::2]))
     config = Path(words["--load-config"])
     with (config.parents[4] / "begun.txt").open("a") as begun:
         begun.write(f"{config.parents[2].name} {os.getpid()}\n")
@@ -39,4 +39,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

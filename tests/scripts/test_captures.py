@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +14,11 @@ from PIL import Image
 from benchmarks.captures import SHARED
 from normlift_ns import Scene, open_run, render
 from normlift_ns.asking import pixel_relevancy
+from normlift_ns.scripts import lift, query
 from tests.captures import needs_shared
+from tests.scripts.conftest import run_entry
 
 pytestmark = [pytest.mark.slow, needs_shared]
-
-
-def command(script: str, *flags: object, cwd: Path) -> str:
-    """What a command prints."""
-    words = [sys.executable, "-m", f"normlift_ns.scripts.{script}", *map(str, flags)]
-    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 def maps(config: Path, texts: list[str], split: str, count: int) -> tuple[Scene, torch.Tensor]:
@@ -39,14 +31,16 @@ def maps(config: Path, texts: list[str], split: str, count: int) -> tuple[Scene,
     )
 
 
-def test_fox_is_orange_and_the_curtain_crimson(tmp_path):
+def test_fox_is_orange_and_the_curtain_crimson(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     relative = Path(os.path.relpath(source, tmp_path))
     flags = ("--encoder", "colour", "--output-dir", "lifted", "--timestamp", "t")
-    print(command("lift", "--load-config", relative, *flags, cwd=tmp_path))
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", relative, *flags) == 0
     config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
-    shown = command("query", "--load-config", config, "--text", "orange", "crimson", "--json", "a.json", cwd=tmp_path)
-    assert "reliability" in shown
+    asked = ("--load-config", config, "--text", "orange", "crimson", "--json", "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
+    assert "reliability" in capsys.readouterr().out
     orange, crimson = json.loads((tmp_path / "a.json").read_text())["queries"]
     assert orange["peak"] > 0.5
     assert crimson["peak"] > 0.6
@@ -67,12 +61,13 @@ def test_fox_is_orange_and_the_curtain_crimson(tmp_path):
     assert means["curtain"][1] > 3 * max(means["head"][1], means["wallpaper"][1])
 
 
-def test_mug_and_bottle_stand_out_from_the_table(tmp_path):
+def test_mug_and_bottle_stand_out_from_the_table(tmp_path, monkeypatch):
     captures = SHARED / "captures"
     source = captures / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
     regions = ("--regions", "files", "--regions-dir", captures / "tabletop" / "instance")
     flags = ("--encoder", "colour", *regions, "--output-dir", tmp_path, "--timestamp", "t")
-    command("lift", "--load-config", source.relative_to(captures), *flags, cwd=captures)
+    monkeypatch.chdir(captures)
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", source.relative_to(captures), *flags) == 0
     run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out", 4)
     names = [Path(name).stem for name in run.held_out.names]
     truth = torch.stack(

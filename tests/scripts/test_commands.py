@@ -55,7 +55,8 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
 
 
 def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
-    outputs = ("--json", tmp_path / "a.json", "--output-path", tmp_path / "a.npz", "--render-dir", tmp_path / "pictures")
+    places = {"--json": tmp_path / "a.json", "--output-path": tmp_path / "a.npz", "--render-dir": tmp_path / "pictures"}
+    outputs = [word for pair in places.items() for word in pair]
     flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = capsys.readouterr().out
@@ -63,14 +64,11 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     document = json.loads((tmp_path / "a.json").read_text())
     red, blue = document["queries"]
     assert {"text", "fraction", "centroid", "peak", "mean_reliability"} <= set(red)
-    assert 0.005 < red["fraction"] < 0.1
-    assert red["peak"] > 0.9
-    assert 0.3 < red["mean_reliability"] < 1
+    assert 0.005 < red["fraction"] < 0.1 and red["peak"] > 0.9 and 0.3 < red["mean_reliability"] < 1
     run = open_scene(lifted)
     scores = np.load(tmp_path / "a.npz")
     assert scores["relevancy"].shape == (len(run.gaussians), 2)
-    assert scores["names"].tolist() == ["red", "sky blue"]
-    assert scores["valid"].dtype == bool
+    assert scores["names"].tolist() == ["red", "sky blue"] and scores["valid"].dtype == bool
     chosen = (scores["relevancy"][:, 0] > document["threshold"]) & scores["valid"]
     assert chosen.mean() == pytest.approx(red["fraction"])
     assert np.allclose(red["centroid"], np.average(run.gaussians.means[chosen], axis=0), atol=0.1)
@@ -115,29 +113,28 @@ def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     for path in before:
         for flag in ("--json", "--output-path"):
             assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red", flag, path) == 1
-    shown = said(capsys)
-    assert shown.count("--overwrite True") == 2 * len(before)
+    assert said(capsys).count("--overwrite True") == 2 * len(before)
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
 
 
 def test_a_damaged_run_is_refused_with_a_message(lifted, tmp_path, monkeypatch, capsys):
     run = tmp_path / "outputs" / "room" / "normlift" / "one"
     shutil.copytree(lifted.parent, run)
-    flags = ("--load-config", run / "config.yml", "--data", lifted.parents[4] / "room", "--output-dir", tmp_path / "out")
+    given = ("--load-config", run / "config.yml", "--data", lifted.parents[4] / "room")
     for name in ("field.safetensors", "manifest.json", "queries.safetensors"):
         path = run / "normlift" / name
         whole = path.read_bytes()
         path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
-        assert run_entry(monkeypatch, export.entrypoint, *flags) == 1
+        assert run_entry(monkeypatch, export.entrypoint, *given, "--output-dir", tmp_path / "out") == 1
         shown = said(capsys)
         assert "is damaged" in shown and name in shown and "ns-normlift" in shown
         assert not (tmp_path / "out").exists()
         path.write_bytes(whole)
 
 
-def test_lifts_without_a_name_at_the_same_second_both_remain(trained, tmp_path, monkeypatch):
+def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
     monkeypatch.setattr("normlift_ns.runs.files.datetime", Clock)
-    flags = ("--load-config", trained, *QUICK, *TWO, "--output-dir", tmp_path)
+    flags = ("--load-config", little, *QUICK, *TWO, "--output-dir", tmp_path)
     names = ["2024-05-01_120000", "2024-05-01_120000_2"]
     for overwrite in ("False", "True"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
@@ -156,18 +153,18 @@ class Clock:
 def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
     monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
     monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", None)
-    flags = ("--load-config", own, *QUICK, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
+    given = (*QUICK, "--region-count", "300", "--refine", "False")
+    flags = ("--load-config", own, *given, "--timestamp", "two", "--beta", "2.0")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (field_of(own.parents[3], t) for t in ("one", "two"))
+    first, second = (field_of(own.parents[3], t) for t in ("t", "two"))
     assert torch.equal(first.scalars.norm, second.scalars.norm)
     assert (second.scalars.reliability <= first.scalars.reliability).all()
     assert torch.equal(second.source, torch.arange(len(second), dtype=torch.int32))
 
 
-def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("normlift_ns.observing._LARGEST_CHUNK", 4)
-    rasterize = seen.block_evidence
-    calls = []
+def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("normlift_ns.observing._LARGEST_CHUNK", 2)
+    rasterize, calls = seen.block_evidence, []
 
     def interrupted(*args, **kwargs):
         calls.append(1)
@@ -175,43 +172,38 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
             raise KeyboardInterrupt
         return rasterize(*args, **kwargs)
 
-    small = (*QUICK, "--refine", "False")
-    flags = ("--load-config", trained, *small, "--output-dir", tmp_path / "out", "--timestamp", "t")
+    flags = ("--load-config", little, *QUICK, "--refine", "False", "--output-dir", tmp_path / "out", "--timestamp", "t")
     monkeypatch.setattr(seen, "block_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
     assert "rerun the command to resume" in capsys.readouterr().err
     written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
-    assert {p.suffix for p in written} == {".safetensors"}
-    assert all(".cache" in p.parts for p in written)
-
-    fresh = []
+    assert {p.suffix for p in written} == {".safetensors"} and all(".cache" in p.parts for p in written)
+    fresh: list[Any] = []
     monkeypatch.setattr(seen, "block_evidence", rasterize)
-    original = seen.Evidence.save
-    monkeypatch.setattr(
-        seen.Evidence, "save", lambda self, path, **rest: (fresh.append(path), original(self, path, **rest))[1]
-    )
+    save = seen.Evidence.save
+    monkeypatch.setattr(seen.Evidence, "save", lambda self, *a, **how: (fresh.append(a), save(self, *a, **how))[1])
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
 
 
-def test_label_maps_of_another_size_are_refused_or_resampled(trained, tmp_path, monkeypatch, capsys):
+def test_label_maps_of_another_size_are_refused_or_resampled(little, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "labels"
     folder.mkdir()
-    for path in (trained.parents[4] / "room" / "instance").iterdir():
+    for path in (little.parents[4] / "room" / "instance").iterdir():
         Image.open(path).resize((80, 60), Image.Resampling.NEAREST).save(folder / path.name)
-    flags = ("--load-config", trained, *QUICK, *TWO, "--regions", "files", "--regions-dir", folder)
+    flags = ("--load-config", little, *QUICK, *TWO, "--regions", "files", "--regions-dir", folder)
     flags = (*flags, "--output-dir", tmp_path / "out")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     shown = said(capsys)
-    assert "80" in shown and "160" in shown and "--regions-resample" in shown
+    assert "80" in shown and "96" in shown and "--regions-resample" in shown
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--regions-resample", "True") == 0
 
 
-def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monkeypatch, capsys):
-    for path in (trained.parents[4] / "room" / "instance").iterdir():
+def test_another_level_of_label_files_rasterizes_nothing(little, tmp_path, monkeypatch, capsys):
+    for path in (little.parents[4] / "room" / "instance").iterdir():
         classes = np.asarray(Image.open(path)).astype(int)
         np.save(tmp_path / f"{path.stem}.npy", np.stack([classes, (classes > 0).astype(int)]))
-    flags = ("--load-config", trained, *QUICK, "--max-views", "4", "--regions-dir", tmp_path)
+    flags = ("--load-config", little, *QUICK, "--max-views", "4", "--regions-dir", tmp_path)
     flags = (*flags, "--output-dir", tmp_path / "out")
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
@@ -238,31 +230,29 @@ def clip(tmp_path_factory) -> tuple[object, ...]:
     return ("--encoder-model", CLIP, "--encoder-pretrained", folder / "tiny.pt", *TWO, "--check", "False")
 
 
-def test_clip_by_patches_and_questions_without_a_network(trained, clip, tmp_path, monkeypatch, capsys):
-    flags = ("--load-config", trained, *clip, "--output-dir", tmp_path, "--timestamp", "t")
+def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path, monkeypatch, capsys):
+    flags = ("--load-config", little, *clip, "--output-dir", tmp_path, "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     config = tmp_path / "room" / "normlift" / "t" / "config.yml"
     manifest = open_run(config).field.manifest
-    assert manifest["features"]["kind"] == "patches"
-    assert manifest["encoder"]["text_template"] == "{}"
+    assert (manifest["features"]["kind"], manifest["encoder"]["text_template"]) == ("patches", "{}")
     ask = ("--load-config", config, "--text", "table", "--json")
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
     monkeypatch.setattr("normlift_ns.encoders.clip.encoder.load_clip", None)
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
     plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
-    assert again == plain
-    assert ensemble["peak"] != plain["peak"]
+    assert again == plain and ensemble["peak"] != plain["peak"]
 
 
-def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
+def test_levels_of_sam(little, clip, tmp_path, monkeypatch, capsys):
     """All levels are found at once, so that another one asks SAM and the rasterizer nothing."""
     from tests.encoders.tiny import write_sam  # noqa: PLC0415
 
     write_sam(tmp_path / "sam.pth", seed=1, gain=6)
     rules = MaskRules(points_per_side=4, predicted_iou=0.5, stability=0.3)
     monkeypatch.setattr("normlift_ns.encoders.build.SamMasks", functools.partial(SamMasks, rules=rules))
-    flags = ("--load-config", trained, *clip, "--sam-model", tmp_path / "sam.pth", "--output-dir", tmp_path)
+    flags = ("--load-config", little, *clip, "--sam-model", tmp_path / "sam.pth", "--output-dir", tmp_path)
     shares = []
     for level in ("l", "s"):
         more = () if level == "l" else ("--level", level)
@@ -276,9 +266,9 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
     assert shares[0] != shares[1] and max(shares) < 1
 
 
-def test_fewer_smaller_and_rendered_views(trained, tmp_path, monkeypatch):
+def test_fewer_smaller_and_rendered_views(little, tmp_path, monkeypatch):
     flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
-    given = ("--load-config", trained, *QUICK, "--refine", "False", "--output-dir", tmp_path)
+    given = ("--load-config", little, *QUICK, "--refine", "False", "--output-dir", tmp_path)
     assert run_entry(monkeypatch, lift.entrypoint, *given, *flags) == 0
     found = field_of(tmp_path, "less").manifest["statistics"]
     assert found["views"] == 5 and 0 < found["zero_evidence_share"] < 0.5
@@ -319,12 +309,12 @@ def test_selection_follows_threshold_and_reliability(lifted):
 
 
 @pytest.mark.slow
-def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, tmp_path, monkeypatch, capsys):
+def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch, capsys):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
-    output = ("--load-config", trained, "--k", "12", "--output-dir", tmp_path / "out")
+    output = ("--load-config", little, "--k", "12", "--output-dir", tmp_path / "out")
     exporting = ("--encoder", "colour", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
     assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
-    assert len(list((tmp_path / "features").iterdir())) == 2 * 12
+    assert len(list((tmp_path / "features").iterdir())) == 2 * 6
     texts = ("red", "sky blue")
     np.savez(tmp_path / "texts.npz", **dict(zip(texts, ColourEncoder().text(texts).numpy())))
 
@@ -359,35 +349,37 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     assert "--queries" in shown and "5" in shown and "343" in shown
 
 
-def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monkeypatch, capsys):
+def test_images_without_features_are_listed_and_left_out(little, tmp_path, monkeypatch, capsys):
     source = RegionFeatures(Grid(9), ColourEncoder())
-    for view in open_scene(trained).train:
+    for view in open_scene(little).train:
         write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
     (tmp_path / "features" / "0003_f.npy").unlink()
     np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
     flags = (
-        *("--load-config", trained, "--features", "langsplat", "--features-dir", tmp_path / "features"),
+        *("--load-config", little, "--features", "langsplat", "--features-dir", tmp_path / "features"),
         *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t"),
         *("--check", "False", "--refine", "False"),
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    assert "1 of 12 images have no features" in said(capsys)
+    assert "1 of 6 images" in said(capsys)
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
     shown = capsys.readouterr()
     assert "1 images without features" in shown.out
-    assert "Warning: 1 of 12 images" in shown.err and "images/0003.png" in shown.err
+    assert "Warning: 1 of 6 images" in shown.err and "images/0003.png" in shown.err
     field = field_of(tmp_path / "out", "t")
-    assert field.manifest["statistics"]["views"] == 11
-    assert int(field.scalars.view_count.max()) <= 11
+    assert field.manifest["statistics"]["views"] == 5
+    assert int(field.scalars.view_count.max()) <= 5
 
 
 @pytest.mark.slow
-def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, tmp_path, monkeypatch):
-    flags = ("--load-config", trained, *QUICK, "--timestamp", "double", "--precision", "double", "--output-dir", tmp_path)
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    double, single = field_of(tmp_path, "double"), open_run(lifted).field
+def test_double_precision_differs_from_the_default_by_rounding(little, tmp_path, monkeypatch):
+    for precision in ("standard", "double"):
+        flags = ("--load-config", little, *QUICK, "--max-views", "3", "--precision", precision)
+        places = ("--output-dir", tmp_path, "--timestamp", precision)
+        assert run_entry(monkeypatch, lift.entrypoint, *flags, *places) == 0
+    double, single = field_of(tmp_path, "double"), field_of(tmp_path, "standard")
     assert double.manifest["options"]["precision"] == "double"
     difference = (double.scalars.reliability - single.scalars.reliability).abs()
     assert 0 < float(difference.quantile(0.99)) < 1e-6
     assert float(difference.max()) < 1e-2  # where a pixel of a faint Gaussian is on the other side of alpha = 1 / 255
-    assert (double.source != single.source).float().mean() < 0.01
+    assert (double.source != single.source).float().mean() < 0.03

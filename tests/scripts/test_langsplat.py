@@ -6,7 +6,6 @@ The vectors are real ones of CLIP's text encoder, so that the names are as hard 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,31 +16,20 @@ from PIL import Image
 from scipy import ndimage
 
 from benchmarks.captures import SHARED
-from benchmarks.plain_room import plain_room
 from normlift_ns import open_run
-from normlift_ns.demo import write_capture, write_splatfacto_run
 from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.captures import clip_vectors, needs_shared
+from tests.scripts.conftest import run_entry
 
-pytestmark = [pytest.mark.slow, needs_shared]
+pytestmark = [pytest.mark.extra, needs_shared]
 
 THINGS = {
-    "cream": "curtain",
-    "light brown": "mattress",
-    "teal": "doormat",
-    "chocolate brown": "table",
-    "sky blue": "sofa",
-    "dark green": "flowerpot",
-    "bright blue": "crate",
-    "pink": "stool",
-    "orange": "cone",
-    "red": "ball",
-    "yellow": "doughnut",
-    "green": "box",
-    "purple": "vase",
-}
+    "cream": "curtain", "light brown": "mattress", "teal": "doormat", "chocolate brown": "table", "sky blue": "sofa",
+    "dark green": "flowerpot", "bright blue": "crate", "pink": "stool", "orange": "cone", "red": "ball",
+    "yellow": "doughnut", "green": "box", "purple": "vase",
+}  # fmt: skip
 """What the classes of the room are called here, by their colours."""
 NOISE = 1.0
 """Length of the noise on the unit vector of every mask: the cosine to the clean vector is 0.7."""
@@ -107,17 +95,15 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
         np.save(folder / f"{path.stem}_f.npy", table.astype(np.float16).astype(np.float32))
 
 
-def command(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["command", *map(str, flags)])
-    entrypoint()
-
-
-def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
+def test_damaged_masks_lift_to_the_right_things(nerfstudio, tmp_path, monkeypatch):
     """mIoU over the Gaussians of 13 classes, mean of three draws of the damage.
 
     What refinement cannot bring back is a thing whose masks are wrong in most views: in the first draw the cactus, in
     11 images at all, is merged with the wall in half of them.
     """
+    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+    from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+
     room = plain_room()
     names = json.loads((SHARED / "clip_vectors" / "lvis_v1_names.json").read_text())
     vectors = clip_vectors()[[names.index(THINGS[name]) for name in room.names]].numpy()
@@ -134,7 +120,7 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
         name = f"{level}_{seed}"
         importing = ("--features", "langsplat", "--features-dir", features, "--text-vectors", tmp_path / "texts.npz")
         flags = ("--load-config", trained, *importing, "--level", level, "--timestamp", name)
-        command(monkeypatch, lift.entrypoint, *flags)
+        assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
         config = trained.parents[2] / "normlift" / name / "config.yml"
         field = open_run(config).field
         scores = []
@@ -147,10 +133,9 @@ def test_damaged_masks_lift_to_the_right_things(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)  # another level has its evidence
     config, summed = lifted(0, "sum")
     asking = ("--text", "sofa", "--negatives", "box", "table", "--json", tmp_path / "a.json")
-    command(monkeypatch, query.entrypoint, "--load-config", config, *asking)
+    assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0
     (sofa,) = json.loads((tmp_path / "a.json").read_text())["queries"]
-    with capsys.disabled():
-        print(f"\nmIoU before and after refinement: {scores}, sum {summed}; sofa {sofa}")
+    print(f"mIoU before and after refinement: {scores}, sum {summed}; sofa {sofa}")
     before, after = np.mean(list(scores.values()), axis=0)
     assert after >= 0.92
     assert all(refined > raw for raw, refined in scores.values())

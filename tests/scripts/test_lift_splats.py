@@ -12,50 +12,33 @@ from normlift_ns import open_run, open_scene
 from normlift_ns.scenes.splat import Splat
 from normlift_ns.scripts import evaluate, export, lift, query
 from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
-from tests.scripts.conftest import SMALL, run_entry
+from tests.scripts.conftest import SMALL, run_entry, said
 
 
 @pytest.fixture
-def ply(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def ply(little: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    return write_ply(tmp_path / "scene.ply", ply_columns(Splat(**open_scene(trained).parameters)))
+    return write_ply(tmp_path / "scene.ply", ply_columns(Splat(**open_scene(little).parameters)))
 
 
-def cameras(trained: Path) -> tuple[object, ...]:
-    folder = trained.parents[4] / "room"
-    return (
-        "--transforms",
-        folder / "transforms.json",
-        "--world-transform",
-        trained.parent / "dataparser_transforms.json",
-    )
-
-
-def test_lift_query_export_and_evaluate(ply: Path, trained: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    flags = ("--load-ply", ply, *cameras(trained), *SMALL, "--timestamp", "a", "--queries", "red", "yellow")
+def test_lift_query_export_and_evaluate(ply: Path, little: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    """The config names cameras that nerfstudio leaves as they are."""
+    room, world = little.parents[4] / "room", little.parent / "dataparser_transforms.json"
+    cameras = ("--transforms", room / "transforms.json", "--world-transform", world)
+    flags = ("--load-ply", ply, *cameras, *SMALL, "--timestamp", "a", "--queries", "red", "yellow")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    printed = capsys.readouterr().out
-    assert "2 of 14 photographs were held out of the training; they are not lifted." in printed
-    assert "Weights are those of gsplat, by the rules of --gsplat-rules" in printed.replace("\n", " ")
-    config = tmp_path / "outputs" / "room" / "normlift" / "a" / "config.yml"
-    assert str(config.parent) in printed
-    found = open_run(config).ask_stored()
-    assert found is not None
-    assert found["red"].peak > 0.8
-    assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, "--text", "red") == 0
-    assert run_entry(monkeypatch, export.entrypoint, "--load-config", config, "--output-dir", tmp_path / "e") == 0
-    labels = trained.parents[4] / "room" / "instance"
-    flags = ("--protocol", "masks", "--labels", labels, "--output-path", tmp_path / "scores.json")
-    assert run_entry(monkeypatch, evaluate.entrypoint, "--load-config", config, *flags) == 0
+    printed = said(capsys)
+    run_dir = tmp_path / "outputs" / "room" / "normlift" / "a"
+    assert "2 of 8 photographs" in printed and "--gsplat-rules" in printed and str(run_dir) in printed
+    found = open_run(run_dir / "config.yml").ask_stored()
+    assert found is not None and found["red"].peak > 0.8
+    asked = ("--load-config", run_dir / "config.yml")
+    assert run_entry(monkeypatch, query.entrypoint, *asked, "--text", "red") == 0
+    assert run_entry(monkeypatch, export.entrypoint, *asked, "--output-dir", tmp_path / "e") == 0
+    flags = ("--protocol", "masks", "--labels", room / "instance", "--output-path", tmp_path / "scores.json")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *asked, *flags) == 0
     assert json.loads((tmp_path / "scores.json").read_text())
-
-
-def test_the_config_names_cameras_that_nerfstudio_leaves_as_they_are(ply: Path, trained: Path, monkeypatch) -> None:
-    flags = ("--load-ply", ply, *cameras(trained), *SMALL, "--timestamp", "a", "--max-views", 2)
-    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    run_dir = ply.parent / "outputs" / "room" / "normlift" / "a"
-    text = (run_dir / "config.yml").read_text()
-    config = yaml.unsafe_load(text)
+    config = yaml.unsafe_load((run_dir / "config.yml").read_text())
     parser = config.pipeline.datamanager.dataparser
     assert (parser.orientation_method, parser.center_method, parser.eval_mode) == ("none", "none", "all")
     assert (parser.auto_scale_poses, parser.load_3D_points, parser.downscale_factor) == (False, False, 1)
@@ -65,42 +48,22 @@ def test_the_config_names_cameras_that_nerfstudio_leaves_as_they_are(ply: Path, 
     assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2"} < set(frame)
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ((), "Give one trained splat, got 0"),
-        (("--load-ply", "scene.ply", "--load-config", "config.yml"), "Give one trained splat, got 2"),
-        (("--load-ply", "scene.ply"), "needs one file of cameras, got none"),
-        (("--load-ply", "scene.ply", "--images", "."), "needs one file of cameras, got none"),
-        (("--load-ply", "scene.ply", "--colmap", "nowhere"), "nowhere, given with --colmap, does not exist"),
-        (("--load-ply", "gone.ply", "--transforms", "ROOM"), "gone.ply, given with --load-ply, does not exist"),
-        (("--load-ply", "scene.ply", "--transforms", "ROOM", "--data", "x"), "--data is for --load-config"),
-        (("--load-ply", "scene.ply", "--transforms", "ROOM", "--views", "some"), "cannot be 'some'"),
-        (("--load-config", "config.yml", "--colmap", "x"), "--colmap is for --load-ply and --load-gsplat"),
-        (("--load-config", "config.yml", "--background", "white"), "--background is for --load-ply"),
-        (("--load-ply", "points.ply", "--transforms", "ROOM"), "is no splat: its 5 vertices have no f_dc_0"),
-        (("--load-gsplat", "other.pt", "--transforms", "ROOM"), "normalized the world of the splat by the points"),
-        (("--load-ply", "scene.ply", "--transforms", "ROOM"), "does not show what its photographs show"),
-        (("--load-ply", "far.ply", "--transforms", "ROOM"), "do not look at this splat"),
-    ],
-)
-def test_what_does_not_fit_is_one_message(ply, trained, monkeypatch, capsys, flags, message) -> None:
-    columns = ply_columns(random_splat(5))
+def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
+    """What shows before the splat is read is in test_early.py."""
+    columns, splat = ply_columns(random_splat(5)), ply_columns(Splat(**open_scene(little).parameters))
     write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})
     write_gsplat(ply.parent / "other.pt", random_splat(50))
-    far = ply_columns(Splat(**open_scene(trained).parameters))
-    write_ply(ply.parent / "far.ply", {**far, "z": far["z"] + 1000})
-    room = trained.parents[4] / "room"
-    words = [room if flag == "ROOM" else flag for flag in flags]
-    assert run_entry(monkeypatch, lift.entrypoint, *words, *SMALL) == 1
-    printed = capsys.readouterr()
-    text = " ".join((printed.out + printed.err).replace("│", " ").split())
-    assert message in text
-    assert "Traceback" not in text
-    assert not (ply.parent / "outputs").exists()
-
-
-def test_a_lift_that_was_refused_can_be_asked_for(ply: Path, trained: Path, monkeypatch) -> None:
-    flags = ("--load-ply", ply, "--transforms", trained.parents[4] / "room", *SMALL, "--timestamp", "a")
-    assert run_entry(monkeypatch, lift.entrypoint, *flags, "--check", "False") == 0
+    write_ply(ply.parent / "far.ply", {**splat, "z": splat["z"] + 1000})
+    given = ("--transforms", little.parents[4] / "room", *SMALL, "--timestamp", "a", "--max-views", "2")
+    for kind, name, *facts in (
+        ("ply", "points.ply", "no splat", "5", "f_dc_0"),
+        ("gsplat", "other.pt", "normalized"),
+        ("ply", "scene.ply", "does not show"),
+        ("ply", "far.ply", "do not look at this splat"),
+    ):
+        assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
+        text = said(capsys).replace("│", " ")
+        assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, text
+        assert not (ply.parent / "outputs").exists()
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-ply", ply, *given, "--check", "False") == 0
     assert (ply.parent / "outputs" / "room" / "normlift" / "a" / "config.yml").is_file()

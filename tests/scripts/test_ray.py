@@ -20,7 +20,7 @@ batch()
 """
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_the_recipe_for_ray(tmp_path, monkeypatch, capsys):
     ray = pytest.importorskip("ray", reason="ray is not installed; it is no dependency: pip install ray")
     made = Batch(tmp_path, ["0.05"] * 12)

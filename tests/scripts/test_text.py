@@ -7,29 +7,18 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
 from rich.console import Console
 
 from normlift_ns.errors import visible
 from normlift_ns.scripts import evaluate, export, lift, query, shared
 from normlift_ns.scripts.answers import prompting
+from tests.scripts.conftest import run_entry
 
 HOSTILE = [
-    "[/red]",
-    "[bold]red[/bold]",
-    "[link=http://x]y[/link]",
-    ":smile:",
-    ":tada: [red",
-    "a[0]\\[1]",
-    "\x1b[31mred\x1b[0m",
-    "\x1b]0;title\x07",
-    "two\nlines",
-    "\rover",
-    "\u202eright to left",
-    "\x9b2J",
-    "\udc80",
+    "[/red]", "[bold]red[/bold]", "[link=http://x]y[/link]", ":smile:", ":tada: [red", "a[0]\\[1]",
+    "\x1b[31mred\x1b[0m", "\x1b]0;title\x07", "two\nlines", "\rover", "\u202eright to left", "\x9b2J", "\udc80",
     "$\\frac{$",
-]
+]  # fmt: skip
 NUMBERS = {
     "fraction": 0.5, "centroid": [0.0] * 3, "extent": None, "peak": 0.5, "mean_reliability": None,
     "suggested_threshold": None, "histogram": None,
@@ -41,19 +30,9 @@ OBJECT = {
 
 
 def summary(text: str) -> Any:
-    manifest = {
-        "statistics": {
-            "gaussians": 1,
-            "zero_evidence_share": 0,
-            "excluded": 0,
-            "left_out": 0,
-            "reliability_quantiles": {},
-        },
-        "forms": {"float16": {"bytes": 1, "bound": 0.1}},
-        "form": "float16",
-        "features": {"kind": "given"},
-        "cost": {},
-    }
+    told = {"gaussians": 1, "zero_evidence_share": 0, "excluded": 0, "left_out": 0, "reliability_quantiles": {}}
+    forms = {"float16": {"bytes": 1, "bound": 0.1}}
+    manifest = {"statistics": told, "forms": forms, "form": "float16", "features": {"kind": "given"}, "cost": {}}
     run = SimpleNamespace(field=SimpleNamespace(manifest=manifest), seconds={}, folder=text)
     return lift.summary(run, {}, 1.0)  # type: ignore[arg-type]
 
@@ -70,44 +49,50 @@ TABLES: dict[str, Callable[[str], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", TABLES)
-@pytest.mark.parametrize("text", HOSTILE)
-@pytest.mark.parametrize("stock", [False, True])
-def test_tables_show_texts_as_they_are(name, text, stock):
-    """Also on a console that would interpret markup, in colours."""
+def printed(content: Any, **options: Any) -> str:
+    """What a console of colours prints."""
     file = io.StringIO()
-    options: dict[str, Any] = {} if stock else {"markup": False, "emoji": False, "highlight": False}
-    console = Console(file=file, width=200, force_terminal=True, color_system="truecolor", **options)
-    console.print(TABLES[name](text))
-    shown = file.getvalue()
-    assert visible(text) in shown
-    for start in ("\x1b]", "\x1b[31m", "\x07", "\r", "\u202e", "\x9b"):
-        assert start not in shown
-    shown.encode("utf8")
+    Console(file=file, width=200, force_terminal=True, color_system="truecolor", **options).print(content)
+    return file.getvalue()
 
 
-@pytest.mark.parametrize("text", HOSTILE)
-def test_lines_are_texts_too(text, capsys):
-    shared.say(f"Written: {text}/{'long/' * 60}end")
-    shared.say_error(f"{text} does not exist")
-    shown = capsys.readouterr()
-    assert shown.out == f"Written: {visible(text)}/{'long/' * 60}end\n"
-    assert shown.err == f"{visible(text)} does not exist\n"
+def test_hostile_texts_are_shown_as_they_are():
+    """Also on a console that would interpret markup, in colours."""
+    for text in HOSTILE:
+        for options in ({}, {"markup": False, "emoji": False, "highlight": False}):
+            shown = printed(shared.plain(text), **options)
+            assert visible(text) in shown, text
+            assert not [x for x in ("\x1b]", "\x1b[31m", "\x07", "\r", "\u202e", "\x9b") if x in shown], text
+            shown.encode("utf8")
 
 
-@pytest.mark.parametrize("text", HOSTILE[:5])
-def test_the_consoles_of_commands_interpret_nothing(text, capsys):
-    shared.CONSOLE.rule(text)
-    shared.CONSOLE.print(text)
-    shared.ERRORS.print(text)
-    shown = capsys.readouterr()
-    assert shown.out.count(text) == 2 and shown.err == f"{text}\n"
+def test_every_table_shows_texts_as_they_are():
+    for name, table in TABLES.items():
+        for text in (":smile: [/red]", "\x1b[31m[bold]red"):
+            shown = printed(table(text))
+            assert visible(text) in shown and "\x1b[31m" not in shown, name
+
+
+def test_lines_are_texts_too(capsys):
+    for text in HOSTILE:
+        shared.say(f"Written: {text}/{'long/' * 60}end")
+        shared.say_error(f"{text} does not exist")
+        shown = capsys.readouterr()
+        assert shown.out == f"Written: {visible(text)}/{'long/' * 60}end\n"
+        assert shown.err == f"{visible(text)} does not exist\n"
+
+
+def test_the_consoles_of_commands_interpret_nothing(capsys):
+    for text in HOSTILE[:5]:
+        shared.CONSOLE.rule(text)
+        shared.CONSOLE.print(text)
+        shared.ERRORS.print(text)
+        shown = capsys.readouterr()
+        assert shown.out.count(text) == 2 and shown.err == f"{text}\n"
 
 
 def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch, capsys):
     """From the flag to the table, the files and their names; the colour is what the encoder reads."""
-    from tests.scripts.conftest import run_entry  # noqa: PLC0415
-
     texts = ("red [/red]", ":smile: yellow", "[bold]green", "\x1b[31m orange")
     folder = tmp_path / "[x] :smile: [/red]"
     flags = ("--load-config", lifted, "--json", folder / "a.json", "--render-dir", folder, "--render-views", "0003")
@@ -124,12 +109,12 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     assert all(visible(text) in shown for text in texts)
 
 
-@pytest.mark.parametrize("width", [60, 80, 120])
-def test_an_answer_fits_into_the_terminal_with_all_its_numbers(width):
-    file = io.StringIO()
+def test_an_answer_fits_into_the_terminal_with_all_its_numbers():
     row = {"text": "tomato red", **NUMBERS, "centroid": [-0.18, 0.25, -0.45], "extent": [0.26, 0.27, 0.1]}
-    Console(file=file, width=width).print(prompting.table([row], "cosine > 0.5", 0.5, narrow=width < 100))
-    lines = file.getvalue().splitlines()
-    assert max(map(len, lines)) <= width
-    assert "…" not in file.getvalue()
-    assert all(number in file.getvalue() for number in ("-0.18", "0.25", "-0.45", "0.26", "0.27", "0.10"))
+    for width in (60, 80, 120):
+        file = io.StringIO()
+        Console(file=file, width=width).print(prompting.table([row], "cosine > 0.5", 0.5, narrow=width < 100))
+        shown = file.getvalue()
+        assert max(map(len, shown.splitlines())) <= width
+        assert "…" not in shown
+        assert all(number in shown for number in ("-0.18", "0.25", "-0.45", "0.26", "0.27", "0.10"))
