@@ -10,13 +10,12 @@ import pytest
 import torch
 from PIL import Image, ImageDraw
 
+from benchmarks.captures import SHARED
 from normlift_ns.encoders import SourceOptions, make_source, read_image
+from tests.captures import needs_shared
 
-CAPTURES = Path(__file__).parents[2].parent / "shared" / "captures"
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CAPTURES.is_dir(), reason="the captures (../shared/captures) are not here"),
-]
+CAPTURES = SHARED / "captures"
+pytestmark = [pytest.mark.slow, needs_shared]
 
 
 def inside(polygons: list[list[tuple[int, int]]]) -> torch.Tensor:
