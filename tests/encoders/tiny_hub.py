@@ -94,7 +94,7 @@ def _write(folder: Path, model: Any, processor: Any, seed: int) -> None:
 
 
 def write_hub(folder: Path, name: str, seed: int = 0) -> None:
-    """One of the networks of `tests.encoders.tiny.HUB`: `naflex` is SigLIP 2 for images of any shape; the joint space of
+    """One of the networks of `HUB`: `naflex` is SigLIP 2 for images of any shape; the joint space of
     MetaCLIP 2 is narrower than its layers."""
     side = {"height": SIDE, "width": SIDE}
     vision = {**_TINY, "image_size": SIDE, "patch_size": PATCH}
