@@ -60,7 +60,11 @@ def assert_same(a: ViewFeatures, b: ViewFeatures) -> None:
 
 
 def test_a_second_run_computes_nothing(counted, tmp_path):
-    expected = RegionFeatures(Grid(12), ColourEncoder()).view(IMAGE, "a.jpg")
+    source = RegionFeatures(Grid(12), ColourEncoder())
+    kept, expected = cached(source, tmp_path), source.view(IMAGE, "a.jpg")
+    identity = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
+    assert kept.identity == source.identity == identity
+    assert torch.equal(kept.text(["red"]), source.text(["red"]))
     for _ in range(2):  # as two runs would: nothing is held in memory
         assert_same(cached(counted, tmp_path / "new" / "folder").view(IMAGE, "a.jpg"), expected)
     assert asked(counted) == (1, 1)
@@ -159,14 +163,6 @@ def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"labels.*/regions/\w+\.safetensors"):
         cached(counted, tmp_path).view(IMAGE, "a.jpg")
     assert list((tmp_path / "regions").iterdir()) == []
-
-
-def test_identity_and_texts_are_those_of_the_source(tmp_path):
-    source = RegionFeatures(Grid(12), ColourEncoder())
-    kept = cached(source, tmp_path)
-    expected = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
-    assert kept.identity == source.identity == expected
-    assert torch.equal(kept.text(["red"]), source.text(["red"]))
 
 
 def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):

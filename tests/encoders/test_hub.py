@@ -79,7 +79,8 @@ def test_texts_are_read_as_the_librarys_processor_reads_them(both: Both) -> None
 @torch.no_grad()
 def value_path(both: Both, pixels: torch.Tensor) -> torch.Tensor:
     """The library's own modules, whose last attention looks at one patch alone, patch by patch."""
-    model, vision, inputs = both.model, both.model.vision_model, both.prepared(pixels, **_as_it_is(both))
+    more = {"naflex": {"max_num_patches": 40}, "metaclip2": {"do_center_crop": False}}.get(both.name, {})
+    model, vision, inputs = both.model, both.model.vision_model, both.prepared(pixels, do_resize=False, **more)
     if both.name == "metaclip2":
         last, heard = vision.encoder.layers[-1], []
         hook = last.register_forward_pre_hook(lambda _, given: heard.append(given[0]))
@@ -94,13 +95,6 @@ def value_path(both: Both, pixels: torch.Tensor) -> torch.Tensor:
     return torch.stack([vision.head(tokens[:, i : i + 1]) for i in range(count)], dim=1)
 
 
-def _as_it_is(both: Both) -> dict[str, Any]:
-    """Options of the processor that leave the size of an image."""
-    return {"do_resize": False, "max_num_patches": 40} if both.name == "naflex" else {
-        "do_resize": False, **({"do_center_crop": False} if both.name == "metaclip2" else {}),
-    }  # fmt: skip
-
-
 def test_patches_are_those_of_the_value_path(both: Both) -> None:
     for rows, columns in ((4, 4), (3, 5), (6, 2)):
         pixels = scaled(IMAGE, rows * PATCH, columns * PATCH).round().to(torch.uint8)
@@ -112,12 +106,3 @@ def test_patches_are_those_of_the_value_path(both: Both) -> None:
     assert view.features.shape == (12, both.network.width) and int(view.labels.max()) == 11
     found = both.network.patches(scaled(IMAGE, 3 * PATCH, 4 * PATCH))[0]
     torch.testing.assert_close(view.features.double(), torch.nn.functional.normalize(found, dim=1), rtol=0, atol=1e-6)
-
-
-def test_probabilities_rank_texts_as_cosines_do(both: Both) -> None:
-    """Why LERF's rule and its draw are the defaults: scale and bias change no order."""
-    images = torch.nn.functional.normalize(both.network.images(IMAGE[None, :SIDE, :SIDE].permute(0, 3, 1, 2)), dim=1)
-    cosines = images @ torch.nn.functional.normalize(both.network.texts(["red mug", "table"]), dim=1).T
-    bias = both.model.logit_bias if both.name != "metaclip2" else 0.0
-    logits = (both.model.logit_scale.exp() * cosines + bias).detach()
-    assert (logits.sigmoid().argsort() == cosines.argsort()).all() and float(both.model.logit_scale.exp()) > 0

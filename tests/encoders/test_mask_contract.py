@@ -10,7 +10,6 @@ import pytest
 import torch
 from PIL import Image
 from safetensors.torch import load_file, save_file
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from normlift_ns.encoders.cache import CachedRegions
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
@@ -20,7 +19,7 @@ from normlift_ns.encoders.sam.masks import SamMasks
 from normlift_ns.encoders.sam.rules import Suppression
 from normlift_ns.encoders.sam.text_masks import Sam3Masks, Sam3Network
 from tests.encoders.test_library import LOOSE, photograph
-from tests.encoders.tiny import copied, refused
+from tests.encoders.tiny import Largest, copied, refused
 
 EVERY = replace(LOOSE, box_iou=0.99, suppression=Suppression(iou=1.0, score=-9.0, outer=0.0, inner=2.0))
 NETWORKS = ("sam", "sam2", "sam_hq", "sam3")
@@ -130,19 +129,6 @@ def test_half_precision_is_within_its_error(folders, kind):
     most = 0.35 if kind == "sam" else 0.15
     assert 0 < error < most, error
     assert 0 < float((near - scores).abs().max()) < most * float(scores.abs().max())
-
-
-class Largest(TorchDispatchMode):
-    """The most elements of any floating tensor that is made."""
-
-    most = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        found = func(*args, **(kwargs or {}))
-        for one in found if isinstance(found, tuple | list) else (found,):
-            if isinstance(one, torch.Tensor) and one.is_floating_point():
-                self.most = max(self.most, one.numel())
-        return found
 
 
 @pytest.mark.parametrize("kind", NETWORKS)

@@ -174,12 +174,9 @@ def test_masks_of_photographs(sam_weights):
 
 
 def test_a_checkpoint_counts_by_its_content(sam_weights, tmp_path):
-    copy = tmp_path / "other.pth"
+    sam, copy = SamMasks(str(sam_weights / "sam_tiny.pth")), tmp_path / "other.pth"
     copy.write_bytes((sam_weights / "sam_tiny.pth").read_bytes())
-    sam = SamMasks(str(sam_weights / "sam_tiny.pth"))
-    assert SamMasks(str(copy)).identity == sam.identity
-    assert json.loads(json.dumps(sam.identity)) == sam.identity
-    assert replace(sam, level="s").identity == sam.identity  # all levels are found at once
+    assert SamMasks(str(copy)).identity == sam.identity == replace(sam, level="s").identity  # all levels are found
     assert replace(sam, rules=LOOSE).identity != sam.identity
     copy.write_bytes(copy.read_bytes() + b"x")
     assert SamMasks(str(copy)).identity != sam.identity

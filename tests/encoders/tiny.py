@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import save_file
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from normlift_ns.encoders.clip.weights import import_open_clip
 from normlift_ns.errors import InputError
@@ -103,3 +104,16 @@ def copied(folder: Path, to: Path) -> Path:
 def noise(height: int, width: int, seed: int = 0) -> torch.Tensor:
     """An image."""
     return torch.randint(0, 256, (height, width, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+
+
+class Largest(TorchDispatchMode):
+    """The most elements of any floating tensor that is made."""
+
+    most = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        for one in found if isinstance(found, tuple | list) else (found,):
+            if isinstance(one, torch.Tensor) and one.is_floating_point():
+                self.most = max(self.most, one.numel())
+        return found
