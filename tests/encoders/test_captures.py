@@ -26,24 +26,22 @@ def inside(polygons: list[list[tuple[int, int]]]) -> torch.Tensor:
     return torch.from_numpy(np.array(mask))
 
 
-HEAD = inside([[(270, 180), (290, 100), (335, 85), (360, 200), (420, 195), (470, 180), (440, 240), (450, 320),
-                (490, 390), (440, 430), (340, 400), (320, 540), (160, 570), (140, 450), (190, 350)]])  # fmt: skip
-CURTAIN = inside([[(450, 40), (535, 40), (535, 180), (450, 180)]])
-ROSE = inside([[(190, 70), (235, 70), (235, 150), (190, 150)]])
-WALLPAPER = inside([[(0, 700), (540, 700), (540, 960), (0, 960)], [(420, 500), (540, 500), (540, 700), (420, 700)],
-                    [(0, 180), (110, 180), (110, 330), (0, 330)]])  # fmt: skip
-
-
 def test_colours_of_the_fox():
+    head = inside([[(270, 180), (290, 100), (335, 85), (360, 200), (420, 195), (470, 180), (440, 240), (450, 320),
+                    (490, 390), (440, 430), (340, 400), (320, 540), (160, 570), (140, 450), (190, 350)]])  # fmt: skip
+    wallpaper = inside([[(0, 700), (540, 700), (540, 960), (0, 960)], [(420, 500), (540, 500), (540, 700), (420, 700)],
+                        [(0, 180), (110, 180), (110, 330), (0, 330)]])  # fmt: skip
+    curtain = inside([[(450, 40), (535, 40), (535, 180), (450, 180)]])
+    rose = inside([[(190, 70), (235, 70), (235, 150), (190, 150)]])
     source = make_source(SourceOptions(encoder="colour"))
     view = source.view(read_image(CAPTURES / "fox" / "images" / "0001.jpg"), "images/0001.jpg")
     cosine = view.features @ source.text(["orange", "crimson"]).T
     orange, crimson = cosine[view.labels.long()].permute(2, 0, 1)
-    assert orange[HEAD].mean() > 2.5 * orange[WALLPAPER].mean()
-    assert orange[HEAD].mean() > 0.3
-    for red in (CURTAIN, ROSE):
-        assert crimson[red].mean() > 10 * crimson[WALLPAPER].mean()
-        assert crimson[red].mean() > 2 * crimson[HEAD].mean()
+    assert orange[head].mean() > 2.5 * orange[wallpaper].mean()
+    assert orange[head].mean() > 0.3
+    for red in (curtain, rose):
+        assert crimson[red].mean() > 10 * crimson[wallpaper].mean()
+        assert crimson[red].mean() > 2 * crimson[head].mean()
 
 
 def test_objects_of_the_tabletop():

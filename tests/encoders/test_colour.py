@@ -98,6 +98,11 @@ def test_numbers_of_familiar_colours():
     assert cosine[0].tolist() == pytest.approx([1, 0.93, 0.43, 0.22, 0.01, 0], abs=0.01)
     cosine = COLOUR.text(["white"]) @ COLOUR.text(["grey", "black"]).T
     assert cosine[0].tolist() == pytest.approx([0.43, 0.00], abs=0.01)
+    # Several names answer alike
+    black, white, both = COLOUR.text(["black", "white", "a black and white cat"])
+    apart = (black @ white).item()
+    assert (both @ black).item() == pytest.approx(math.sqrt((1 + apart) / 2), abs=1e-5)
+    assert (both @ white).item() == pytest.approx((both @ black).item(), abs=1e-5)
 
 
 def test_a_region_is_its_mean_cielab_colour():
@@ -138,13 +143,6 @@ def test_prompts_are_reduced_to_names():
         "": [],
     }.items():
         assert colour_names(prompt) == found, prompt
-
-
-def test_several_names_answer_alike():
-    black, white, both = COLOUR.text(["black", "white", "a black and white cat"])
-    apart = (black @ white).item()
-    assert (both @ black).item() == pytest.approx(math.sqrt((1 + apart) / 2), abs=1e-5)
-    assert (both @ white).item() == pytest.approx((both @ black).item(), abs=1e-5)
 
 
 def test_what_names_no_colour_is_refused_with_near_names():

@@ -80,29 +80,31 @@ def table() -> np.ndarray:
     return torch.nn.functional.normalize(torch.arange(7.0 * 20).reshape(7, 20) + 1, dim=1).numpy()
 
 
-LOADERS: dict[str, tuple[str, bytes, Callable[[Path], Callable[[], object]], dict[str, bytes]]] = {
-    "label map, NPY": ("a.npy", npy(MAP), map_loader, {}),
-    "label map, 8 bits": ("a.png", png(MAP.astype(np.uint8)), map_loader, {}),
-    "label map, 16 bits": ("a.png", png((300 * MAP).astype(np.uint16)), map_loader, {}),
-    "segment map": ("a_s.npy", npy(np.stack([MAP] * 4).astype("f4")), langsplat_loader, {"a_f.npy": npy(table())}),
-    "feature table": ("a_f.npy", npy(table()), langsplat_loader, {"a_s.npy": npy(np.stack([MAP] * 4))}),
-    "text vectors": ("t.npz", npz(fox=np.arange(4.0), mug=np.ones(4)), text_loader, {}),
-    "picture": ("p.jpg", png(IMAGE.numpy()), lambda folder: lambda: read_image(folder / "p.jpg"), {}),
-}
+def loaders() -> dict[str, tuple[str, bytes, Callable[[Path], Callable[[], object]], dict[str, bytes]]]:
+    """A file's name and content, what loads it from its folder, and the files beside it."""
+    return {
+        "label map, NPY": ("a.npy", npy(MAP), map_loader, {}),
+        "label map, 8 bits": ("a.png", png(MAP.astype(np.uint8)), map_loader, {}),
+        "label map, 16 bits": ("a.png", png((300 * MAP).astype(np.uint16)), map_loader, {}),
+        "segment map": ("a_s.npy", npy(np.stack([MAP] * 4).astype("f4")), langsplat_loader, {"a_f.npy": npy(table())}),
+        "feature table": ("a_f.npy", npy(table()), langsplat_loader, {"a_s.npy": npy(np.stack([MAP] * 4))}),
+        "text vectors": ("t.npz", npz(fox=np.arange(4.0), mug=np.ones(4)), text_loader, {}),
+        "picture": ("p.jpg", png(IMAGE.numpy()), lambda folder: lambda: read_image(folder / "p.jpg"), {}),
+    }
 
 
-@pytest.mark.parametrize("kind", LOADERS)
-def test_damaged_files_and_what_is_none_raise_our_errors_only(kind: str, tmp_path: Path) -> None:
-    name, whole, loader, others = LOADERS[kind]
-    for other, content in others.items():
-        (tmp_path / other).write_bytes(content)
-    (tmp_path / name).write_bytes(whole)
-    loader(tmp_path)()
-    fuzz(15, damaged(whole), tmp_path / name, loader(tmp_path))
-    (tmp_path / name).unlink()
-    for _ in no_files(tmp_path / name):
-        refused(loader(tmp_path), str(tmp_path), error=Exception)
-        survives(loader(tmp_path))
+def test_damaged_files_and_what_is_none_raise_our_errors_only(tmp_path: Path) -> None:
+    for kind, (name, whole, loader, others) in loaders().items():
+        folder = tmp_path / kind
+        folder.mkdir()
+        for other, content in {**others, name: whole}.items():
+            (folder / other).write_bytes(content)
+        loader(folder)()
+        fuzz(15, damaged(whole), folder / name, loader(folder))
+        (folder / name).unlink()
+        for _ in no_files(folder / name):
+            refused(loader(folder), str(folder), error=Exception)
+            survives(loader(folder))
 
 
 def test_any_header_of_an_array_raises_our_errors_only(tmp_path: Path) -> None:

@@ -119,14 +119,12 @@ def test_sum_adds_all_levels_up(folder):
     # Nine combinations of rows occur, and no pixel is without any but the last two.
     assert (pixels(view).norm(dim=2) == 0).tolist() == [[False] * 4, [False] * 4, [False, False, True, True]]
     assert len(view.features) == len({tuple(c[y][x] for c in CHANNELS) for y in range(3) for x in range(4)}) - 1
-
-
-def test_opposite_vectors_cancel_in_the_sum(tmp_path):
+    # Opposite vectors cancel
     table = rows()
     table[5] = [-value for value in table[0]]
-    put_map(tmp_path, [DEFAULT, [[X] * 4] * 3, [[X] * 4] * 3, L])
-    put_table(tmp_path, table)
-    view = source(tmp_path, "sum").view(IMAGE, NAME)
+    put_map(folder, [DEFAULT, [[X] * 4] * 3, [[X] * 4] * 3, L])
+    put_table(folder, table)
+    view = source(folder, "sum").view(IMAGE, NAME)
     assert (pixels(view)[:2, :2] == 0).all()
     assert (pixels(view)[:2, 2:3].norm(dim=2) > 0.99).all()
 
@@ -139,10 +137,7 @@ def test_maps_and_tables_of_every_type(folder):
     for kind in "fde":
         put_table(folder, rows(), kind=kind)
         assert_close(source(folder).view(IMAGE, NAME), expected(L))
-
-
-def test_unsigned_maps_wrap_minus_one_around(folder):
-    """-1 becomes 255, which is past the table."""
+    # -1 becomes 255, which is past the table
     put_map(folder, [[[value % 256 for value in row] for row in c] for c in CHANNELS], kind="B", descr="|u1")
     with pytest.warns(UserWarning, match=r"_s\.npy: channels 0, 1, 2, 3 .* 7 rows .*\(255\)"):
         assert_close(source(folder).view(IMAGE, NAME), expected(L))
@@ -193,9 +188,7 @@ def test_maps_of_another_resolution(folder):
     stretched = torch.zeros(HEIGHT, 2 * WIDTH, 3, dtype=torch.uint8)
     refused(lambda: source(folder).view(stretched, NAME), "_s.npy is 4x3", "8x3")
     assert_close(source(folder, resample=True).view(stretched, NAME), expected(L).repeat_interleave(2, 1))
-
-
-def test_regions_that_vanish_in_a_small_image_have_no_rows(folder):
+    # Regions that vanish have no rows
     view = source(folder, "s", resample=True).view(torch.zeros(1, 1, 3, dtype=torch.uint8), NAME)
     assert view.features.shape == (1, D)  # row 3 of the table, at the centre
 
@@ -221,9 +214,7 @@ def test_names_end_at_the_first_dot_or_the_last(folder):
     assert_close(source(folder).view(IMAGE, "a.left.jpg"), expected(M))
     names = ["x/a.right.png", "a.jpg"]
     refused(lambda: source(folder).available(names), *names, "a_s.npy")
-
-
-def test_paths_in_names_lead_nowhere_else(folder):
+    # Paths in names lead nowhere else
     (folder / "inner").mkdir()
     put_map(folder / "inner", stem="b")
     put_table(folder / "inner", rows(), stem="b")
@@ -256,13 +247,11 @@ def test_what_names_no_row_counts_as_unlabelled(folder):
             view = source(folder, "sum").view(IMAGE, NAME)
         without = [[[X if value == 5 else value for value in row] for row in channel] for channel in CHANNELS]
         assert_close(view, torch.nn.functional.normalize(sum(expected(channel) for channel in without), dim=2))
-
-
-def test_an_image_without_any_mask(tmp_path):
-    put_map(tmp_path, [[[X] * WIDTH] * HEIGHT] * 4)
-    put_table(tmp_path, [])
+    # An image without any mask
+    put_map(folder, [[[X] * WIDTH] * HEIGHT] * 4)
+    put_table(folder, [])
     for level in ("l", "sum"):
-        view = source(tmp_path, level).view(IMAGE, NAME)
+        view = source(folder, level).view(IMAGE, NAME)
         assert view.features.shape == (0, D) and (view.labels == -1).all()
 
 
@@ -313,8 +302,6 @@ def test_flags_make_the_source(folder):
     ):
         refused(lambda given=given: make_source(SourceOptions(**given)), *parts)
 
-
-# Writing.
 
 PHOTO = noise(30, 40)
 
@@ -367,18 +354,9 @@ def test_existing_files_stay_unless_asked(tmp_path):
     write(overwrite=True)
     assert len(np.load(tmp_path / "a_f.npy")) > 4
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a_f.npy", "a_s.npy"]
-
-
-def test_several_levels_at_once_have_no_place_in_the_format(tmp_path):
-    class Both(LabelFiles):
-        chosen = (0, 1)
-
-    labels_4(tmp_path, 2)
-    both = RegionFeatures(Both(tmp_path), ColourEncoder())
-    refused(lambda: write_langsplat(both, PHOTO, "a.jpg", tmp_path, overwrite=False), "several levels")
-
-
-# Text vectors.
+    both = type("Both", (LabelFiles,), {"chosen": (0, 1)})(labels_4(tmp_path, 2).regions.folder)
+    several = RegionFeatures(both, ColourEncoder())  # at once, which have no place in the format
+    refused(lambda: write_langsplat(several, PHOTO, "a.jpg", tmp_path, overwrite=False), "several levels")
 
 
 def test_text_vectors_are_looked_up_and_normalised(tmp_path):
@@ -400,9 +378,8 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
     with pytest.raises(FileExistsError):
         write_text_vectors(file, {})
     whole = file.read_bytes()
-    for bit in range(
-        0, 8 * len(whole), max(1, 41 // FACTOR)
-    ):  # what does not matter to the vectors may change: the date of an entry
+    # What is no vector may change, such as the date of an entry
+    for bit in range(0, 8 * len(whole), max(1, 41 // FACTOR)):
         changed = bytearray(whole)
         changed[bit // 8] ^= 1 << bit % 8
         file.write_bytes(changed)

@@ -68,18 +68,7 @@ def test_crops_are_those_of_the_protocol():
             expected = torch.nn.functional.interpolate(pixels[None], size, mode="bilinear", align_corners=False)[0]
             torch.testing.assert_close(resized, expected, rtol=0, atol=1e-3)
             assert np.abs(resized.permute(1, 2, 0).numpy() - cv2.resize(square, size[::-1])).max() <= 1  # cv2 rounds
-
-
-def test_timm_is_imported_without_wandb(monkeypatch):
-    monkeypatch.delitem(sys.modules, "wandb", raising=False)
-    found = []
-    monkeypatch.setattr("importlib.import_module", lambda name: found.append((name, sys.modules["wandb"])))
-    import_open_clip()
-    assert found == [("open_clip", None)]
-    assert "wandb" not in sys.modules
-
-
-def test_a_crop_shows_all_of_a_region_whatever_lies_on_it():
+    # A crop shows all of a region, whatever lies on it
     beneath = torch.full((48, 64), -1, dtype=torch.int32)
     beneath[10:20, 30:41] = 0  # what the second took from the first
     whole = LABELS.where(beneath == -1, 0)
@@ -89,6 +78,15 @@ def test_a_crop_shows_all_of_a_region_whatever_lies_on_it():
     crops = masked_crops(IMAGE, maps, torch.arange(3), boxes, (40, 40), "black")
     assert torch.equal(crops[0], masked_crops(IMAGE, alone[1], torch.tensor([0]), boxes[:1], (40, 40), "black")[0])
     assert torch.equal(crops[1], masked_crops(IMAGE, alone[0], torch.tensor([1]), boxes[1:2], (40, 40), "black")[0])
+
+
+def test_timm_is_imported_without_wandb(monkeypatch):
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    found = []
+    monkeypatch.setattr("importlib.import_module", lambda name: found.append((name, sys.modules["wandb"])))
+    import_open_clip()
+    assert found == [("open_clip", None)]
+    assert "wandb" not in sys.modules
 
 
 @torch.no_grad()

@@ -81,13 +81,17 @@ def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
     close((masks, ious), by_transformers(str(checkpoint), huge, torch.float64), 1e-4)
 
 
-def test_precision_is_part_of_the_identity(checkpoint):
+def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
     sam = SamMasks(str(checkpoint))
     assert resolve_precision("auto", "cpu") == "float32" and resolve_precision("auto", "cuda") == "float16"
     assert sam.identity == SamMasks(str(checkpoint), precision="float32").identity
     assert sam.identity != SamMasks(str(checkpoint), precision="bfloat16").identity
     wrong: Any = "half"
     refused(lambda: SamMasks(str(checkpoint), precision=wrong), "'half'", "--sam-precision", "auto, float32")
+    # In half precision too
+    rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
+    labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
+    assert labels.shape[0] == 4 and int(labels.max()) >= 0
 
 
 @needs_cuda
@@ -105,9 +109,3 @@ def test_a_gpu_measures_masks_as_they_are_enlarged(checkpoint, embedding):
     large = network.enlarge(logits, (96, 128))
     assert float((found.inner - (large > 1).flatten(1).sum(dim=1)).abs().max()) <= 2
     assert float((found.outer - (large > -1).flatten(1).sum(dim=1)).abs().max()) <= 2
-
-
-def test_rules_in_half_precision_find_masks(checkpoint):
-    rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
-    labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
-    assert labels.shape[0] == 4 and int(labels.max()) >= 0

@@ -31,33 +31,27 @@ def test_grid_cells_are_squares_of_one_size(height, width, count):
     assert int(labels.max()) + 1 == -(-height // side) * -(-width // side)
 
 
-def test_grid_by_hand():
+def test_grid_by_hand_and_impossible_settings():
     labels = Grid(6).labels(torch.zeros(4, 5, 3, dtype=torch.uint8), "")[0, 0]
     assert labels.tolist() == [[0, 0, 1, 1, 2], [0, 0, 1, 1, 2], [3, 3, 4, 4, 5], [3, 3, 4, 4, 5]]
+    refused(lambda: Grid(0), "1", "0")
+    refused(lambda: Superpixels(-3), "1", "-3")
+    refused(lambda: Superpixels(3, compactness=0), "compactness", "0")
 
 
-def test_superpixels_keep_to_edges():
+def test_superpixels_keep_to_edges_also_of_tiny_images():
     image = torch.full((60, 81, 3), 40, dtype=torch.uint8)
     image[:, 37:] = 215
     labels = Superpixels(30).labels(image, "")[0, 0]
     assert_compact(labels)
     assert set(labels[:, :37].unique().tolist()).isdisjoint(labels[:, 37:].unique().tolist())
     assert 20 <= int(labels.max()) + 1 <= 45
-
-
-def test_superpixels_of_tiny_images():
     for size in ((1, 1), (1, 40), (40, 1), (7, 5), (33, 64)):
         for image in (torch.full((*size, 3), 9, dtype=torch.uint8), noise(*size)):
             labels = Superpixels(256).labels(image, "")[0, 0]
             assert labels.shape == size
             assert_compact(labels)
             assert int(labels.min()) == 0
-
-
-def test_impossible_settings_are_refused():
-    refused(lambda: Grid(0), "1", "0")
-    refused(lambda: Superpixels(-3), "1", "-3")
-    refused(lambda: Superpixels(3, compactness=0), "compactness", "0")
 
 
 MAP = np.array([[0, 7, 7], [3, 0, 200]])
@@ -192,9 +186,7 @@ def test_wrong_label_files_say_what_is_wrong(tmp_path):
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "3 colour channels")
     (tmp_path / "a.png").write_bytes(b"no picture")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "picture")
-
-
-def test_missing_and_ambiguous_label_files(tmp_path):
+    # Missing and ambiguous ones
     refused(lambda: LabelFiles(tmp_path / "nowhere"), "nowhere", "--regions-dir", error=FileNotFoundError)
     parts = ("images/b.jpg", "b.png or b.npy")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/b.jpg"), *parts, error=FileNotFoundError)

@@ -82,15 +82,9 @@ def test_the_masks_are_those_of_metas_generator(sam_weights, monkeypatch, size):
     kept = SamMasks(str(sam_weights / "tiny"), rules=replace(rules, suppression=EVERYTHING)).masks(image)
     chosen = SamMasks(str(sam_weights / "tiny"), rules=rules).masks(image)
 
-    generator = import_module("segment_anything").SamAutomaticMaskGenerator(
-        tiny_sam(seed=1),
-        points_per_side=5,
-        pred_iou_thresh=0.6,
-        stability_score_thresh=0.6,
-        box_nms_thresh=0.7,
-        crop_n_layers=1,
-        min_mask_region_area=15,
-    )
+    same = {"points_per_side": 5, "pred_iou_thresh": 0.6, "stability_score_thresh": 0.6, "min_mask_region_area": 15}
+    made = import_module("segment_anything").SamAutomaticMaskGenerator
+    generator = made(tiny_sam(seed=1), **same, box_nms_thresh=0.7, crop_n_layers=1)
     predictor = generator.predictor
     for level, channels in zip(LEVELS, (slice(0, 3), slice(0, 1), slice(1, 2), slice(2, 3)), strict=True):
 
@@ -149,9 +143,7 @@ def test_label_maps_hold_all_levels_with_overlaps_beneath(sam_weights, monkeypat
         assert int(maps.max()) == len(level) - 1
     assert [replace(sam, level=level).chosen for level in LEVELS] == [(0,), (1,), (2,), (3,)]
     assert SamMasks(str(sam_weights / "tiny")).chosen == (3,)
-
-
-def test_no_mask_is_good_enough(sam_weights):
+    # No mask is good enough
     sam = SamMasks(str(sam_weights / "tiny"), rules=MaskRules(points_per_side=2, predicted_iou=9.0))
     labels = sam.labels(noise(30, 40), "a.jpg")
     assert labels.shape == (4, 1, 30, 40) and bool((labels == -1).all())

@@ -12,13 +12,7 @@ from tests.encoders.tiny import refused
 UNIT = torch.nn.functional.normalize(torch.arange(1.0, 7.0).reshape(2, 3), dim=1)
 
 
-def test_view_features_accept_unlabelled_pixels_and_regions_without_pixels():
-    view = ViewFeatures(torch.tensor([[-1, 0], [0, 0]], dtype=torch.int32), UNIT)
-    assert view.features.shape == (2, 3)
-    ViewFeatures(torch.full((4, 5), -1, dtype=torch.int32), torch.zeros(0, 3))
-
-
-def test_view_features_refuse_what_does_not_fit():
+def test_view_features_accept_what_fits_and_refuse_the_rest():
     none = torch.zeros(2, 2, dtype=torch.int32)
     for labels, features, parts in (
         (none.float(), UNIT, ["labels", "torch.int32"]),
@@ -30,6 +24,10 @@ def test_view_features_refuse_what_does_not_fit():
         (none, UNIT * torch.tensor([[1.0], [torch.nan]]), ["row 1 has length nan"]),
     ):
         refused(lambda given=(labels, features): ViewFeatures(*given), *parts)
+    # Unlabelled pixels and regions without pixels fit
+    view = ViewFeatures(torch.tensor([[-1, 0], [0, 0]], dtype=torch.int32), UNIT)
+    assert view.features.shape == (2, 3)
+    ViewFeatures(torch.full((4, 5), -1, dtype=torch.int32), torch.zeros(0, 3))
 
 
 def test_regions_of_cells_must_have_features():

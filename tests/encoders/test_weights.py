@@ -48,16 +48,14 @@ def test_all_published_weights_are_known(empty_hub: Path, open_clip: Any) -> Non
     assert all(clip_weights_at_hand(model, tag) is False for model, tag in published[::9])
 
 
-def test_weights_of_sam(empty_hub: Path, tmp_path: Path) -> None:
+def test_weights_of_sam_and_a_broken_cache(empty_hub: Path, tmp_path: Path) -> None:
     for file in ("config.json", "model.safetensors"):
         assert not sam_weights_at_hand(DEFAULT_SAM)
         put(empty_hub, DEFAULT_SAM, file)
     assert sam_weights_at_hand(DEFAULT_SAM)
     assert sam_weights_at_hand(str(tmp_path))
     assert not sam_weights_at_hand("a/b")
-
-
-def test_a_broken_cache_holds_nothing(empty_hub: Path) -> None:
+    # A broken cache holds nothing
     put(empty_hub, REPOSITORY, "config.json")
     assert is_cached(REPOSITORY, "config.json")
     for content in (b"\xff\xfe", b"a\0b", b"x" * 5000, b""):
