@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,20 +14,10 @@ import torch
 
 from normlift_ns.encoders import SourceOptions, make_source
 from normlift_ns.encoders.build import resolve_regions, source_settings
-from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.hub.encoder import HubEncoder
 from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.text_encoders import default_rule, encoder_of, encoder_settings
-from tests.encoders.tiny import copied, noise, refused
-
-IMAGE = noise(48, 64)
-
-
-class Field:
-    """What is known of a field."""
-
-    def __init__(self, manifest: dict[str, Any]) -> None:
-        self.manifest = manifest
+from tests.encoders.tiny import copied, refused
 
 
 @pytest.fixture
@@ -34,9 +25,11 @@ def folder(hub_weights: Path, tmp_path: Path) -> Path:
     return copied(hub_weights / "siglip2", tmp_path / "net")
 
 
-def lifted(folder: Path, regions: Any) -> Field:
+def lifted(folder: Path, regions: Any) -> Any:
+    """What is known of a field."""
     options = SourceOptions(encoder="siglip2", encoder_model=str(folder), regions=regions, region_count=12)
-    return Field({"encoder": encoder_settings(options), "features": make_source(options).identity, "dimension": 32})
+    features = make_source(options).identity
+    return SimpleNamespace(manifest={"encoder": encoder_settings(options), "features": features, "dimension": 32})
 
 
 def test_regions_are_patches_where_there_is_no_gpu(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,11 +67,3 @@ def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> Non
     assert json.loads(done.stdout) == expected[::-1].tolist()
     asked = encoder_of(field, cache=tmp_path / "texts")
     refused(lambda: asked.rows(["wine"]), "net", "--encoder-model", error=FileNotFoundError)
-
-
-def test_features_of_regions_are_kept(folder: Path, tmp_path: Path) -> None:
-    options = SourceOptions(encoder="siglip2", encoder_model=str(folder), regions="grid", region_count=12)
-    expected = cached(make_source(options), tmp_path / "cache").view(IMAGE, "a.jpg")
-    again: Any = make_source(options)
-    vars(again.encoder)["network"] = None
-    assert torch.equal(cached(again, tmp_path / "cache").view(IMAGE, "a.jpg").features, expected.features)

@@ -337,13 +337,6 @@ def test_a_round_trip_is_exact(tmp_path, levels):
             assert channel.max() == start[number + 1] - 1
 
 
-def test_a_copy_of_langsplats_own_file_is_the_same_level(folder, tmp_path):
-    write_langsplat(source(folder), IMAGE, NAME, tmp_path / "copy", overwrite=False)
-    first, second = (source(place).view(IMAGE, NAME) for place in (folder, tmp_path / "copy"))
-    assert torch.equal(first.features, second.features)
-    assert torch.equal(pixels(first), pixels(second))
-
-
 def test_existing_files_stay_unless_asked(tmp_path):
     ours = RegionFeatures(Grid(4), ColourEncoder())
     for _ in range(2):  # the same content: as where an interrupted lift goes on

@@ -10,7 +10,7 @@ from PIL import Image
 
 from normlift_ns.encoders.sam import folders
 from normlift_ns.encoders.sam.library import load_network
-from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks
+from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.encoders.sam.rules import Suppression
 from tests.encoders.tiny import copied, refused
 from tests.encoders.tiny_library import SIDE, write_tiny
@@ -62,17 +62,6 @@ def test_answers_are_those_of_transformers(library_weights: Path, kind: str, tra
         large = processor.post_process_masks([expected.float()], *sizes.values(), binarize=False)[0]
         ours = network.enlarge(logits.flatten(0, 1), size)
         torch.testing.assert_close(ours, large.flatten(0, 1).float(), rtol=0, atol=3e-5 * scale)
-
-
-def test_levels_are_the_three_masks_of_a_point(library_weights: Path) -> None:
-    image = photograph(40, 60)
-    for kind in KINDS:
-        sam = SamMasks(str(library_weights / kind), rules=LOOSE)
-        masks = sam.masks(image)
-        assert list(masks) == list(LEVELS) and all(len(level) > 0 for level in masks.values())
-        assert not torch.equal(masks["s"][0], masks["l"][0])
-        labels = sam.labels(image, "a.jpg")
-        assert labels.shape[0] == 4 and labels.shape[2:] == (40, 60)
 
 
 def test_checkpoints_for_video_hold_the_model_for_images(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from normlift_ns.encoders.cache import CachedRegions
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.encoders.sam import rules, text_masks
 from normlift_ns.encoders.sam.library import load_network
-from normlift_ns.encoders.sam.masks import SamMasks
+from normlift_ns.encoders.sam.masks import LEVELS, SamMasks
 from normlift_ns.encoders.sam.rules import Suppression
 from normlift_ns.encoders.sam.text_masks import Sam3Masks, Sam3Network
 from tests.encoders.test_library import LOOSE, photograph
@@ -63,6 +63,10 @@ def test_labels_have_no_gaps_and_repeat(folders, kind, tmp_path):
         beneath = (level[:-1] >= 0) | (level[1:] < 0)  # nothing lies beneath nothing
         assert bool(beneath.all())
     assert int(labels.max()) >= 0
+    if kind in NETWORKS[:3]:
+        masks = source.masks(IMAGE)
+        assert tuple(masks) == LEVELS and levels == 4 and all(len(level) > 0 for level in masks.values())
+        assert not torch.equal(masks["s"][0], masks["l"][0])  # of the three masks of a point
     assert max(source.chosen, default=0) < levels
     assert torch.equal(labels, make(kind, folder).labels(IMAGE.clone(), NAME))
     kept = CachedRegions(source, tmp_path)

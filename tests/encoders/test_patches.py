@@ -6,11 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.captures import SHARED
 from normlift_ns.encoders.clip.patches import dense_tokens
-from normlift_ns.encoders.images import read_image
 from normlift_ns.encoders.patches import PatchFeatures, patch_grid
-from tests.captures import needs_shared
 from tests.encoders.tiny import CLIP, noise, refused
 
 IMAGE = noise(48, 80)
@@ -87,12 +84,3 @@ def test_what_has_no_patches_is_refused(clip):
     ):
         refused(lambda model=model: PatchFeatures(replace(clip, model=model)), model, reason)
     refused(lambda: PatchFeatures(clip, 0), "1", "0")
-
-
-@pytest.mark.slow
-@needs_shared
-def test_a_photograph(clip):
-    image = read_image(SHARED / "captures" / "fox" / "images" / "0001.jpg")
-    view = PatchFeatures(clip).view(image, "images/0001.jpg")
-    assert view.labels.shape == image.shape[:2] and len(view.features) == 43 * 24
-    assert len(view.features.unique(dim=0)) == 43 * 24

@@ -80,15 +80,11 @@ def test_blobs_and_holes_in_them(blobs, least):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_noise(device):
+def test_noise_stripes_checkerboards_and_plain_masks(device):
     g = np.random.default_rng(3)
     for share in (0.002, 0.1, 0.4, 0.5, 0.6, 0.9, 0.998):
         _, changed = assert_right(g.random((3, 60, 71)) < share, 20, device)
         assert all(changed)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_stripes_checkerboards_and_plain_masks(device):
     y, x = np.mgrid[:40, :47]
     masks = [y % 2 == 0, x % 2 == 0, (x + y) % 2 == 0, y > 50, y >= 0, (y == 7) & (x == 9), (y == 39) & (x == 46)]
     masks += [(y == 0) & (x == 0), (x + y) % 5 == 0, (x // 4 + y // 4) % 2 == 0, (y < 20) ^ ((y == 3) & (x > 44))]
@@ -131,7 +127,7 @@ def blotches(*shape: int) -> torch.Tensor:
     return torch.from_numpy(ndimage.uniform_filter(np.random.default_rng(0).random(shape), (0, 5, 5)) > 0.5)
 
 
-def test_chunks_change_nothing(monkeypatch):
+def test_chunks_and_a_gpus_components_change_nothing(monkeypatch):
     masks = blotches(7, 60, 45)
     expected = clean_masks(masks, 40)
     assert expected[1].all() and not torch.equal(expected[0], masks)
@@ -141,6 +137,10 @@ def test_chunks_change_nothing(monkeypatch):
     monkeypatch.undo()
     turned = clean_masks(masks.permute(0, 2, 1), 40)  # another order in memory
     assert torch.equal(turned[0], expected[0].permute(0, 2, 1)) and torch.equal(turned[1], expected[1])
+    monkeypatch.setattr(small_regions, "_joined_by_scipy", small_regions._joined_by_torch)
+    assert all(map(torch.equal, clean_masks(masks, 40), expected))
+    order = torch.from_numpy(np.random.default_rng(0).permutation(3000))  # a long chain is one component
+    assert bool((small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())
 
 
 @examples(20)
@@ -154,13 +154,3 @@ def test_components_are_the_same_on_any_device(data, nodes):
     found = small_regions._joined_by_torch(nodes, edges)
     assert torch.equal(found.unique(return_inverse=True)[1], expected)
     assert bool((found[found] == found).all()) and bool((found <= torch.arange(nodes)).all())
-
-
-def test_a_long_chain_is_one_component_and_masks_are_the_same_on_a_gpu(monkeypatch):
-    order = torch.from_numpy(np.random.default_rng(0).permutation(3000))
-    found = small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]]))
-    assert bool((found == 0).all())
-    masks = blotches(9, 70, 55)
-    expected = clean_masks(masks, 12)
-    monkeypatch.setattr(small_regions, "_joined_by_scipy", small_regions._joined_by_torch)
-    assert all(map(torch.equal, clean_masks(masks, 12), expected))

@@ -32,11 +32,9 @@ def _pieces(special: Sequence[str], bytes_too: bool) -> tuple[dict[str, int], li
     return {name: number for number, name in enumerate(names)}, merges
 
 
-def _ending(tokenizer: Any, first: str, end: str, number: int, start: int = 0) -> None:
-    """Puts the end behind every text, and perhaps something before it."""
-    single = f"{first} $A {end}".strip()
-    known = [(end, number), *([(first, start)] if first else [])]
-    tokenizer.post_processor = processors.TemplateProcessing(single=single, special_tokens=known)
+def _ending(tokenizer: Any, end: str) -> None:
+    """Puts the end, token 1, behind every text."""
+    tokenizer.post_processor = processors.TemplateProcessing(single=f"$A {end}", special_tokens=[(end, 1)])
 
 
 def siglip_tokenizer() -> Any:
@@ -48,15 +46,10 @@ def siglip_tokenizer() -> Any:
     tokenizer.normalizer = normalizers.Sequence([normalizers.Lowercase(), normalizers.Strip()])
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
     tokenizer.decoder = decoders.Metaspace()
-    _ending(tokenizer, "", "</s>", 1)
-    return transformers.PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        eos_token="</s>",
-        pad_token="</s>",
-        unk_token="<unk>",
-        padding_side="right",
-        model_input_names=["input_ids"],
-    )
+    _ending(tokenizer, "</s>")
+    tokens = {"eos_token": "</s>", "pad_token": "</s>", "unk_token": "<unk>"}
+    names = {"padding_side": "right", "model_input_names": ["input_ids"]}
+    return transformers.PreTrainedTokenizerFast(tokenizer_object=tokenizer, **tokens, **names)
 
 
 def siglip2_tokenizer() -> Any:
@@ -65,7 +58,7 @@ def siglip2_tokenizer() -> Any:
     tokenizer = transformers.Siglip2Tokenizer(
         vocab=vocabulary, merges=merges, padding_side="right", model_input_names=["input_ids"]
     )
-    _ending(tokenizer.backend_tokenizer, "", "<eos>", 1)
+    _ending(tokenizer.backend_tokenizer, "<eos>")
     return tokenizer
 
 

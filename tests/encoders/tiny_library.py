@@ -15,23 +15,12 @@ _DECODER = {"hidden_size": 32, "mlp_dim": 32, "num_attention_heads": 2, "iou_hea
 
 
 def _hiera() -> dict[str, Any]:
-    backbone = {
-        "hidden_size": 8,
-        "image_size": [SIDE, SIDE],
-        "blocks_per_stage": [1, 1, 2, 1],
-        "embed_dim_per_stage": [8, 16, 32, 64],
-        "num_attention_heads_per_stage": [1, 1, 2, 2],
-        "window_size_per_stage": [4, 4, 4, 4],
-        "global_attention_blocks": [3],
-        "window_positional_embedding_background_size": [2, 2],
-    }
-    channels, sizes = [64, 32, 16, 8], [[16, 16], [8, 8], [4, 4]]
-    return {
-        "backbone_config": {"model_type": "sam2_hiera_det_model", **backbone},
-        "backbone_channel_list": channels,
-        "backbone_feature_sizes": sizes,
-        "fpn_hidden_size": 32,
-    }
+    sides = {"image_size": [SIDE, SIDE], "window_positional_embedding_background_size": [2, 2]}
+    stages = {"blocks": [1, 1, 2, 1], "embed_dim": [8, 16, 32, 64], "num_attention_heads": [1, 1, 2, 2]}
+    backbone = {f"{name}_per_stage": values for name, values in {**stages, "window_size": [4] * 4}.items()}
+    backbone |= {"model_type": "sam2_hiera_det_model", "hidden_size": 8, "global_attention_blocks": [3], **sides}
+    neck = {"backbone_channel_list": [64, 32, 16, 8], "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]]}
+    return {"backbone_config": backbone, **neck, "fpn_hidden_size": 32}
 
 
 def tiny(kind: str, seed: int = 0) -> Any:

@@ -8,9 +8,7 @@ from normlift_ns.kernels import nearest
 from tests.scenes import generator
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:invalid value encountered:RuntimeWarning"
-)  # infinity - infinity, unused
+pytestmark = pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # infinity - infinity
 
 
 def uneven(n: int, seed: int = 0) -> torch.Tensor:
@@ -28,8 +26,7 @@ LARGER = [pytest.param(150, 12, marks=pytest.mark.extra), pytest.param(70, 36, m
 
 @pytest.mark.parametrize(("n", "k"), [(45, 12), (5, 12), (1, 3), *LARGER])
 def test_equals_the_cpu(n, k):
-    points = uneven(n)
-    points = points.to(DEVICE)
+    points = uneven(n).to(DEVICE)
     found = nearest.nearest(points, k)
     expected = _on_cpu(points.cpu(), k)
     unsure = (~found.certain).nonzero().squeeze(1)  # the far one: to float32 the cluster is one point

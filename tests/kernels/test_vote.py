@@ -18,9 +18,7 @@ from tests.scenes import generator, unit_rows
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 BFLOAT16 = [torch.bfloat16] if torch.cuda.is_available() else []
 """Triton's interpreter multiplies the bits of such numbers as if they were integers."""
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:(overflow|invalid value) encountered:RuntimeWarning"
-)  # of infinity, unused
+pytestmark = pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered:RuntimeWarning")  # of infinity
 
 
 def own_evidence(reliability: torch.Tensor) -> torch.Tensor:
@@ -37,13 +35,8 @@ def numbers(config: RefineConfig, neighbors: Neighbors) -> dict[str, float]:
 
 
 def cast(
-    neighbors: Neighbors,
-    directions: torch.Tensor,
-    reliability: torch.Tensor,
-    config: RefineConfig,
-    voters: int | None = None,
-    **options: Any,
-) -> torch.Tensor:
+    neighbors: Neighbors, directions, reliability, config: RefineConfig, voters: int | None = None, **options: Any
+):
     """The winners of the first voters or of all, with `own_evidence` in a posterior vote; -1 if unwritten."""
     n = len(reliability)
     every = torch.arange(n, dtype=torch.int32)
@@ -155,9 +148,7 @@ def test_the_first_halves_decide_what_is_clear_and_nothing_else():
 
 @pytest.mark.parametrize("kind", ["paper", "posterior"])
 def test_a_margin_counts_in_the_units_of_supports(kind):
-    """The best neighbour of a Gaussian without evidence, some spacings away, wins with Delta a little below its support
-    and not with one a little above.
-    """
+    """The best neighbour of one without evidence wins with Delta a little below its support, not a little above."""
     means, directions, reliability = close_calls(2, 20, 20, 0.3)
     means[0] = torch.tensor([2.0, 0.5, 0.5])
     directions[0], reliability[0] = 0, 0
@@ -275,6 +266,7 @@ def test_nothing_changes_where_nobody_is_reliable():
     arrays = (torch.arange(10), neighbors.index, neighbors.distance, directions, row_of, reliability, source)
     there = [x.to(DEVICE) for x in arrays]
     for own in (None, there[5] + 1):
+        vote(there[0][:0], *there[1:], tau=0.8, gamma=0.05, width=1.0, delta=0.0, own=own, prior=4.0)
         vote(*there, tau=0.8, gamma=0.05, width=1.0, delta=0.0, own=own, prior=4.0)
         assert torch.equal(there[-1].cpu(), source)  # nothing written
 
