@@ -68,9 +68,10 @@ def test_what_else_is_in_the_batch_changes_nothing(encoder: Any) -> None:
     for region in (0, 63, 64, 69):
         alone = encoder.encode(IMAGE, torch.where(region == MANY, 0, -1).int())
         torch.testing.assert_close(alone[0], together[region], rtol=0, atol=1e-5)
-    views = [(IMAGE, NONE), (255 - IMAGE, MANY), (IMAGE, MANY)]
-    for rows, view in zip(encoder.encode_each(iter(views)), views, strict=True):
-        torch.testing.assert_close(rows, encoder.encode(*view), rtol=0, atol=1e-5)
+    views = [(IMAGE, NONE), (255 - IMAGE, FEW), (IMAGE, MANY)]
+    expected = encoder.encode(*views[0]), encoder.encode(*views[1]), together
+    for rows, alone in zip(encoder.encode_each(iter(views)), expected, strict=True):
+        torch.testing.assert_close(rows, alone, rtol=0, atol=1e-5)
     prompts = [f"red {i}" for i in range(70)]
     torch.testing.assert_close(encoder.text(prompts)[64:65], encoder.text(prompts[64:65]), rtol=0, atol=1e-5)
 
@@ -108,12 +109,12 @@ def test_a_gpu_sees_what_the_cpu_sees(options: SourceOptions, encoder: Any) -> N
 
 
 def test_no_step_takes_memory_for_all_regions_or_texts_at_once(encoder: Any) -> None:
-    """Of 192 crops and texts after 64 each."""
-    many, sizes = (torch.arange(48 * 64).reshape(1, 48, 64) // 16).int(), []
+    """Of 96 crops and 192 texts after 16 and 64."""
+    many, sizes = (torch.arange(48 * 64).reshape(1, 48, 64) // 32).int(), []
     _ = encoder.text(TEXTS), encoder.encode(IMAGE, FEW)  # weights are large
-    for count in (64, 192):
+    for crops, texts in ((16, 64), (96, 192)):
         with Largest() as largest:
-            rows = encoder.encode(IMAGE, torch.where(many < count, many, -1)), encoder.text(["red"] * count)
+            rows = encoder.encode(IMAGE, torch.where(many < crops, many, -1)), encoder.text(["red"] * texts)
         sizes.append(max(largest.most, rows[0].numel(), rows[1].numel()))
     assert sizes[1] <= max(sizes[0], rows[0].numel(), rows[1].numel())
 

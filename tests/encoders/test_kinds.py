@@ -7,6 +7,8 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -38,6 +40,16 @@ def install(folder: Path, package: str, points: str, code: str = "") -> None:
     (folder / f"{package}.py").write_text(code)
 
 
+@contextmanager
+def plugged(folder: Path, package: str, points: str, code: str) -> Iterator[None]:
+    """Such a package on the path."""
+    install(folder, package, points, code)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield
+    sys.modules.pop(package, None)
+
+
 def points(**encoders: str) -> str:
     return f"[{GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
 
@@ -63,7 +75,7 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     refused(lambda: encoder_kind("same"), "'same'", "claimed", "plug", "two", "uninstall")
 
 
-def test_a_broken_encoder_breaks_itself_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
     for number, (value, code, parts) in enumerate((
         ("nowhere:KIND", "", ["cannot be loaded", "ModuleNotFoundError"]),
         ("plug:KIND", "1 / 0", ["cannot be loaded", "ZeroDivisionError", "--encoder open_clip"]),
@@ -71,16 +83,11 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path, monkeypatch: pytest
         ("plug:KIND", "KIND = 3", ["plug:KIND", "int", "EncoderKind"]),
         ("plug:", "", ["cannot be loaded"]),
     )):  # fmt: skip
-        folder = tmp_path / str(number)
-        install(folder, "plug", points(bad=value, open_clip="plug:KIND"), code)
-        install(folder, "worse", f"[{GROUP}]\nno value at all\n= = =\n[")
-        with monkeypatch.context() as patch:
-            patch.syspath_prepend(folder)
-            patch.delitem(sys.modules, "plug", raising=False)
+        install(tmp_path / str(number), "worse", f"[{GROUP}]\nno value at all\n= = =\n[")
+        with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
             refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
             assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.clip.kind"
             assert encoder_names() == ["bad", *OURS]
-            sys.modules.pop("plug", None)
 
 
 def test_help_loads_no_encoder(tmp_path: Path) -> None:
@@ -105,7 +112,7 @@ KIND = EncoderKind(lambda options, device: {made})
 """
 
 
-def test_what_another_package_makes_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
     image, labels = torch.zeros(4, 2, 3, dtype=torch.uint8), torch.arange(2).repeat(4, 1)[None].int()
     for number, (rows, made, parts) in enumerate((
         ("torch.ones(2, 3)", "Wrong()", ["1.73"]),
@@ -117,12 +124,8 @@ def test_what_another_package_makes_is_checked(tmp_path: Path, monkeypatch: pyte
         ("0", "missing", ["'wrong'", "NameError"]),
     )):  # fmt: skip
         code = WRONG.format(rows=rows, made=made)
-        install(tmp_path / str(number), "wrong_plug", points(wrong="wrong_plug:KIND"), code)
-        with monkeypatch.context() as patch:
-            patch.syspath_prepend(tmp_path / str(number))
-            patch.delitem(sys.modules, "wrong_plug", raising=False)
+        with plugged(tmp_path / str(number), "wrong_plug", points(wrong="wrong_plug:KIND"), code):
             refused(lambda: make_encoder(SourceOptions(encoder="wrong")).encode(image, labels), *parts)
-            sys.modules.pop("wrong_plug", None)
 
 
 def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,7 +84,7 @@ def close_calls(seed: int, n: int, dimension: int, noise: float) -> tuple[torch.
     return means, torch.where(empty[:, None], 0.0, directions), torch.where(empty, 0.0, reliability)
 
 
-@examples(3)
+@examples(2)
 @given(
     kind=st.sampled_from(["paper", "posterior"]),
     prior=st.sampled_from([0.0, 0.5, 4.0, 100.0]),
