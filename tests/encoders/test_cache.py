@@ -19,9 +19,9 @@ from normlift_ns.encoders.patches import PatchFeatures
 from normlift_ns.encoders.regions import Grid, LabelFiles
 from normlift_ns.encoders.source import each_view
 from normlift_ns.encoders.texts.kept import KeptTexts, text_identity
-from tests.encoders.tiny import CLIP, write_clip
+from tests.encoders.tiny import noise
 
-IMAGE = torch.randint(0, 256, (20, 30, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+IMAGE = noise(20, 30)
 
 
 @dataclass
@@ -60,7 +60,11 @@ def assert_same(a: ViewFeatures, b: ViewFeatures) -> None:
 
 
 def test_a_second_run_computes_nothing(counted, tmp_path):
-    expected = RegionFeatures(Grid(12), ColourEncoder()).view(IMAGE, "a.jpg")
+    source = RegionFeatures(Grid(12), ColourEncoder())
+    kept, expected = cached(source, tmp_path), source.view(IMAGE, "a.jpg")
+    identity = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
+    assert kept.identity == source.identity == identity
+    assert torch.equal(kept.text(["red"]), source.text(["red"]))
     for _ in range(2):  # as two runs would: nothing is held in memory
         assert_same(cached(counted, tmp_path / "new" / "folder").view(IMAGE, "a.jpg"), expected)
     assert asked(counted) == (1, 1)
@@ -69,12 +73,9 @@ def test_a_second_run_computes_nothing(counted, tmp_path):
 
 
 def test_an_interrupted_run_resumes(counted, tmp_path):
-    images = [IMAGE, 255 - IMAGE, IMAGE // 2]
-    source = cached(counted, tmp_path)
-    for i in range(2):
-        source.view(images[i], f"{i}.jpg")
-    for i in range(3):
-        source.view(images[i], f"{i}.jpg")
+    for count in (2, 3):
+        for i in range(count):
+            cached(counted, tmp_path).view(IMAGE // (i + 1), f"{i}.jpg")
     assert counted.regions.asked == ["0.jpg", "1.jpg", "2.jpg"]
     assert asked(counted) == (3, 3)
 
@@ -115,30 +116,30 @@ def test_another_label_file_is_another_entry(tmp_path):
         np.save(labels / "a.npy", np.full((20, 30), value))
         assert len(source.view(IMAGE, "a.jpg").features) == regions
     (labels / "a.npy").unlink()
-    with pytest.raises(FileNotFoundError, match=r"a\.jpg has no label map"):
+    with pytest.raises(FileNotFoundError, match=r"a\.jpg"):
         source.view(IMAGE, "a.jpg")
 
 
-@pytest.mark.parametrize("kind", ["regions", "features"])
-@pytest.mark.parametrize("damage", ["truncate", "empty", "flip", "other"])
-def test_a_damaged_entry_is_computed_again(counted, tmp_path, kind, damage):
+def test_a_damaged_entry_is_computed_again(counted, tmp_path):
+    """Cut off, empty, with other names inside, with any bit flipped."""
     source = cached(counted, tmp_path)
-    expected = source.view(IMAGE, "a.jpg")
-    (path,) = (tmp_path / kind).iterdir()
-    whole = path.read_bytes()
-    header = 8 + int.from_bytes(whole[:8], "little")
-    path.write_bytes(
-        {
-            "truncate": whole[: len(whole) // 2],
-            "empty": b"",
-            "flip": whole[:-1] + bytes([whole[-1] ^ 1]),
-            "other": whole[:header].replace(b'"labels"', b'"nonons"').replace(b'"features"', b'"nonsense"')
-            + whole[header:],
-        }[damage]
-    )
-    assert_same(source.view(IMAGE, "a.jpg"), expected)
-    assert asked(counted) == ((2, 1) if kind == "regions" else (1, 2))
-    assert path.read_bytes() == whole
+    expected, tries = source.view(IMAGE, "a.jpg"), 1
+    for kind in ("regions", "features"):
+        (path,) = (tmp_path / kind).iterdir()
+        whole = path.read_bytes()
+        header = 8 + int.from_bytes(whole[:8], "little")
+        names = whole[:header].replace(b'"labels"', b'"nonons"').replace(b'"features"', b'"nonsense"')
+        wrong = [whole[: len(whole) // 2], b"", names + whole[header:], whole[:-1] + bytes([whole[-1] ^ 1])]
+        for bit in random.Random(0).sample(range(8 * len(whole)), 12):
+            wrong.append(bytearray(whole))
+            wrong[-1][bit // 8] ^= 1 << bit % 8
+        for content in wrong:
+            path.write_bytes(content)
+            assert_same(source.view(IMAGE, "a.jpg"), expected)
+            assert path.read_bytes() == whole
+        tries += len(wrong)
+        assert asked(counted) == ((tries, 1) if kind == "regions" else (17, 17))
+        tries = 1
 
 
 def test_many_regions_survive(tmp_path):
@@ -159,24 +160,9 @@ def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
         raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
     monkeypatch.setattr("normlift_ns.core.disk.tensors.save_file", full)
-    with pytest.raises(OSError, match=r"cannot keep 2D labels: .*/regions/\w+\.safetensors cannot .*free disk space"):
+    with pytest.raises(OSError, match=r"labels.*/regions/\w+\.safetensors"):
         cached(counted, tmp_path).view(IMAGE, "a.jpg")
     assert list((tmp_path / "regions").iterdir()) == []
-
-
-def test_identity_and_texts_are_those_of_the_source(tmp_path):
-    source = RegionFeatures(Grid(12), ColourEncoder())
-    kept = cached(source, tmp_path)
-    expected = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
-    assert kept.identity == source.identity == expected
-    assert torch.equal(kept.text(["red"]), source.text(["red"]))
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("clip")
-    write_clip(folder)
-    return OpenClipEncoder(CLIP, str(folder / "tiny.pt"))
 
 
 def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):
@@ -258,7 +244,7 @@ def test_texts_of_a_folder_that_cannot_be_written_to(clip, tmp_path):
     (tmp_path / "file").write_text("")
     rows = kept_texts(clip, tmp_path / "file" / "texts").text(["table"])
     assert torch.equal(rows, clip.text(["table"]))
-    with pytest.raises(ValueError, match="text 1 of 1 is empty"):
+    with pytest.raises(ValueError, match="1 of 1"):
         kept_texts(clip, tmp_path).text([" "])
 
 
@@ -277,46 +263,28 @@ def test_patches_seen_before_need_no_network(clip, tmp_path):
 
 def test_swapped_entries_are_computed_again(counted, tmp_path):
     """Content that is whole, under the name of another image."""
-    source = cached(counted, tmp_path)
-    images = (IMAGE, "a.jpg"), (255 - IMAGE, "b.jpg")
+    source, images = cached(counted, tmp_path), ((IMAGE, "a.jpg"), (255 - IMAGE, "b.jpg"))
     expected = [source.view(*image) for image in images]
     for kind in ("regions", "features"):
-        first, second = (tmp_path / kind).iterdir()
-        content = first.read_bytes(), second.read_bytes()
-        first.write_bytes(content[1])
-        second.write_bytes(content[0])
-    before = asked(counted)
-    for image, view in zip(images, expected, strict=True):
-        assert_same(source.view(*image), view)
-    assert before == (2, 2)
-    assert asked(counted) == (4, 4)
-    for image, view in zip(images, expected, strict=True):
-        assert_same(source.view(*image), view)
-    assert asked(counted) == (4, 4)
+        swap(tmp_path / kind)
+    assert asked(counted) == (2, 2)
+    for _ in range(2):
+        for image, view in zip(images, expected, strict=True):
+            assert_same(source.view(*image), view)
+        assert asked(counted) == (4, 4)
 
 
-def test_every_flipped_bit_of_an_entry_is_noticed(counted, tmp_path):
-    source = cached(counted, tmp_path)
-    expected = source.view(IMAGE, "a.jpg")
-    for kind in ("regions", "features"):
-        (path,) = (tmp_path / kind).iterdir()
-        whole = path.read_bytes()
-        for bit in random.Random(0).sample(range(8 * len(whole)), 40):
-            changed = bytearray(whole)
-            changed[bit // 8] ^= 1 << bit % 8
-            path.write_bytes(changed)
-            assert_same(source.view(IMAGE, "a.jpg"), expected)
-            assert path.read_bytes() == whole
-    assert asked(counted) == (41, 41)
+def swap(folder: Path) -> None:
+    first, second = folder.iterdir()
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
 
 
 def test_a_text_under_the_name_of_another_is_encoded_again(clip, tmp_path):
     texts = kept_texts(clip, tmp_path)
     mug, table = texts.text(["mug"]), texts.text(["table"])
-    first, second = tmp_path.iterdir()
-    content = first.read_bytes()
-    first.write_bytes(second.read_bytes())
-    second.write_bytes(content)
+    swap(tmp_path)
     torch.testing.assert_close(texts.text(["mug"]), mug, rtol=0, atol=1e-6)
     torch.testing.assert_close(texts.text(["table"]), table, rtol=0, atol=1e-6)
     assert not torch.allclose(mug, table)

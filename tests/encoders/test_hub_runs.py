@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,32 +14,22 @@ import torch
 
 from normlift_ns.encoders import SourceOptions, make_source
 from normlift_ns.encoders.build import resolve_regions, source_settings
-from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.hub.encoder import HubEncoder
 from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.errors import InputError
 from normlift_ns.text_encoders import default_rule, encoder_of, encoder_settings
-from tests.encoders.tiny_hub import write_siglip2
-
-IMAGE = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-
-
-class Field:
-    """What is known of a field."""
-
-    def __init__(self, manifest: dict[str, Any]) -> None:
-        self.manifest = manifest
+from tests.encoders.tiny import copied, refused
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    write_siglip2(tmp_path / "net")
-    return tmp_path / "net"
+def folder(hub_weights: Path, tmp_path: Path) -> Path:
+    return copied(hub_weights / "siglip2", tmp_path / "net")
 
 
-def lifted(folder: Path, regions: Any = "grid") -> Field:
+def lifted(folder: Path, regions: Any) -> Any:
+    """What is known of a field."""
     options = SourceOptions(encoder="siglip2", encoder_model=str(folder), regions=regions, region_count=12)
-    return Field({"encoder": encoder_settings(options), "features": make_source(options).identity, "dimension": 32})
+    features = make_source(options).identity
+    return SimpleNamespace(manifest={"encoder": encoder_settings(options), "features": features, "dimension": 32})
 
 
 def test_regions_are_patches_where_there_is_no_gpu(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,13 +40,18 @@ def test_regions_are_patches_where_there_is_no_gpu(folder: Path, monkeypatch: py
     assert source_settings(SourceOptions(encoder="siglip2", encoder_model="net"))["encoder_model"] == str(folder)
 
 
-@pytest.mark.parametrize("regions", ["grid", "patches"])
-def test_texts_asked_before_need_no_weights(folder: Path, regions: str, tmp_path: Path) -> None:
-    field = lifted(folder, regions)
+def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> None:
+    field, of_grid = lifted(folder, "patches"), lifted(folder, "grid")
     texts = encoder_of(field, cache=tmp_path / "texts")
     assert default_rule(field) == ("lerf", ("object", "things", "stuff", "texture"), 0.5)
     expected = texts.rows(["red mug", "table"])
     assert torch.equal(torch.from_numpy(expected), HubEncoder("siglip2", str(folder)).text(["red mug", "table"]))
+    assert len(encoder_of(of_grid, cache=tmp_path / "texts").rows(["mug"])) == 1
+    config = folder / "tokenizer_config.json"  # other weights in the same place answer nothing new
+    config.write_text(config.read_text() + " ")
+    again = encoder_of(of_grid, cache=tmp_path / "texts")
+    assert (again.rows(["red mug"]) == expected[:1]).all()
+    refused(lambda: again.rows(["wine"]), "siglip2", "--text-vectors")
     folder.rename(tmp_path / "gone")
     (tmp_path / "manifest.json").write_text(json.dumps(field.manifest))
     program = (
@@ -69,23 +65,5 @@ def test_texts_asked_before_need_no_weights(folder: Path, regions: str, tmp_path
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == expected[::-1].tolist()
-    with pytest.raises(FileNotFoundError, match="net, given with --encoder-model, does not exist"):
-        encoder_of(field, cache=tmp_path / "texts").rows(["wine"])
-
-
-def test_other_weights_in_the_same_place_answer_nothing_new(folder: Path, tmp_path: Path) -> None:
-    field = lifted(folder)
-    kept = encoder_of(field, cache=tmp_path / "texts").rows(["red mug"])
-    write_siglip2(folder, seed=1)
-    again = encoder_of(field, cache=tmp_path / "texts")
-    assert (again.rows(["red mug"]) == kept).all()
-    with pytest.raises(InputError, match=r"the encoder siglip2 is not what the run was lifted with.*--text-vectors"):
-        again.rows(["table"])
-
-
-def test_features_of_regions_are_kept(folder: Path, tmp_path: Path) -> None:
-    options = SourceOptions(encoder="siglip2", encoder_model=str(folder), regions="grid", region_count=12)
-    expected = cached(make_source(options), tmp_path / "cache").view(IMAGE, "a.jpg")
-    again: Any = make_source(options)
-    vars(again.encoder)["network"] = None
-    assert torch.equal(cached(again, tmp_path / "cache").view(IMAGE, "a.jpg").features, expected.features)
+    asked = encoder_of(field, cache=tmp_path / "texts")
+    refused(lambda: asked.rows(["wine"]), "net", "--encoder-model", error=FileNotFoundError)

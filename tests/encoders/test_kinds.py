@@ -7,6 +7,8 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,12 @@ from normlift_ns.encoders.hub.places import check_packages
 from normlift_ns.encoders.kinds import BUILT_IN, GROUP, encoder_kind, encoder_names, known_kind
 from normlift_ns.errors import InputError
 from normlift_ns.scripts.early import check_source
-from tests.scripts.test_help import tomllib
+from tests.encoders.tiny import refused
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROOT = Path(__file__).parents[2]
 OURS = ["colour", "metaclip2", "open_clip", "siglip", "siglip2"]
@@ -33,12 +40,24 @@ def install(folder: Path, package: str, points: str, code: str = "") -> None:
     (folder / f"{package}.py").write_text(code)
 
 
+@contextmanager
+def plugged(folder: Path, package: str, points: str, code: str) -> Iterator[None]:
+    """Such a package on the path."""
+    install(folder, package, points, code)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield
+    sys.modules.pop(package, None)
+
+
 def points(**encoders: str) -> str:
     return f"[{GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
 
 
-def test_ours_are_registered_in_pyproject() -> None:
+def test_ours_are_registered_in_pyproject_and_built_in() -> None:
+    """So that they are found without metadata too, as in a source tree on PYTHONPATH."""
     registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"][GROUP]
+    assert registered == BUILT_IN
     assert sorted(registered) == encoder_names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
@@ -46,40 +65,29 @@ def test_ours_are_registered_in_pyproject() -> None:
 
 
 def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, "plug", points(other="plug:KIND"))
+    install(tmp_path, "plug", points(other="plug:KIND", same="plug:KIND"))
+    install(tmp_path, "two", points(same="two:KIND"))
     monkeypatch.syspath_prepend(tmp_path)
-    message = "unknown encoder 'clip'; --encoder is one of colour, metaclip2, open_clip, other, siglip, siglip2"
-    for refused in (encoder_kind, lambda name: check_source(SourceOptions(encoder=name), ())):
-        with pytest.raises(InputError, match=message):
-            refused("clip")
+    parts = ("'clip'", "--encoder", "colour, metaclip2, open_clip, other, same, siglip, siglip2")
+    refused(lambda: encoder_kind("clip"), *parts)
+    refused(lambda: check_source(SourceOptions(encoder="clip"), ()), *parts)
     assert known_kind("clip") is None and known_kind(3) is None
+    refused(lambda: encoder_kind("same"), "'same'", "claimed", "plug", "two", "uninstall")
 
 
-@pytest.mark.parametrize(
-    ("value", "code", "message"),
-    [
-        (
-            "nowhere:KIND",
-            "",
-            "encoder 'bad' of package plug cannot be loaded .ModuleNotFoundError: No module named",
-        ),
-        ("plug:KIND", "1 / 0", "cannot be loaded .ZeroDivisionError: division by zero.*--encoder open_clip"),
-        ("plug:KIND", "raise SystemExit(3)", "cannot be loaded .SystemExit: 3"),
-        ("plug:KIND", "KIND = 3", "is no encoder: plug:KIND is of type int, expected an EncoderKind"),
-        ("plug:", "", "cannot be loaded"),
-    ],
-)
-def test_a_broken_encoder_breaks_itself_only(
-    value: str, code: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    install(tmp_path, "plug", points(bad=value, open_clip="plug:KIND"), code)
-    install(tmp_path, "worse", f"[{GROUP}]\nno value at all\n= = =\n[")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "plug", raising=False)
-    with pytest.raises(InputError, match=message):
-        encoder_kind("bad")
-    assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.clip.kind"
-    assert encoder_names() == ["bad", *OURS]
+def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
+    for number, (value, code, parts) in enumerate((
+        ("nowhere:KIND", "", ["cannot be loaded", "ModuleNotFoundError"]),
+        ("plug:KIND", "1 / 0", ["cannot be loaded", "ZeroDivisionError", "--encoder open_clip"]),
+        ("plug:KIND", "raise SystemExit(3)", ["cannot be loaded", "SystemExit: 3"]),
+        ("plug:KIND", "KIND = 3", ["plug:KIND", "int", "EncoderKind"]),
+        ("plug:", "", ["cannot be loaded"]),
+    )):  # fmt: skip
+        install(tmp_path / str(number), "worse", f"[{GROUP}]\nno value at all\n= = =\n[")
+        with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
+            refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
+            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.clip.kind"
+            assert encoder_names() == ["bad", *OURS]
 
 
 def test_help_loads_no_encoder(tmp_path: Path) -> None:
@@ -93,14 +101,6 @@ def test_help_loads_no_encoder(tmp_path: Path) -> None:
     assert loaded.isdisjoint({"plug", "torch", "numpy", "transformers", "normlift_ns.encoders.clip.kind"})
 
 
-def test_two_packages_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, "one", points(same="one:KIND"))
-    install(tmp_path, "two", points(same="two:KIND"))
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match=r"encoder 'same' is claimed by package \w+ .*uninstall one of the two"):
-        encoder_kind("same")
-
-
 WRONG = """
 import torch
 from normlift_ns.encoders import EncoderKind
@@ -112,72 +112,45 @@ KIND = EncoderKind(lambda options, device: {made})
 """
 
 
-@pytest.mark.parametrize(
-    ("rows", "made", "message"),
-    [
-        ("torch.ones(2, 3)", "Wrong()", "gave regions vectors of other lengths than 1, such as 1.73; normalise them"),
-        ("torch.eye(3)", "Wrong()", r"gave torch.float32 \(3, 3\) for 2 regions, expected floats \[2, D\]"),
-        ("None", "Wrong()", "gave NoneType for 2 regions"),
-        ("torch.eye(2) / torch.zeros(1)", "Wrong()", "vectors of other lengths than 1"),
-        ("1 / 0", "Wrong()", "encoder 'wrong' of another package failed .ZeroDivisionError"),
-        ("0", "object()", "has no identity and no encode and no text"),
-        ("0", "missing", "encoder 'wrong' of another package failed .NameError"),
-    ],
-)
-def test_what_another_package_makes_is_checked(
-    rows: str, made: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    install(tmp_path, "wrong_plug", points(wrong="wrong_plug:KIND"), WRONG.format(rows=rows, made=made))
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "wrong_plug", raising=False)
-    labels = torch.arange(2).repeat(4, 1)[None].int()
-    with pytest.raises(InputError, match=message):
-        make_encoder(SourceOptions(encoder="wrong")).encode(torch.zeros(4, 2, 3, dtype=torch.uint8), labels)
+def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
+    image, labels = torch.zeros(4, 2, 3, dtype=torch.uint8), torch.arange(2).repeat(4, 1)[None].int()
+    for number, (rows, made, parts) in enumerate((
+        ("torch.ones(2, 3)", "Wrong()", ["1.73"]),
+        ("torch.eye(3)", "Wrong()", ["torch.float32 (3, 3)", "2 regions", "[2, D]"]),
+        ("None", "Wrong()", ["NoneType", "2 regions"]),
+        ("torch.eye(2) / torch.zeros(1)", "Wrong()", ["vectors of other lengths than 1"]),
+        ("1 / 0", "Wrong()", ["'wrong'", "ZeroDivisionError"]),
+        ("0", "object()", ["identity", "encode", "text"]),
+        ("0", "missing", ["'wrong'", "NameError"]),
+    )):  # fmt: skip
+        code = WRONG.format(rows=rows, made=made)
+        with plugged(tmp_path / str(number), "wrong_plug", points(wrong="wrong_plug:KIND"), code):
+            refused(lambda: make_encoder(SourceOptions(encoder="wrong")).encode(image, labels), *parts)
 
 
-@pytest.mark.parametrize(
-    ("package", "found", "message"),
-    [
-        (
-            "torch",
-            "2.5.1",
-            "--encoder siglip2 needs torch 2.6 or later, found 2.5.1 .*--encoder open_clip works",
-        ),
-        ("transformers", "4.49.0", "needs transformers 4.56 or later, found 4.49.0"),
-    ],
-)
-def test_packages_that_are_too_old_are_refused(
-    package: str, found: str, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    versions = {"torch": "2.6.0", "transformers": "5.0.0", package: found}
-    monkeypatch.setattr("normlift_ns.encoders.hub.places.version", versions.__getitem__)
-    for refused in (check_source, lambda options, _: make_encoder(options)):
-        with pytest.raises(InputError, match=message):
-            refused(SourceOptions(encoder="siglip2", encoder_model="/nowhere"), ())
-    versions[package] = "10.0"
-    check_packages(FAMILIES["siglip2"])
+def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = {"torch": "2.6.0", "transformers": "5.0.0"}
+    monkeypatch.setattr("normlift_ns.encoders.hub.places.version", lambda package: versions[package])
+    options = SourceOptions(encoder="siglip2", encoder_model="/nowhere")
+    for package, found, least in (("torch", "2.5.1", "2.6"), ("transformers", "4.49.0", "4.56")):
+        versions[package], enough = found, versions[package]
+        for call in (lambda: check_source(options, ()), lambda: make_encoder(options)):
+            refused(call, "siglip2", f"{package} {least}", found, "--encoder open_clip")
+        versions[package] = "10.0"
+        check_packages(FAMILIES["siglip2"])
+        versions[package] = enough
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"encoder_model": "/nowhere/x"}, FileNotFoundError, "/nowhere/x, given with --encoder-model, does not exist"),
-        ({"encoder_model": "siglip"}, InputError, "'siglip' is neither a folder nor a name of the hub; give a folder"),
-        ({"encoder_pretrained": "openai"}, InputError, "--encoder-pretrained openai is for --encoder open_clip"),
-        (
-            {},
-            FileNotFoundError,
-            "SigLIP 2 network google/siglip2-base-patch16-224 is neither on this machine nor",
-        ),
-    ],
-)
-def test_mistakes_are_told_before_torch_is_loaded(
-    options: dict[str, str], error: type[Exception], message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_mistakes_are_told_before_torch_is_loaded(empty_hub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(error, match=message):
-        check_source(SourceOptions(encoder="siglip2", **options), ())
+    for options, error, parts in (
+        ({"encoder_model": "/nowhere/x"}, FileNotFoundError, ["/nowhere/x", "--encoder-model"]),
+        ({"encoder_model": "siglip"}, InputError, ["'siglip'"]),
+        ({"encoder_pretrained": "openai"}, InputError, ["--encoder-pretrained openai", "--encoder open_clip"]),
+        ({}, FileNotFoundError, ["SigLIP 2", "google/siglip2-base-patch16-224"]),
+    ):
+        source = SourceOptions(encoder="siglip2", **options)
+        refused(lambda source=source: check_source(source, ()), *parts, error=error)
 
 
 @pytest.mark.slow
@@ -209,9 +182,3 @@ def test_the_recipe_works_as_a_package(trained: Path, tmp_path: Path) -> None:
     assert done.returncode == 1 and "text 'purple' is none of red, green, blue, yellow" in done.stderr
     done = run("ns-normlift-query", *asked[:2], "--text", "red", here=False)
     assert done.returncode == 1 and "unknown encoder 'mean_rgb'" in done.stderr and "--text-vectors" in done.stderr
-
-
-def test_what_is_built_in_is_what_is_registered():
-    """Ours are found without metadata too, as in a source tree on PYTHONPATH."""
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
-    assert project["project"]["entry-points"]["normlift_ns.encoders"] == BUILT_IN

@@ -1,60 +1,44 @@
 """What every source of masks promises, whatever network or file is behind it."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from safetensors.torch import load_file, save_file
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from normlift_ns.encoders.cache import CachedRegions
 from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.encoders.sam import rules, text_masks
 from normlift_ns.encoders.sam.library import load_network
-from normlift_ns.encoders.sam.masks import SamMasks
+from normlift_ns.encoders.sam.masks import LEVELS, SamMasks
 from normlift_ns.encoders.sam.rules import Suppression
 from normlift_ns.encoders.sam.text_masks import Sam3Masks, Sam3Network
-from normlift_ns.encoders.sam.weights import load_sam
-from normlift_ns.encoders.source import Regions
 from tests.encoders.test_library import LOOSE, photograph
-from tests.encoders.tiny import write_sam
-from tests.encoders.tiny_library import write_tiny
+from tests.encoders.tiny import Largest, copied, refused
 
 EVERY = replace(LOOSE, box_iou=0.99, suppression=Suppression(iou=1.0, score=-9.0, outer=0.0, inner=2.0))
 NETWORKS = ("sam", "sam2", "sam_hq", "sam3")
 IMAGE, NAME = photograph(40, 60), "a.png"
 
 
-class Source(NamedTuple):
-    make: Callable[[Path], Regions]
-    folder: Path
-    """Of the weights, or of the files."""
-
-
 @pytest.fixture(scope="module")
-def sources(tmp_path_factory) -> dict[str, Source]:
-    root = tmp_path_factory.mktemp("contract")
-    write_sam(root / "meta.pth", seed=1, gain=6)
-    load_sam(str(root / "meta.pth")).save_pretrained(root / "sam")
-    for kind in NETWORKS[1:]:
-        write_tiny(root / kind, kind, seed=2)
-    (root / "files").mkdir()
+def folders(sam_weights, library_weights, tmp_path_factory) -> dict[str, Path]:
+    """Of the weights, or of the files."""
+    files = tmp_path_factory.mktemp("files")
     values = np.array([0, 7, 3, 200], np.uint8)[(IMAGE[:, :, 0] // 64).numpy()]
-    Image.fromarray(values).save(root / "files" / NAME)
-    made: dict[str, Callable[[Path], Regions]] = {
-        **{kind: lambda folder: SamMasks(str(folder), rules=EVERY) for kind in NETWORKS[:3]},
-        "sam3": lambda folder: Sam3Masks(("mug", "red mug"), str(folder)),
-        "files": LabelFiles,
-        "superpixel": lambda folder: Superpixels(20),
-        "grid": lambda folder: Grid(20),
-    }
-    return {kind: Source(make, root / kind) for kind, make in made.items()}
+    Image.fromarray(values).save(files / NAME)
+    return {"sam": sam_weights / "eager", **{kind: library_weights / kind for kind in NETWORKS[1:]}, "files": files}
+
+
+def make(kind: str, folder: Path) -> Any:
+    if kind in NETWORKS:
+        return Sam3Masks(("mug", "red mug"), str(folder)) if kind == "sam3" else SamMasks(str(folder), rules=EVERY)
+    return {"files": LabelFiles(folder), "superpixel": Superpixels(20), "grid": Grid(20)}[kind]
 
 
 KINDS = (*NETWORKS, "files", "superpixel", "grid")
@@ -66,16 +50,10 @@ def unsure(monkeypatch) -> None:
     monkeypatch.setattr(text_masks, "SCORE", 0.2)
 
 
-def copied(source: Source, folder: Path) -> Path:
-    for file in source.folder.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    return folder
-
-
 @pytest.mark.parametrize("kind", KINDS)
-def test_labels_have_no_gaps_and_repeat(sources, kind, tmp_path):
-    make, folder = sources[kind]
-    source = make(folder)
+def test_labels_have_no_gaps_and_repeat(folders, kind, tmp_path):
+    folder = folders.get(kind, tmp_path)
+    source = make(kind, folder)
     labels = source.labels(IMAGE, NAME)
     levels, depth, height, width = labels.shape
     assert labels.dtype == torch.int32 and (height, width) == IMAGE.shape[:2] and levels >= 1 and depth >= 1
@@ -85,66 +63,58 @@ def test_labels_have_no_gaps_and_repeat(sources, kind, tmp_path):
         beneath = (level[:-1] >= 0) | (level[1:] < 0)  # nothing lies beneath nothing
         assert bool(beneath.all())
     assert int(labels.max()) >= 0
+    if kind in NETWORKS[:3]:
+        masks = source.masks(IMAGE)
+        assert tuple(masks) == LEVELS and levels == 4 and all(len(level) > 0 for level in masks.values())
+        assert not torch.equal(masks["s"][0], masks["l"][0])  # of the three masks of a point
     assert max(source.chosen, default=0) < levels
-    assert torch.equal(labels, make(folder).labels(IMAGE.clone(), NAME))
-    kept = CachedRegions(source, tmp_path)
-    assert torch.equal(kept.labels(IMAGE, NAME), labels) and torch.equal(kept.labels(IMAGE, NAME), labels)
+    kept = CachedRegions(make(kind, folder), tmp_path)
+    assert torch.equal(kept.labels(IMAGE.clone(), NAME), labels) and torch.equal(kept.labels(IMAGE, NAME), labels)
     assert json.loads(json.dumps(source.identity)) == source.identity
 
 
 @pytest.mark.parametrize("kind", NETWORKS)
-def test_identity_changes_with_any_weight(sources, kind, tmp_path):
-    make, folder = sources[kind]
-    mine = make(folder).identity
-    assert make(copied(sources[kind], tmp_path)).identity == mine  # wherever it lies
-    state = load_file(folder / "model.safetensors")
+def test_identity_changes_with_any_weight(folders, kind, tmp_path):
+    mine = make(kind, folders[kind]).identity
+    assert make(kind, copied(folders[kind], tmp_path)).identity == mine  # wherever it lies
+    state = load_file(tmp_path / "model.safetensors")
     for name in (min(state), max(state)):
         changed = {key: value.clone() for key, value in state.items()}
         changed[name].view(-1)[-1] += 1e-3
         save_file(changed, tmp_path / "model.safetensors")
-        assert make(tmp_path).identity != mine
-    source: Any = make(folder)
-    assert replace(source, precision="bfloat16").identity != mine
+        assert make(kind, tmp_path).identity != mine
+    assert replace(make(kind, folders[kind]), precision="bfloat16").identity != mine
 
 
 @pytest.mark.parametrize("kind", NETWORKS)
-@pytest.mark.parametrize("damage", ["truncated", "other sizes", "no weights", "not JSON", "lacking"])
-def test_damaged_files_are_refused_by_name(sources, kind, damage, tmp_path):
-    make = sources[kind].make
-    folder = copied(sources[kind], tmp_path)
-    config, weights = folder / "config.json", folder / "model.safetensors"
-    if damage == "truncated":
-        weights.write_bytes(weights.read_bytes()[:5000])
-    elif damage == "no weights":
-        weights.unlink()
-    elif damage == "not JSON":
-        config.write_text("{")
-    elif damage == "lacking":
-        state = load_file(weights)
-        state.pop(next(name for name in state if name.startswith("mask_decoder")))
-        save_file(state, weights)
-    else:
-        found = json.loads(config.read_text())
-        part = found["detr_decoder_config" if kind == "sam3" else "mask_decoder_config"]
-        part["num_layers" if kind == "sam3" else "num_hidden_layers"] = 5
-        config.write_text(json.dumps(found))
-    with pytest.raises(ValueError, match="SAM") as info:
-        make(folder).labels(IMAGE, NAME)
-    assert str(folder) in str(info.value) and "\n" not in str(info.value) and info.value.__suppress_context__
-
-
-def test_damaged_label_maps_are_refused_by_name(sources, tmp_path):
-    folder = copied(sources["files"], tmp_path)
-    (folder / NAME).write_bytes((folder / NAME).read_bytes()[:40])
-    with pytest.raises(ValueError, match=r"label map .*a\.png"):
-        sources["files"].make(folder).labels(IMAGE, NAME)
+def test_damaged_files_are_refused_by_name(folders, kind, tmp_path):
+    for damage in ("truncated", "other sizes", "no weights", "not JSON", "lacking"):
+        folder = copied(folders[kind], tmp_path / damage)
+        config, weights = folder / "config.json", folder / "model.safetensors"
+        if damage == "truncated":
+            weights.write_bytes(weights.read_bytes()[:5000])
+        elif damage == "no weights":
+            weights.unlink() if kind == "sam" else weights.rename(folder / "pytorch_model.bin")
+        elif damage == "not JSON":
+            config.write_text("{")
+        elif damage == "lacking":
+            state = load_file(weights)
+            state.pop(next(name for name in state if name.startswith("mask_decoder")))
+            save_file(state, weights)
+        else:
+            found = json.loads(config.read_text())
+            part = found["detr_decoder_config" if kind == "sam3" else "mask_decoder_config"]
+            part["num_layers" if kind == "sam3" else "num_hidden_layers"] = 5
+            config.write_text(json.dumps(found))
+        parts = ["no model.safetensors"] if damage == "no weights" else ["--regions patches"] if kind == "sam" else []
+        refused(lambda folder=folder: make(kind, folder).labels(IMAGE, NAME), "SAM", str(folder), *parts)
 
 
 @pytest.mark.parametrize("kind", NETWORKS)
-def test_half_precision_is_within_its_error(sources, kind):
+def test_half_precision_is_within_its_error(folders, kind):
     """bfloat16 has 8 bits: answers of a few layers differ by some hundredths, more where weights are made large so that
     masks depend on the point."""
-    folder, points = str(sources[kind].folder), torch.tensor([[20.0, 30.0], [70.0, 10.0]])
+    folder, points = str(folders[kind]), torch.tensor([[20.0, 30.0], [70.0, 10.0]])
     answers = []
     for precision in ("float32", "bfloat16"):
         if kind == "sam3":
@@ -164,27 +134,13 @@ def test_half_precision_is_within_its_error(sources, kind):
     assert 0 < float((near - scores).abs().max()) < most * float(scores.abs().max())
 
 
-class Largest(TorchDispatchMode):
-    """The most elements of any floating tensor that is made."""
-
-    most = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        found = func(*args, **(kwargs or {}))
-        for one in found if isinstance(found, tuple | list) else (found,):
-            if isinstance(one, torch.Tensor) and one.is_floating_point():
-                self.most = max(self.most, one.numel())
-        return found
-
-
 @pytest.mark.parametrize("kind", NETWORKS)
-def test_memory_on_a_cpu_is_that_of_a_batch_of_masks(sources, kind, monkeypatch):
+def test_memory_on_a_cpu_is_that_of_a_batch_of_masks(folders, kind, monkeypatch):
     """However many masks there are, few are enlarged at a time."""
-    make, folder = sources[kind]
     image = photograph(150, 220)
     monkeypatch.setattr(text_masks, "_TOGETHER", 2)
     monkeypatch.setitem(rules._CHUNK, "cpu", 2**17)  # of the suppression
-    source: Any = make(folder)
+    source = make(kind, folders[kind])
     if kind != "sam3":
         source = replace(source, rules=replace(EVERY, points_per_side=5))
         source.network.masks.size = 4

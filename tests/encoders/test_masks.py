@@ -1,14 +1,14 @@
 """Rules on masks, against straightforward Python: sets of pixels, exact fractions as floats."""
 
 import numpy as np
-import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
 from tests.encoders.tiny import needs_cuda
+from tests.examples import examples
 
 
 def nms_by_hand(masks: list[set], scores: list[float], rules: Suppression) -> list[bool]:
@@ -52,7 +52,7 @@ def boxes_with_noise(draw) -> np.ndarray:
     return masks
 
 
-@settings(max_examples=150, deadline=None)
+@examples(20)
 @given(
     masks=boxes_with_noise(),
     data=st.data(),
@@ -65,13 +65,13 @@ def test_suppression_is_that_of_the_protocol(masks, data, rules):
     assert found.tolist() == nms_by_hand([pixels(mask) for mask in masks], scores, rules)
 
 
-def discs() -> np.ndarray:
+def discs(pairs: int = 24) -> np.ndarray:
     """Pairs of discs that nearly agree, of areas from specks to half of the image."""
     g = np.random.default_rng(0)
-    y, x = np.mgrid[:120, :160]
+    y, x = np.mgrid[:60, :80]
     masks = []
-    for _ in range(60):
-        cy, cx, r = g.uniform(0, 120), g.uniform(0, 160), np.exp(g.uniform(0.5, 4.2))
+    for _ in range(pairs):
+        cy, cx, r = g.uniform(0, 60), g.uniform(0, 80), np.exp(g.uniform(0.5, 3.5))
         masks.append((y - cy) ** 2 + (x - cx) ** 2 < r**2)
         masks.append((y - cy - g.normal()) ** 2 + (x - cx) ** 2 < (r * g.uniform(0.9, 1.1)) ** 2)
     return np.array([mask for mask in masks if mask.any()])
@@ -85,23 +85,25 @@ def test_suppression_of_overlaps_as_large_as_those_of_photographs():
     assert 5 < int(found.sum()) < len(masks) // 2
 
 
-def test_the_best_three_stay_where_none_is_good():
+def test_suppression_by_hand():
+    """The best three stay where none is good; a small mask inside a large one goes, whatever its score."""
     masks = torch.eye(5, dtype=torch.bool)[:, None]
     assert mask_nms(masks, torch.tensor([0.1, 0.5, 0.3, 0.7, 0.2])).tolist() == [False, True, True, True, False]
     assert mask_nms(masks[:2], torch.tensor([0.1, 0.5])).tolist() == [True, True]
-
-
-def test_a_small_mask_inside_a_large_one_goes_whatever_its_score():
-    large = torch.ones(1, 10, 10, dtype=torch.bool)
-    small = torch.zeros(1, 10, 10, dtype=torch.bool)
-    small[0, 2:5, 2:5] = True
+    masks = torch.ones(2, 10, 10, dtype=torch.bool)
+    masks[1] = False
+    masks[1, 2:5, 2:5] = True
     for scores in ([0.8, 0.9], [0.9, 0.8]):
-        assert mask_nms(torch.cat([large, small]), torch.tensor(scores)).tolist() == [True, False]
+        assert mask_nms(masks, torch.tensor(scores)).tolist() == [True, False]
+    for count in (0, 3):  # no masks, and whole images
+        masks = torch.ones(count, 4, 5, dtype=torch.bool)
+        assert mask_nms(masks, torch.ones(count)).tolist() == [True, False, False][:count]
+        assert stack_masks(masks).shape == (max(1, count), 4, 5)
 
 
 @needs_cuda
 def test_a_gpu_finds_the_same():
-    masks = torch.from_numpy(discs())
+    masks = torch.from_numpy(discs(60))
     scores = 0.6 + 0.4 * torch.rand(len(masks), generator=torch.Generator().manual_seed(0))
     assert torch.equal(mask_nms(masks.cuda(), scores.cuda()).cpu(), mask_nms(masks, scores))
     assert torch.equal(stack_masks(masks.cuda()).cpu(), stack_masks(masks))
@@ -109,7 +111,6 @@ def test_a_gpu_finds_the_same():
     assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
 
 
-@settings(max_examples=100, deadline=None)
 @given(masks=boxes_with_noise())
 def test_later_masks_lie_on_top_and_none_is_lost(masks):
     labels = stack_masks(torch.from_numpy(masks)).numpy()
@@ -124,17 +125,9 @@ def test_later_masks_lie_on_top_and_none_is_lost(masks):
     assert ((labels[:-1] > labels[1:]) | (labels[1:] == -1)).all()
 
 
-@settings(max_examples=50, deadline=None)
 @given(masks=boxes_with_noise(), empty=st.booleans())
 def test_boxes(masks, empty):
     masks = np.concatenate([masks, np.zeros((1, *masks.shape[1:]), dtype=bool)]) if empty else masks
     for mask, box in zip(masks, boxes_of(torch.from_numpy(masks)).tolist(), strict=True):
         y, x = np.nonzero(mask)
         assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_no_masks_and_whole_images(count):
-    masks = torch.ones(count, 4, 5, dtype=torch.bool)
-    assert mask_nms(masks, torch.ones(count)).tolist() == [True, False, False][:count]
-    assert stack_masks(masks).shape == (max(1, count), 4, 5)

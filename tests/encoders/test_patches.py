@@ -6,22 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.captures import SHARED
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.patches import dense_tokens
-from normlift_ns.encoders.images import read_image
 from normlift_ns.encoders.patches import PatchFeatures, patch_grid
-from tests.captures import needs_shared
-from tests.encoders.tiny import CLIP, needs_cuda, open_clip, write_clip
+from tests.encoders.tiny import CLIP, noise, refused
 
-IMAGE = torch.randint(0, 256, (48, 80, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-
-
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory) -> OpenClipEncoder:
-    folder = tmp_path_factory.mktemp("weights")
-    write_clip(folder)
-    return OpenClipEncoder(CLIP, str(folder / "tiny.pt"))
+IMAGE = noise(48, 80)
 
 
 def value_path(model, pixels: torch.Tensor) -> torch.Tensor:
@@ -37,21 +26,21 @@ def value_path(model, pixels: torch.Tensor) -> torch.Tensor:
     return (model.visual.ln_post(mixed) @ model.visual.proj)[:, 1:]
 
 
-@pytest.mark.parametrize("size", [(32, 32), (48, 80), (24, 16)])
 @torch.no_grad()
-def test_tokens_are_those_of_the_value_path(encoder, size):
+def test_tokens_are_those_of_the_value_path(clip, open_clip):
     """At the size of training, and at others against a model that open_clip makes for that size."""
-    model = open_clip.create_model(CLIP, force_image_size=size)
-    open_clip.load_checkpoint(model, encoder.pretrained)
-    pixels = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(1))
-    expected = value_path(model.eval(), pixels)
-    torch.testing.assert_close(dense_tokens(encoder.network.model.visual, pixels), expected, rtol=0, atol=1e-5)
+    for size in ((32, 32), (48, 80), (24, 16)):
+        model = open_clip.create_model(CLIP, force_image_size=size)
+        open_clip.load_checkpoint(model, clip.pretrained)
+        pixels = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(1))
+        expected = value_path(model.eval(), pixels)
+        torch.testing.assert_close(dense_tokens(clip.network.model.visual, pixels), expected, rtol=0, atol=1e-5)
 
 
-def test_features_are_the_tokens_of_the_scaled_image(encoder):
-    view = PatchFeatures(encoder, 15).view(IMAGE, "a.jpg")
+def test_features_are_the_tokens_of_the_scaled_image(clip):
+    view = PatchFeatures(clip, 15).view(IMAGE, "a.jpg")
     assert patch_grid(48, 80, 15) == (3, 5)
-    network = encoder.network
+    network = clip.network
     pixels = torch.nn.functional.interpolate(
         IMAGE.permute(2, 0, 1)[None].float(), (24, 40), mode="bicubic", antialias=True
     ).clamp(0, 255)
@@ -61,65 +50,37 @@ def test_features_are_the_tokens_of_the_scaled_image(encoder):
     assert torch.equal(view.labels, (5 * y + x).int())
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "count"), [(960, 540, 1024), (31, 77, 50), (5, 9, 1024), (30, 90, 7), (9, 9, 1)]
-)
-def test_patches_keep_the_shape_of_the_image(encoder, height, width, count):
-    rows, columns = patch_grid(height, width, count)
-    assert rows <= height and columns <= width
-    assert rows * columns <= 1.3 * count + 1
-    if min(rows, columns) > 3:
-        assert rows / columns == pytest.approx(height / width, rel=0.15)
-    labels = PatchFeatures(encoder, count).labels(torch.zeros(height, width, 3, dtype=torch.uint8))
-    assert labels.shape == (height, width)
-    sizes = torch.bincount(labels.flatten())
-    assert len(sizes) == rows * columns
-    assert int(sizes.min()) >= (height // rows) * (width // columns)
+def test_patches_keep_the_shape_of_the_image(clip):
+    for height, width, count in ((960, 540, 1024), (31, 77, 50), (5, 9, 1024), (30, 90, 7), (9, 9, 1)):
+        rows, columns = patch_grid(height, width, count)
+        assert rows <= height and columns <= width
+        assert rows * columns <= 1.3 * count + 1
+        if min(rows, columns) > 3:
+            assert rows / columns == pytest.approx(height / width, rel=0.15)
+        labels = PatchFeatures(clip, count).labels(torch.zeros(height, width, 3, dtype=torch.uint8))
+        assert labels.shape == (height, width)
+        sizes = torch.bincount(labels.flatten())
+        assert len(sizes) == rows * columns
+        assert int(sizes.min()) >= (height // rows) * (width // columns)
 
 
-def test_a_source_like_any_other(encoder):
-    source = PatchFeatures(encoder, 15)
+def test_a_source_like_any_other(clip):
+    source = PatchFeatures(clip, 15)
     assert source.available(["b.jpg", "a.jpg"]) == ["b.jpg", "a.jpg"]
-    assert torch.equal(source.text(["red"]), encoder.text(["red"]))
+    assert torch.equal(source.text(["red"]), clip.text(["red"]))
     assert json.loads(json.dumps(source.identity)) == source.identity
-    assert source.identity != PatchFeatures(encoder, 16).identity
-    assert source.identity != PatchFeatures(replace(encoder, fill="white"), 15).identity
-    again = PatchFeatures(replace(encoder), 15).view(IMAGE, "a.jpg")
+    assert source.identity != PatchFeatures(clip, 16).identity
+    assert source.identity != PatchFeatures(replace(clip, fill="white"), 15).identity
+    again = PatchFeatures(replace(clip), 15).view(IMAGE, "a.jpg")
     assert torch.equal(again.features, source.view(IMAGE, "a.jpg").features)
-    with pytest.raises(ValueError, match=r"image a\.jpg must be a uint8 tensor"):
-        source.view(IMAGE.float(), "a.jpg")
+    refused(lambda: source.view(IMAGE.float(), "a.jpg"), "a.jpg", "uint8")
 
 
-@pytest.mark.parametrize(
-    ("model", "reason"),
-    [
-        ("RN50", "its image encoder is a convolutional network"),
-        ("convnext_base", "its image encoder is timm's"),
-        ("coca_ViT-B-32", "it pools by attention"),
-    ],
-)
-def test_models_without_a_value_path_are_refused(encoder, model, reason):
-    with pytest.raises(ValueError, match=f"needs a vision transformer of open_clip; {model} is none: {reason}"):
-        PatchFeatures(replace(encoder, model=model))
-
-
-def test_no_patches(encoder):
-    with pytest.raises(ValueError, match="regions per image must be at least 1, got 0"):
-        PatchFeatures(encoder, 0)
-
-
-@needs_cuda
-def test_a_gpu_sees_what_the_cpu_sees(encoder):
-    expected = PatchFeatures(encoder, 15).view(IMAGE, "a.jpg")
-    found = PatchFeatures(replace(encoder, device="cuda"), 15).view(IMAGE, "a.jpg")
-    assert torch.equal(found.labels, expected.labels)
-    assert found.features.dtype == torch.float32 and found.features.device.type == "cpu"
-    assert (found.features * expected.features).sum(dim=1).min() > 0.999
-
-
-@needs_shared
-def test_a_photograph(encoder):
-    image = read_image(SHARED / "captures" / "fox" / "images" / "0001.jpg")
-    view = PatchFeatures(encoder).view(image, "images/0001.jpg")
-    assert view.labels.shape == image.shape[:2] and len(view.features) == 43 * 24
-    assert len(view.features.unique(dim=0)) == 43 * 24
+def test_what_has_no_patches_is_refused(clip):
+    for model, reason in (
+        ("RN50", "convolutional"),
+        ("convnext_base", "timm"),
+        ("coca_ViT-B-32", "pools by attention"),
+    ):
+        refused(lambda model=model: PatchFeatures(replace(clip, model=model)), model, reason)
+    refused(lambda: PatchFeatures(clip, 0), "1", "0")

@@ -1,31 +1,30 @@
 """SAM's network in other precisions, compiled and not, against transformers' own code in float64."""
 
+from typing import Any
+
 import pytest
 import torch
 
-from normlift_ns.encoders.build import make_regions
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
 from normlift_ns.encoders.sam.weights import load_sam
-from normlift_ns.errors import InputError
-from normlift_ns.options import SourceOptions
-from tests.encoders.tiny import SIDE, needs_cuda, write_sam
+from tests.encoders.tiny import SIDE, needs_cuda, noise, refused, write_sam
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE
 
 
+BOUNDS = {"float32": 2e-6, "float16": 8e-3, "bfloat16": 4e-2}
+
+
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    path = tmp_path_factory.mktemp("sam") / "sam.pth"
-    write_sam(path, seed=1)
-    return path
+def checkpoint(sam_weights):
+    return sam_weights / "sam_tiny.pth"
 
 
 @pytest.fixture(scope="module")
 def embedding(checkpoint):
-    image = torch.randint(0, 256, (96, 128, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     network = SamNetwork.load(str(checkpoint), "cpu")
-    return network.embed(network.pixels([image]))[0]
+    return network.embed(network.pixels([noise(96, 128)]))[0]
 
 
 @pytest.fixture(scope="module")
@@ -40,38 +39,33 @@ def by_transformers(path: str, embedding: torch.Tensor, dtype: torch.dtype) -> t
     return found.pred_masks[0], found.iou_scores[0]
 
 
-def errors(found, expected) -> tuple[float, float]:
-    """Of logits, as a share of the largest, and of predicted IoU; the largest."""
-    scale = float(expected[0].abs().max())
-    (logits, ious), (exact, scores) = found, expected
-    return float((logits.cpu().double() - exact).abs().max()) / scale, float((ious.cpu().double() - scores).abs().max())
-
-
 def close(found, expected, bound: float) -> None:
-    assert max(errors(found, expected)) < bound
+    """Logits, as a share of the largest, and predicted IoU."""
+    for ours, exact, scale in zip(found, expected, (float(expected[0].abs().max()), 1.0)):
+        assert float((ours.cpu().double() - exact).abs().max()) < bound * scale
 
 
-@pytest.mark.parametrize(("precision", "bound"), [("float32", 2e-6), ("float16", 8e-3), ("bfloat16", 4e-2)])
-def test_answers_in_each_precision(checkpoint, embedding, expected, precision, bound):
-    found = SamNetwork.load(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
-    close(found, expected, bound)
-    assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
+def test_answers_in_each_precision(checkpoint, embedding, expected):
     assert float(expected[0].std(dim=0).mean()) > 0.01 * float(expected[0].abs().max())  # masks depend on their point
-    agree = ((found[0] > 0) == (expected[0] > 0)).float().mean()
-    assert float(agree) > 1 - bound / 4
+    for precision, bound in BOUNDS.items():
+        found = SamNetwork.load(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
+        close(found, expected, bound)
+        assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
+        agree = ((found[0] > 0) == (expected[0] > 0)).float().mean()
+        assert float(agree) > 1 - bound / 4
 
 
-@pytest.mark.parametrize("precision", ["float32", "float16", "bfloat16"])
-def test_errors_are_no_larger_than_those_of_transformers(tmp_path, embedding, precision):
+def test_errors_are_no_larger_than_those_of_transformers(tmp_path, embedding):
     """Where weights make rounding grow a hundredfold; in half precision transformers runs under autocast."""
     path = tmp_path / "sam.pth"
     write_sam(path, seed=1, gain=2)
     expected = by_transformers(str(path), embedding, torch.float64)
-    found = SamNetwork.load(str(path), "cpu", precision).decode(embedding, POINTS)
-    with torch.autocast("cpu", getattr(torch, precision), enabled=precision != "float32"):
-        theirs = by_transformers(str(path), embedding, torch.float32)
-    here, there = (float((x[0].double() - expected[0]).square().mean().sqrt()) for x in (found, theirs))
-    assert 0 < here < (1.5 if precision == "float32" else 0.8) * there
+    for precision in BOUNDS:
+        found = SamNetwork.load(str(path), "cpu", precision).decode(embedding, POINTS)
+        with torch.autocast("cpu", getattr(torch, precision), enabled=precision != "float32"):
+            theirs = by_transformers(str(path), embedding, torch.float32)
+        here, there = (float((x[0].double() - expected[0]).square().mean().sqrt()) for x in (found, theirs))
+        assert 0 < here < (1.5 if precision == "float32" else 0.8) * there
 
 
 def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
@@ -82,27 +76,24 @@ def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
     close((masks, ious), by_transformers(str(checkpoint), huge, torch.float64), 1e-4)
 
 
-def test_precision_is_part_of_the_identity(checkpoint):
+def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
     sam = SamMasks(str(checkpoint))
     assert resolve_precision("auto", "cpu") == "float32" and resolve_precision("auto", "cuda") == "float16"
     assert sam.identity == SamMasks(str(checkpoint), precision="float32").identity
     assert sam.identity != SamMasks(str(checkpoint), precision="bfloat16").identity
-
-
-def test_the_option_reaches_the_network(checkpoint):
-    options = SourceOptions(regions="sam", sam_model=str(checkpoint), sam_precision="bfloat16")
-    assert make_regions(options) == SamMasks(str(checkpoint), "l", "cpu", "bfloat16")
-    with pytest.raises(InputError, match=r'--sam-precision float16 is for --regions sam, not for "grid"'):
-        make_regions(SourceOptions(regions="grid", sam_precision="float16"))
-    with pytest.raises(InputError, match="unknown precision of SAM 'half'; --sam-precision is one of auto, float32"):
-        SamMasks(str(checkpoint), precision="half")  # pyright: ignore[reportArgumentType]
+    wrong: Any = "half"
+    refused(lambda: SamMasks(str(checkpoint), precision=wrong), "'half'", "--sam-precision", "auto, float32")
+    # In half precision too
+    rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
+    labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
+    assert labels.shape[0] == 4 and int(labels.max()) >= 0
 
 
 @needs_cuda
-@pytest.mark.parametrize(("precision", "bound"), [("float32", 1e-4), ("float16", 8e-3), ("bfloat16", 4e-2)])
-def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected, precision, bound):
-    network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision)
-    close(network.decode(embedding.cuda(), POINTS), expected, bound)
+def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected):
+    for precision, bound in {**BOUNDS, "float32": 1e-4}.items():
+        network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision)
+        close(network.decode(embedding.cuda(), POINTS), expected, bound)
 
 
 @needs_cuda
@@ -113,10 +104,3 @@ def test_a_gpu_measures_masks_as_they_are_enlarged(checkpoint, embedding):
     large = network.enlarge(logits, (96, 128))
     assert float((found.inner - (large > 1).flatten(1).sum(dim=1)).abs().max()) <= 2
     assert float((found.outer - (large > -1).flatten(1).sum(dim=1)).abs().max()) <= 2
-
-
-def test_rules_in_half_precision_find_masks(checkpoint):
-    image = torch.randint(0, 256, (60, 80, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    rules = MaskRules(points_per_side=4, predicted_iou=-9.0, stability=0.01)
-    labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(image, "")
-    assert labels.shape[0] == 4 and int(labels.max()) >= 0

@@ -2,12 +2,13 @@
 
 import numpy as np
 import torch
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
 from normlift_ns.encoders.sam.resize import resize_bilinear
 from tests.encoders.tiny import needs_cuda
+from tests.examples import examples
 
 sides = st.integers(1, 70)
 
@@ -22,7 +23,7 @@ def check(height: int, width: int, to_height: int, to_width: int, seed: int, dev
     assert off <= (1 if to_height < height else 0)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(25)
 @given(height=sides, width=sides, to_height=sides, to_width=sides, seed=st.integers(0, 9))
 @example(height=70, width=60, to_height=3, to_width=1, seed=0)
 @example(height=1, width=1, to_height=5, to_width=9, seed=0)
@@ -31,7 +32,7 @@ def test_equals_pillow(height, width, to_height, to_width, seed):
 
 
 def test_sizes_of_photographs():
-    for size in ((731, 988, 758, 1024), (491, 619, 812, 1024), (1331, 2000, 681, 1024), (768, 1024, 768, 1024)):
+    for size in ((123, 988, 127, 1024), (1331, 200, 681, 102), (48, 1024, 48, 1024)):
         check(*size, seed=1)
 
 

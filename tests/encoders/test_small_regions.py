@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
@@ -11,6 +11,7 @@ from scipy import ndimage
 from normlift_ns.encoders.sam import small_regions
 from normlift_ns.encoders.sam.small_regions import clean_masks
 from tests.encoders.tiny import DEVICES
+from tests.examples import examples
 
 EIGHT = np.ones((3, 3))
 
@@ -53,7 +54,7 @@ def picture(*rows: str) -> np.ndarray:
     return np.array([[pixel == "#" for pixel in row] for row in rows])
 
 
-@settings(max_examples=300, deadline=None)
+@examples(25)
 @given(
     masks=arrays(bool, st.tuples(st.integers(1, 4), st.integers(1, 9), st.integers(1, 18))), least=st.integers(0, 30)
 )
@@ -66,7 +67,6 @@ def test_any_masks(masks, least):
     assert_right(masks, least)
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     blobs=st.lists(st.tuples(*[st.integers(0, 29)] * 2, st.integers(0, 7), st.booleans()), max_size=12),
     least=st.integers(2, 60),
@@ -80,15 +80,11 @@ def test_blobs_and_holes_in_them(blobs, least):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("share", [0.002, 0.1, 0.4, 0.5, 0.6, 0.9, 0.998])
-def test_noise(share, device):
+def test_noise_stripes_checkerboards_and_plain_masks(device):
     g = np.random.default_rng(3)
-    _, changed = assert_right(g.random((6, 90, 131)) < share, 20, device)
-    assert all(changed)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_stripes_checkerboards_and_plain_masks(device):
+    for share in (0.002, 0.1, 0.4, 0.5, 0.6, 0.9, 0.998):
+        _, changed = assert_right(g.random((3, 60, 71)) < share, 20, device)
+        assert all(changed)
     y, x = np.mgrid[:40, :47]
     masks = [y % 2 == 0, x % 2 == 0, (x + y) % 2 == 0, y > 50, y >= 0, (y == 7) & (x == 9), (y == 39) & (x == 46)]
     masks += [(y == 0) & (x == 0), (x + y) % 5 == 0, (x // 4 + y // 4) % 2 == 0, (y < 20) ^ ((y == 3) & (x > 44))]
@@ -96,9 +92,8 @@ def test_stripes_checkerboards_and_plain_masks(device):
         assert_right(np.stack(masks), least, device)
 
 
-@pytest.mark.parametrize(
-    ("mask", "least", "expected", "different"),
-    [
+def test_edge_cases_of_neighbourhood_and_order():
+    for mask, least, expected, different in (
         (picture("#..", ".#.", "..#"), 3, picture("#..", ".#.", "..#"), False),
         (picture("#...", ".#..", "....", "...#"), 2, picture("#...", ".#..", "....", "...."), True),  # diagonals touch
         (picture("..#", "#.."), 2, picture("..#", "..."), True),  # an end of a row and the start of the next do not
@@ -110,12 +105,10 @@ def test_stripes_checkerboards_and_plain_masks(device):
         # A piece that is large only once its hole is filled stays: holes come first.
         (picture("###.....", "#.#.....", "###.....", "........"), 9, picture(*["###....."] * 3, "........"), True),
         (picture("##......", "##....#.", "........"), 5, picture("##......", "##......", "........"), True),
-    ],
-)
-def test_edge_cases_of_neighbourhood_and_order(mask, least, expected, different):
-    cleaned, changed = clean_masks(torch.from_numpy(mask)[None], least)
-    assert np.array_equal(cleaned[0].numpy(), expected)
-    assert changed.tolist() == [different]
+    ):
+        cleaned, changed = clean_masks(torch.from_numpy(mask)[None], least)
+        assert np.array_equal(cleaned[0].numpy(), expected), mask
+        assert changed.tolist() == [different], mask
 
 
 def test_masks_do_not_touch_one_another():
@@ -124,17 +117,18 @@ def test_masks_do_not_touch_one_another():
     masks[0, 4], masks[1, 0, :3], masks[1, 4, 7], masks[2, 0, 0] = True, True, True, True
     cleaned, changed = assert_right(masks, 4)
     assert changed == [False, True, True] and cleaned.sum() == 8 + 3 + 1
+    for count in (0, 3):  # no masks, and whole images
+        whole = torch.ones(count, 4, 5, dtype=torch.bool)
+        found, different = clean_masks(whole, 10)
+        assert torch.equal(found, whole) and different.tolist() == [False] * count
 
 
-@pytest.mark.parametrize("count", [0, 3])
-def test_no_masks_and_whole_images(count):
-    masks = torch.ones(count, 4, 5, dtype=torch.bool)
-    cleaned, changed = clean_masks(masks, 10)
-    assert torch.equal(cleaned, masks) and changed.tolist() == [False] * count
+def blotches(*shape: int) -> torch.Tensor:
+    return torch.from_numpy(ndimage.uniform_filter(np.random.default_rng(0).random(shape), (0, 5, 5)) > 0.5)
 
 
-def test_chunks_change_nothing(monkeypatch):
-    masks = torch.from_numpy(ndimage.uniform_filter(np.random.default_rng(0).random((7, 60, 45)), (0, 5, 5)) > 0.5)
+def test_chunks_and_a_gpus_components_change_nothing(monkeypatch):
+    masks = blotches(7, 60, 45)
     expected = clean_masks(masks, 40)
     assert expected[1].all() and not torch.equal(expected[0], masks)
     for chunk in (1, 3 * 60 * 45):
@@ -143,9 +137,13 @@ def test_chunks_change_nothing(monkeypatch):
     monkeypatch.undo()
     turned = clean_masks(masks.permute(0, 2, 1), 40)  # another order in memory
     assert torch.equal(turned[0], expected[0].permute(0, 2, 1)) and torch.equal(turned[1], expected[1])
+    monkeypatch.setattr(small_regions, "_joined_by_scipy", small_regions._joined_by_torch)
+    assert all(map(torch.equal, clean_masks(masks, 40), expected))
+    order = torch.from_numpy(np.random.default_rng(0).permutation(3000))  # a long chain is one component
+    assert bool((small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())
 
 
-@settings(max_examples=200, deadline=None)
+@examples(20)
 @given(data=st.data(), nodes=st.integers(1, 40))
 def test_components_are_the_same_on_any_device(data, nodes):
     """Also their numbers' order, which decides between pieces of one size."""
@@ -156,16 +154,3 @@ def test_components_are_the_same_on_any_device(data, nodes):
     found = small_regions._joined_by_torch(nodes, edges)
     assert torch.equal(found.unique(return_inverse=True)[1], expected)
     assert bool((found[found] == found).all()) and bool((found <= torch.arange(nodes)).all())
-
-
-def test_a_long_chain_is_one_component():
-    order = torch.from_numpy(np.random.default_rng(0).permutation(3000))
-    found = small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]]))
-    assert bool((found == 0).all())
-
-
-def test_the_components_of_a_gpu_give_the_same_masks(monkeypatch):
-    masks = torch.from_numpy(ndimage.uniform_filter(np.random.default_rng(1).random((9, 70, 55)), (0, 3, 3)) > 0.5)
-    expected = clean_masks(masks, 12)
-    monkeypatch.setattr(small_regions, "_joined_by_scipy", small_regions._joined_by_torch)
-    assert all(map(torch.equal, clean_masks(masks, 12), expected))

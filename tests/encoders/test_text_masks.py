@@ -5,21 +5,19 @@ from pathlib import Path
 
 import pytest
 import torch
-import transformers
 from PIL import Image
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from normlift_ns.encoders.sam import text_masks
 from normlift_ns.encoders.sam.text_masks import Sam3Masks, Sam3Network, TextMasks
 from tests.encoders.test_library import photograph
-from tests.encoders.tiny_library import SAM3_SIDE, write_tiny
+from tests.encoders.tiny import copied, refused
+from tests.encoders.tiny_library import SAM3_SIDE
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("sam3")
-    write_tiny(folder, "sam3", seed=2)
-    return folder
+@pytest.fixture(scope="session")
+def written(library_weights) -> Path:
+    return library_weights / "sam3"
 
 
 @pytest.fixture
@@ -28,43 +26,42 @@ def eager(monkeypatch) -> None:
     monkeypatch.setattr(text_masks, "SCORE", 0.2)
 
 
-@pytest.mark.parametrize("size", [(60, 90), (56, 56)])
-def test_masks_are_those_of_transformers(written, eager, size):
-    image, texts = photograph(*size), ["mug", "red mug"]
-    found = Sam3Network.load(str(written), "cpu").find(image, texts)
-    side = {"height": SAM3_SIDE, "width": SAM3_SIDE}
+def test_masks_are_those_of_transformers(written, eager, transformers):
+    texts, side = ["mug", "red mug"], {"height": SAM3_SIDE, "width": SAM3_SIDE}
     processor = transformers.Sam3Processor(
         transformers.Sam3ImageProcessor(size=side), transformers.CLIPTokenizer.from_pretrained(written)
     )
     model = transformers.Sam3Model.from_pretrained(written).double().eval()
-    for text, ours in zip(texts, found):
-        inputs = processor(images=Image.fromarray(image.numpy()), text=text, return_tensors="pt")
-        exact = {name: x.double() if x.is_floating_point() else x for name, x in inputs.items()}
-        exact.pop("original_sizes")
-        with torch.no_grad():
-            out = model(**exact)
-        (expected,) = processor.post_process_instance_segmentation(
-            out, threshold=text_masks.SCORE, mask_threshold=0.5, target_sizes=[size]
-        )
-        assert len(ours.scores) > 0
-        torch.testing.assert_close(ours.scores.double(), expected["scores"], rtol=0, atol=2e-5)
-        differ = (ours.masks != expected["masks"].bool()).float().mean()
-        assert ours.masks.shape == expected["masks"].shape and float(differ) < 1e-3
-        assert 0.02 < float(ours.masks.float().mean()) < 0.98
-    assert len(found[0].scores) < 12 and len(found[0].scores) != len(found[1].scores)
+    network = Sam3Network.load(str(written), "cpu")
+    for size in ((60, 90), (56, 56)):
+        image = photograph(*size)
+        found = network.find(image, texts)
+        for text, ours in zip(texts, found):
+            inputs = processor(images=Image.fromarray(image.numpy()), text=text, return_tensors="pt")
+            exact = {name: x.double() if x.is_floating_point() else x for name, x in inputs.items()}
+            exact.pop("original_sizes")
+            with torch.no_grad():
+                out = model(**exact)
+            (expected,) = processor.post_process_instance_segmentation(
+                out, threshold=text_masks.SCORE, mask_threshold=0.5, target_sizes=[size]
+            )
+            assert len(ours.scores) > 0
+            torch.testing.assert_close(ours.scores.double(), expected["scores"], rtol=0, atol=2e-5)
+            differ = (ours.masks != expected["masks"].bool()).float().mean()
+            assert ours.masks.shape == expected["masks"].shape and float(differ) < 1e-3
+            assert 0.02 < float(ours.masks.float().mean()) < 0.98
+        assert len(found[0].scores) < 12 and len(found[0].scores) != len(found[1].scores)
 
 
 def test_checkpoints_that_are_published_hold_a_tracker_too(written, tmp_path):
     """facebook/sam3 says sam3_video; the model for images is its detector."""
-    write_tiny(tmp_path, "sam3")
-    config = json.loads((tmp_path / "config.json").read_text())
+    config = json.loads((copied(written, tmp_path) / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam3_video", "detector_config": config}))
-    model = transformers.Sam3Model.from_pretrained(written)
-    state = {f"detector_model.{name}": value for name, value in model.state_dict().items()}
-    save_file({**state, "tracker_model.memory": torch.zeros(3)}, tmp_path / "model.safetensors")
-    network = Sam3Network.load(str(tmp_path), "cpu")
-    for name, value in network._model.state_dict().items():
-        assert torch.equal(value, model.state_dict()[name])
+    state = load_file(written / "model.safetensors")
+    tracker = {"tracker_model.memory": torch.zeros(3)}
+    save_file({**{f"detector_model.{name}": x for name, x in state.items()}, **tracker}, tmp_path / "model.safetensors")
+    found = Sam3Network.load(str(tmp_path), "cpu")._model.state_dict()
+    assert all(torch.equal(found[name], value) for name, value in state.items())
 
 
 def test_where_masks_overlap_the_higher_score_counts(written, monkeypatch):
@@ -86,12 +83,8 @@ def test_where_masks_overlap_the_higher_score_counts(written, monkeypatch):
     assert torch.equal((labels[0] == mug).any(dim=0), left)  # what the encoder sees
 
 
-def test_identity_holds_texts_weights_and_words(written, tmp_path):
-    mine = Sam3Masks(("mug", "plate"), str(written)).identity
-    assert json.loads(json.dumps(mine)) == mine
-    for file in written.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    assert Sam3Masks(("mug", "plate"), str(tmp_path)).identity == mine
+def test_identity_holds_texts_and_words(written, tmp_path):
+    mine = Sam3Masks(("mug", "plate"), str(copied(written, tmp_path))).identity
     assert Sam3Masks(("mug",), str(tmp_path)).identity != mine
     words = tmp_path / "tokenizer.json"
     words.write_text(words.read_text() + " ")
@@ -99,19 +92,14 @@ def test_identity_holds_texts_weights_and_words(written, tmp_path):
 
 
 def test_what_is_refused(written, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="name them with --queries"):
-        Sam3Masks((), str(written))
-    with pytest.raises(ValueError, match=r"SAM 3 reads 32 tokens of a text at most, .* has \d+"):
-        Sam3Network.load(str(written), "cpu").find(photograph(20, 20), ["bowl " * 40])
-    for file in written.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    (tmp_path / "tokenizer.json").unlink()
-    (tmp_path / "vocab.json").unlink(missing_ok=True)
-    with pytest.raises(ValueError, match=r"the folder has no tokenizer\.json"):
-        Sam3Network.load(str(tmp_path), "cpu")
+    refused(lambda: Sam3Masks((), str(written)), "--queries")
+    network = Sam3Network.load(str(written), "cpu")
+    refused(lambda: network.find(photograph(20, 20), ["bowl " * 40]), "32 tokens", "has ")
+    copied(written, tmp_path)
+    for name in ("tokenizer.json", "vocab.json"):
+        (tmp_path / name).unlink(missing_ok=True)
+    refused(lambda: Sam3Network.load(str(tmp_path), "cpu"), str(tmp_path), "no tokenizer.json")
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2"}))
-    with pytest.raises(ValueError, match=r"'sam2' \(SAM 2 answers points: --regions sam\), expected one of 'sam3'"):
-        Sam3Masks(("mug",), str(tmp_path))
+    refused(lambda: Sam3Masks(("mug",), str(tmp_path)), "'sam2'", "--regions sam)", "'sam3'")
     monkeypatch.setattr(torch, "__version__", "2.5.0")
-    with pytest.raises(ValueError, match=r"SAM 3 needs torch 2\.6 or newer, this is 2\.5\.0; the first SAM works"):
-        Sam3Masks(("mug",), str(written))
+    refused(lambda: Sam3Masks(("mug",), str(written)), "SAM 3", "torch 2.6", "2.5.0")

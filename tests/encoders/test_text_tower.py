@@ -16,34 +16,26 @@ from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.clip.text_tower import load_text_tower
 from normlift_ns.options import SourceOptions
 from normlift_ns.text_encoders import encoder_of, encoder_settings
-from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES, open_clip, write_clip
+from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES
 
 TEXTS = ["fox", "a red fox that sleeps under a very old tree", "ÄÖ 狐 🦊", "word " * 200, "it's 12,5 %"]
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("weights")
-    write_clip(folder)
-    return folder
-
-
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("template", ["{}", "a photo of a {}", "ensemble"])
-@pytest.mark.parametrize("file", ["tiny.pt", "tiny.safetensors"])
-def test_vectors_are_those_of_open_clip(weights, file, template, device):
-    path = str(weights / file)
-    tower = load_text_tower(CLIP, path, template, device)
-    assert tower is not None
-    found, expected = tower.text(TEXTS), OpenClipEncoder(CLIP, path, template=template).text(TEXTS)
-    assert found.shape == expected.shape == (len(TEXTS), 24)
-    assert found.device.type == "cpu"
-    assert (found - expected).abs().max() < 2e-6
-    assert (found[0] - found[1]).abs().max() > 0.01
+def test_vectors_are_those_of_open_clip(clip_weights, device):
+    for file, template in (("tiny.pt", "{}"), ("tiny.pt", "a photo of a {}"), ("tiny.safetensors", "ensemble")):
+        path = str(clip_weights / file)
+        tower = load_text_tower(CLIP, path, template, device)
+        assert tower is not None
+        found, expected = tower.text(TEXTS), OpenClipEncoder(CLIP, path, template=template).text(TEXTS)
+        assert found.shape == expected.shape == (len(TEXTS), 24)
+        assert found.device.type == "cpu"
+        assert (found - expected).abs().max() < 2e-6, (file, template)
+        assert (found[0] - found[1]).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("quick", [True, False])
-def test_both_activations_agree_with_open_clip_in_float64(tmp_path, quick):
+def test_both_activations_agree_with_open_clip_in_float64(tmp_path, open_clip, quick):
     name = f"normlift-quick-{quick}"
     config = {**CLIP_CONFIG, "quick_gelu": quick}
     (tmp_path / f"{name}.json").write_text(json.dumps(config))
@@ -63,36 +55,35 @@ def test_both_activations_agree_with_open_clip_in_float64(tmp_path, quick):
     assert (replace(tower, quick_gelu=not quick).text(TEXTS).double() - expected).abs().max() > 1e-4
 
 
-def test_half_precision_wrapped_and_prefixed_weights_are_read(weights, tmp_path):
-    state = load_file(weights / "tiny.safetensors")
+def test_half_precision_wrapped_and_prefixed_weights_are_read(clip, clip_weights, tmp_path):
+    state = load_file(clip_weights / "tiny.safetensors")
     torch.save({"state_dict": {f"module.{k}": v.half() for k, v in state.items()}}, tmp_path / "wrapped.pt")
     tower = load_text_tower(CLIP, str(tmp_path / "wrapped.pt"), "{}")
     assert tower is not None
-    expected = OpenClipEncoder(CLIP, str(weights / "tiny.pt")).text(TEXTS)
-    assert 0 < (tower.text(TEXTS) - expected).abs().max() < 0.01
+    assert 0 < (tower.text(TEXTS) - clip.text(TEXTS)).abs().max() < 0.01
 
 
-def test_what_is_not_plain_is_left_to_open_clip(weights, tmp_path):
-    path = str(weights / "tiny.pt")
-    assert load_text_tower("roberta-ViT-B-32", path, "{}") is None
-    assert load_text_tower("coca_ViT-B-32", path, "{}") is None
-    assert load_text_tower("ViT-B-16-SigLIP", path, "{}") is None
-    assert load_text_tower("no-such-model", path, "{}") is None
-    assert load_text_tower(CLIP, "no-such-tag", "{}") is None
-    assert load_text_tower(CLIP, path, "no place") is None
-    assert load_text_tower("ViT-B-32", path, "{}") is None  # of other shapes
-    state = load_file(weights / "tiny.safetensors")
+def test_what_is_not_plain_is_left_to_open_clip(clip, clip_weights, tmp_path):
+    state = load_file(clip_weights / "tiny.safetensors")
     del state["ln_final.bias"]
     save_file(state, tmp_path / "incomplete.safetensors")
     (tmp_path / "text.pt").write_text("no weights")
     (tmp_path / "empty.safetensors").write_bytes(b"")
     torch.save([1, 2], tmp_path / "list.pt")
-    for name in ("incomplete.safetensors", "text.pt", "empty.safetensors", "list.pt"):
-        assert load_text_tower(CLIP, str(tmp_path / name), "{}") is None
+    files = [str(file) for file in tmp_path.iterdir()]
+    assert len(files) == 4
+    of_other_shapes = "ViT-B-32"
+    models = ("roberta-ViT-B-32", "coca_ViT-B-32", "ViT-B-16-SigLIP", "no-such-model", of_other_shapes)
+    for model, path, template in (
+        *((model, clip.pretrained, "{}") for model in models),
+        *((CLIP, path, "{}") for path in (*files, "no-such-tag")),
+        (CLIP, clip.pretrained, "no place"),
+    ):
+        assert load_text_tower(model, path, template) is None, (model, path, template)
 
 
 @pytest.mark.slow
-def test_a_text_that_is_new_imports_neither_torchvision_nor_transformers(tmp_path):
+def test_a_text_that_is_new_imports_neither_torchvision_nor_transformers(tmp_path, open_clip):
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(1)
         model = open_clip.create_model("ViT-S-32-alt", pretrained_hf=False)
@@ -118,8 +109,8 @@ print(json.dumps([rows, heavy, open_clip.get_model_config("ViT-S-32-alt")["embed
     assert dimension == expected.shape[1]
 
 
-def test_a_question_takes_the_tower_and_open_clip_where_there_is_none(weights, monkeypatch):
-    options = SourceOptions(encoder_model=CLIP, encoder_pretrained=str(weights / "tiny.pt"))
+def test_a_question_takes_the_tower_and_open_clip_where_there_is_none(clip, monkeypatch):
+    options = SourceOptions(encoder_model=CLIP, encoder_pretrained=clip.pretrained)
     field: Any = SimpleNamespace(manifest={"encoder": encoder_settings(options)})
     made = []
     real = text_tower.load_text_tower

@@ -1,5 +1,5 @@
 """Folders of SigLIP, SigLIP 2 and MetaCLIP 2 with few random weights, written by transformers itself, with real
-tokenizers of few tokens."""
+tokenizers of few tokens. Imports transformers, so that tests import it while they run."""
 
 from __future__ import annotations
 
@@ -32,11 +32,9 @@ def _pieces(special: Sequence[str], bytes_too: bool) -> tuple[dict[str, int], li
     return {name: number for number, name in enumerate(names)}, merges
 
 
-def _ending(tokenizer: Any, first: str, end: str, number: int, start: int = 0) -> None:
-    """Puts the end behind every text, and perhaps something before it."""
-    single = f"{first} $A {end}".strip()
-    known = [(end, number), *([(first, start)] if first else [])]
-    tokenizer.post_processor = processors.TemplateProcessing(single=single, special_tokens=known)
+def _ending(tokenizer: Any, end: str) -> None:
+    """Puts the end, token 1, behind every text."""
+    tokenizer.post_processor = processors.TemplateProcessing(single=f"$A {end}", special_tokens=[(end, 1)])
 
 
 def siglip_tokenizer() -> Any:
@@ -48,15 +46,10 @@ def siglip_tokenizer() -> Any:
     tokenizer.normalizer = normalizers.Sequence([normalizers.Lowercase(), normalizers.Strip()])
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
     tokenizer.decoder = decoders.Metaspace()
-    _ending(tokenizer, "", "</s>", 1)
-    return transformers.PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        eos_token="</s>",
-        pad_token="</s>",
-        unk_token="<unk>",
-        padding_side="right",
-        model_input_names=["input_ids"],
-    )
+    _ending(tokenizer, "</s>")
+    tokens = {"eos_token": "</s>", "pad_token": "</s>", "unk_token": "<unk>"}
+    names = {"padding_side": "right", "model_input_names": ["input_ids"]}
+    return transformers.PreTrainedTokenizerFast(tokenizer_object=tokenizer, **tokens, **names)
 
 
 def siglip2_tokenizer() -> Any:
@@ -65,7 +58,7 @@ def siglip2_tokenizer() -> Any:
     tokenizer = transformers.Siglip2Tokenizer(
         vocab=vocabulary, merges=merges, padding_side="right", model_input_names=["input_ids"]
     )
-    _ending(tokenizer.backend_tokenizer, "", "<eos>", 1)
+    _ending(tokenizer.backend_tokenizer, "<eos>")
     return tokenizer
 
 
@@ -93,63 +86,30 @@ def _write(folder: Path, model: Any, processor: Any, seed: int) -> None:
     processor.save_pretrained(folder)
 
 
-def _siglip(folder: Path, tokenizer: Any, images: Any, seed: int) -> None:
+def write_hub(folder: Path, name: str, seed: int = 0) -> None:
+    """One of the networks of `HUB`: `naflex` is SigLIP 2 for images of any shape; the joint space of
+    MetaCLIP 2 is narrower than its layers."""
+    side = {"height": SIDE, "width": SIDE}
+    vision = {**_TINY, "image_size": SIDE, "patch_size": PATCH}
+    kinds = {"siglip": siglip_tokenizer, "metaclip2": metaclip_tokenizer}
+    tokenizer = kinds.get(name, siglip2_tokenizer)()
     text = {**_TINY, "vocab_size": len(tokenizer), "max_position_embeddings": LENGTH}
-    config = transformers.SiglipConfig(
-        text_config={**text, "bos_token_id": 0, "eos_token_id": 1},
-        vision_config={**_TINY, "image_size": SIDE, "patch_size": PATCH},
-    )
-    _write(folder, transformers.SiglipModel(config), transformers.SiglipProcessor(images, tokenizer), seed)
-
-
-def write_siglip(folder: Path, seed: int = 0) -> None:
-    """SigLIP: bicubic images, as its processor says."""
-    size = {"height": SIDE, "width": SIDE}
-    images = transformers.SiglipImageProcessor(size=size, resample=3, image_mean=[0.5] * 3, image_std=[0.5] * 3)
-    _siglip(folder, siglip_tokenizer(), images, seed)
-
-
-def write_siglip2(folder: Path, seed: int = 0) -> None:
-    """SigLIP 2 of fixed resolution: the architecture of SigLIP, another tokenizer."""
-    size = {"height": SIDE, "width": SIDE}
-    images = transformers.SiglipImageProcessor(size=size, resample=2, image_mean=[0.4] * 3, image_std=[0.3] * 3)
-    _siglip(folder, siglip2_tokenizer(), images, seed)
-
-
-def write_naflex(folder: Path, seed: int = 0) -> None:
-    """SigLIP 2 for images of any shape."""
-    tokenizer = siglip2_tokenizer()
-    text = {**_TINY, "vocab_size": len(tokenizer), "max_position_embeddings": LENGTH}
-    config = transformers.Siglip2Config(
-        text_config={**text, "bos_token_id": 2, "eos_token_id": 1},
-        vision_config={**_TINY, "num_patches": 16, "patch_size": PATCH},
-    )
-    images = transformers.Siglip2ImageProcessor(patch_size=PATCH, max_num_patches=20)
-    _write(folder, transformers.Siglip2Model(config), transformers.Siglip2Processor(images, tokenizer), seed)
-
-
-def write_metaclip2(folder: Path, seed: int = 0) -> None:
-    """MetaCLIP 2, whose joint space is narrower than its layers."""
-    tokenizer = metaclip_tokenizer()
-    config = transformers.MetaClip2Config(
-        text_config={
-            **_TINY,
-            "vocab_size": len(tokenizer),
-            "max_position_embeddings": LENGTH,
-            "eos_token_id": 2,
-            "bos_token_id": 0,
-        },
-        vision_config={**_TINY, "image_size": SIDE, "patch_size": PATCH},
-        projection_dim=24,
-    )
-    images = transformers.CLIPImageProcessor(size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE})
-    _write(folder, transformers.MetaClip2Model(config), transformers.CLIPProcessor(images, tokenizer), seed)
-
-
-WRITERS = {
-    "siglip": ("siglip", write_siglip),
-    "siglip2": ("siglip2", write_siglip2),
-    "naflex": ("siglip2", write_naflex),
-    "metaclip2": ("metaclip2", write_metaclip2),
-}
-"""Name of the encoder, and what writes a folder for it."""
+    if name == "metaclip2":
+        text |= {"eos_token_id": 2, "bos_token_id": 0}
+        config = transformers.MetaClip2Config(text_config=text, vision_config=vision, projection_dim=24)
+        images = transformers.CLIPImageProcessor(size={"shortest_edge": SIDE}, crop_size=side)
+        _write(folder, transformers.MetaClip2Model(config), transformers.CLIPProcessor(images, tokenizer), seed)
+    elif name == "naflex":
+        text |= {"bos_token_id": 2, "eos_token_id": 1}
+        vision = {**_TINY, "num_patches": 16, "patch_size": PATCH}
+        config = transformers.Siglip2Config(text_config=text, vision_config=vision)
+        images = transformers.Siglip2ImageProcessor(patch_size=PATCH, max_num_patches=20)
+        _write(folder, transformers.Siglip2Model(config), transformers.Siglip2Processor(images, tokenizer), seed)
+    else:  # of fixed resolution, SigLIP 2 has the architecture of SigLIP
+        mean, std, resample = (0.5, 0.5, 3) if name == "siglip" else (0.4, 0.3, 2)
+        norm = {"image_mean": [mean] * 3, "image_std": [std] * 3}
+        images = transformers.SiglipImageProcessor(size=side, resample=resample, **norm)
+        config = transformers.SiglipConfig(
+            text_config={**text, "bos_token_id": 0, "eos_token_id": 1}, vision_config=vision
+        )
+        _write(folder, transformers.SiglipModel(config), transformers.SiglipProcessor(images, tokenizer), seed)

@@ -1,66 +1,44 @@
 """SAM 2, HQ-SAM and SAM 3 of transformers with few random weights, as transformers writes them."""
 
 import json
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
-import transformers
 
 SIDE = 64
 """Of the input of SAM 2 and HQ-SAM."""
 SAM3_SIDE = 56
-WORDS = ["mug", "plate", "red", "bowl", "the", "a"]
 _PROMPT = {"hidden_size": 32, "image_size": SIDE, "patch_size": 16, "mask_input_channels": 4}
 _DECODER = {"hidden_size": 32, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 16}
 
 
 def _hiera() -> dict[str, Any]:
-    backbone = {
-        "hidden_size": 8,
-        "image_size": [SIDE, SIDE],
-        "blocks_per_stage": [1, 1, 2, 1],
-        "embed_dim_per_stage": [8, 16, 32, 64],
-        "num_attention_heads_per_stage": [1, 1, 2, 2],
-        "window_size_per_stage": [4, 4, 4, 4],
-        "global_attention_blocks": [3],
-        "window_positional_embedding_background_size": [2, 2],
-    }
-    channels, sizes = [64, 32, 16, 8], [[16, 16], [8, 8], [4, 4]]
-    return {
-        "backbone_config": {"model_type": "sam2_hiera_det_model", **backbone},
-        "backbone_channel_list": channels,
-        "backbone_feature_sizes": sizes,
-        "fpn_hidden_size": 32,
-    }
+    sides = {"image_size": [SIDE, SIDE], "window_positional_embedding_background_size": [2, 2]}
+    stages = {"blocks": [1, 1, 2, 1], "embed_dim": [8, 16, 32, 64], "num_attention_heads": [1, 1, 2, 2]}
+    backbone = {f"{name}_per_stage": values for name, values in {**stages, "window_size": [4] * 4}.items()}
+    backbone |= {"model_type": "sam2_hiera_det_model", "hidden_size": 8, "global_attention_blocks": [3], **sides}
+    neck = {"backbone_channel_list": [64, 32, 16, 8], "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]]}
+    return {"backbone_config": backbone, **neck, "fpn_hidden_size": 32}
 
 
 def tiny(kind: str, seed: int = 0) -> Any:
     """A model of transformers, by the model type of its config, its weights large enough to matter."""
-    vit = {
-        "hidden_size": 32,
-        "num_hidden_layers": 2,
-        "num_attention_heads": 2,
-        "image_size": SIDE,
-        "window_size": 2,
-        "global_attn_indexes": [1],
-        "output_channels": 32,
-        "num_pos_feats": 16,
-        "mlp_dim": 64,
-    }
+    transformers = import_module("transformers")
+    vit = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": SIDE, "window_size": 2}
+    vit |= {"global_attn_indexes": [1], "output_channels": 32, "num_pos_feats": 16, "mlp_dim": 64}
+    parts = {"vision_config": _hiera(), "prompt_encoder_config": _PROMPT, "mask_decoder_config": _DECODER}
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         if kind == "sam2":
-            parts = {"vision_config": _hiera(), "prompt_encoder_config": _PROMPT, "mask_decoder_config": _DECODER}
             model = transformers.Sam2Model(transformers.Sam2Config(**parts))
         elif kind == "sam2_video":
-            parts = {"vision_config": _hiera(), "prompt_encoder_config": _PROMPT, "mask_decoder_config": _DECODER}
             memory: dict[str, Any] = {f"memory_{name}_hidden_size": 32 for name in ("attention", "encoder")}
             model = transformers.Sam2VideoModel(transformers.Sam2VideoConfig(**parts, image_size=SIDE, **memory))
         elif kind == "sam_hq":
-            parts = {"vision_config": vit, "prompt_encoder_config": _PROMPT}
-            decoder = {**_DECODER, "vit_dim": 32}
-            model = transformers.SamHQModel(transformers.SamHQConfig(**parts, mask_decoder_config=decoder))
+            parts |= {"vision_config": vit, "mask_decoder_config": {**_DECODER, "vit_dim": 32}}
+            model = transformers.SamHQModel(transformers.SamHQConfig(**parts))
         else:
             model = transformers.Sam3Model(_sam3())
         with torch.no_grad():
@@ -80,7 +58,7 @@ def _sam3() -> Any:
     vit |= {"window_size": 2, "global_attn_indexes": [1], "pretrain_image_size": 28, **small}
     words = {"model_type": "clip_text_model", "vocab_size": 64, "projection_dim": 16, "num_hidden_layers": 1, **small}
     words |= {"max_position_embeddings": 32, "hidden_act": "gelu"}
-    return transformers.Sam3Config(
+    return import_module("transformers").Sam3Config(
         vision_config={"backbone_config": vit, "fpn_hidden_size": 32,
                        "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]]},
         text_config={**words, "bos_token_id": 62, "eos_token_id": 63, "pad_token_id": 63},
@@ -114,4 +92,4 @@ def write_tokenizer(folder: Path) -> None:
     vocabulary |= {"<|startoftext|>": 62, "<|endoftext|>": 63}
     (folder / "vocab.json").write_text(json.dumps(vocabulary))
     (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(dict.fromkeys(merges)) + "\n")
-    transformers.CLIPTokenizer.from_pretrained(folder).save_pretrained(folder)
+    import_module("transformers").CLIPTokenizer.from_pretrained(folder).save_pretrained(folder)

@@ -26,15 +26,15 @@ def enlarged(logits: torch.Tensor, side: int, scaled: tuple[int, int], size: tup
 @pytest.mark.parametrize(
     ("side", "scaled", "size", "dtype"),
     [
-        (64, (64, 41), (100, 64), torch.float16),
-        (64, (33, 64), (20, 39), torch.float32),
         (64, (33, 64), (20, 39), torch.float16),
-        (128, (128, 128), (128, 128), torch.float32),
+        (64, (33, 64), (67, 39), torch.float32),  # 67 rows: a block and a part of one
         (64, (1, 64), (1, 70), torch.float32),
+        pytest.param(64, (64, 41), (100, 64), torch.float16, marks=pytest.mark.extra),
+        pytest.param(128, (128, 128), (128, 128), torch.float32, marks=pytest.mark.extra),
     ],
 )
 def test_equals_masks_that_are_made(side, scaled, size, dtype):
-    logits = smooth(9, side // 4).to(dtype)
+    logits = smooth(7, side // 4).to(dtype)
     logits[-1] = -5.0  # an empty mask
     logits[-2] = 5.0  # a full one
     rows, columns = (taps(side // 4, side, s, n) for s, n in zip(scaled, size))
@@ -48,19 +48,19 @@ def test_equals_masks_that_are_made(side, scaled, size, dtype):
         assert bool(((found.cpu() - exact).abs() <= undecided).all())
         assert int(undecided.sum()) < 0.01 * large.numel()
     decided = ~(large.abs() < close).flatten(1).any(dim=1)
-    assert int(decided.sum()) >= 7
+    assert int(decided.sum()) >= 4
     assert torch.equal(boxes.cpu()[decided], expected.boxes[decided])
     assert boxes[-1].tolist() == [0, 0, 0, 0] and inner[-1] == outer[-1] == 0
     assert boxes[-2].tolist() == [0, 0, size[1] - 1, size[0] - 1] and inner[-2] == size[0] * size[1]
     assert 0 < int(expected.inner[3]) < int(expected.outer[3]) or min(size) == 1
 
 
-@pytest.mark.parametrize(("count", "side", "scaled", "size"), [(8, 32, 20, 31), (256, 1024, 757, 731), (3, 12, 12, 5)])
-def test_three_logits_make_a_pixel(count, side, scaled, size):
-    first, weights = taps(count, side, scaled, size)
-    line = torch.randn(count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    whole = interpolate(line[None, None], side, mode="linear", align_corners=False)[:, :, :scaled]
-    expected = interpolate(whole, size, mode="linear", align_corners=False)[0, 0]
-    found = (line[first[:, None] + torch.arange(3)] * weights).sum(dim=1)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-    assert int(first.min()) >= 0 and int(first.max()) <= count - 3
+def test_three_logits_make_a_pixel():
+    for count, side, scaled, size in ((8, 32, 20, 31), (256, 1024, 757, 731), (3, 12, 12, 5)):
+        first, weights = taps(count, side, scaled, size)
+        line = torch.randn(count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        whole = interpolate(line[None, None], side, mode="linear", align_corners=False)[:, :, :scaled]
+        expected = interpolate(whole, size, mode="linear", align_corners=False)[0, 0]
+        found = (line[first[:, None] + torch.arange(3)] * weights).sum(dim=1)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+        assert int(first.min()) >= 0 and int(first.max()) <= count - 3

@@ -8,9 +8,7 @@ from normlift_ns.kernels import nearest
 from tests.scenes import generator
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:invalid value encountered:RuntimeWarning"
-)  # infinity - infinity, unused
+pytestmark = pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # infinity - infinity
 
 
 def uneven(n: int, seed: int = 0) -> torch.Tensor:
@@ -23,10 +21,12 @@ def uneven(n: int, seed: int = 0) -> torch.Tensor:
     return points
 
 
-@pytest.mark.parametrize(("n", "k"), [(150, 12), (70, 36), (5, 12), (1, 3)])
+LARGER = [pytest.param(150, 12, marks=pytest.mark.extra), pytest.param(70, 36, marks=pytest.mark.extra)]
+
+
+@pytest.mark.parametrize(("n", "k"), [(45, 12), (5, 12), (1, 3), *LARGER])
 def test_equals_the_cpu(n, k):
-    points = uneven(n)
-    points = points.to(DEVICE)
+    points = uneven(n).to(DEVICE)
     found = nearest.nearest(points, k)
     expected = _on_cpu(points.cpu(), k)
     unsure = (~found.certain).nonzero().squeeze(1)  # the far one: to float32 the cluster is one point
@@ -39,23 +39,16 @@ def test_equals_the_cpu(n, k):
     assert torch.equal(found.spacing.cpu(), expected.spacing)
 
 
-def test_ties_that_it_cannot_order_are_reported():
-    """Six points of a lattice stand at each distance: more than the spare candidates."""
-    points = torch.cartesian_prod(*[torch.arange(5.0)] * 3)
-    found = nearest.nearest(points.to(DEVICE), 12)
-    expected = _on_cpu(points, 12)
-    certain = found.certain.cpu()
-    assert torch.equal(found.index.cpu()[certain], expected.index[certain])
-    assert not certain.all()
-
-
-def test_more_coincident_points_than_candidates_are_reported():
-    points = torch.zeros(80, 3)
-    points[60:] = torch.randn(20, 3, generator=generator(1))
-    found, expected = nearest.nearest(points.to(DEVICE), 12), _on_cpu(points, 12)
-    certain = found.certain.cpu()
-    assert not certain[:60].any()
-    assert torch.equal(found.index.cpu()[certain], expected.index[certain])
+def test_what_it_cannot_order_is_reported():
+    """Six points of a lattice stand at each distance, more than the spare candidates; and more stand at one place."""
+    coincident = torch.zeros(38, 3)
+    coincident[30:] = torch.randn(8, 3, generator=generator(1))
+    lattice = torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.arange(4.0))
+    for points, surely_not in ((lattice, 0), (coincident, 30)):
+        found, expected = nearest.nearest(points.to(DEVICE), 12), _on_cpu(points, 12)
+        certain = found.certain.cpu()
+        assert torch.equal(found.index.cpu()[certain], expected.index[certain])
+        assert not certain.all() and not certain[:surely_not].any()
 
 
 def test_the_tree_holds_every_point_once():
