@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift
 from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
+from tests.examples import examples
 from tests.scenes import dense, generator, random_evidence, unit_rows
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -90,7 +91,7 @@ def oracle(evidence: Evidence, features: torch.Tensor, power: float, level: torc
     return out
 
 
-@settings(deadline=None, max_examples=25)
+@examples(8)
 @given(seed=SEEDS, power=st.sampled_from([0.0, 1.0, 2.0]), levels=st.integers(1, 2))
 def test_equals_the_formula(seed, power, levels):
     evidence = things(seed, gaussians=25)
@@ -100,7 +101,7 @@ def test_equals_the_formula(seed, power, levels):
     assert torch.allclose(found, oracle(evidence, features, power, level), rtol=0, atol=1e-12)
 
 
-@settings(deadline=None, max_examples=25)
+@examples(8)
 @given(seed=SEEDS)
 def test_random_evidence_equals_the_formula(seed):
     evidence = random_evidence(20, VIEWS, seed)
@@ -110,7 +111,6 @@ def test_random_evidence_equals_the_formula(seed):
     assert torch.allclose(found, oracle(evidence, features, 1.0, level), rtol=0, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_overlaps_are_symmetric_shares(seed):
     evidence = things(seed)
@@ -124,7 +124,6 @@ def test_overlaps_are_symmetric_shares(seed):
     assert 0 < agreement <= 1
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_rows_are_unit_and_zero_rows_stay(seed):
     evidence = things(seed)
@@ -137,7 +136,7 @@ def test_rows_are_unit_and_zero_rows_stay(seed):
     assert torch.allclose(found[kept].norm(dim=1), torch.ones(int(kept.sum())), atol=1e-6)
 
 
-@settings(deadline=None, max_examples=25)
+@examples(8)
 @given(seed=SEEDS, views=st.permutations(range(5)))
 def test_order_does_not_matter(seed, views):
     evidence = things(seed)
@@ -178,7 +177,7 @@ def test_regions_of_different_levels_are_not_compared():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@settings(deadline=None, max_examples=10)
+@examples(5)
 @given(seed=SEEDS)
 def test_levels_together_are_levels_apart(device, seed):
     """Two levels of masks of the same pictures in one evidence, columns in any order within their view: the same as
@@ -296,7 +295,6 @@ def test_a_sample_tells_what_the_whole_does():
     assert sampled.agreement[0] == pytest.approx(whole.agreement[0], abs=0.05)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, least=st.integers(1, 30))
 def test_every_region_has_its_sample(seed, least):
     evidence = random_evidence(300, VIEWS, seed)

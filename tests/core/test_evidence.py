@@ -2,13 +2,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift, rasterize_evidence
 from normlift_ns.core.evidence import MASKED, Entries
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.encoders.source import joint_partition
+from tests.examples import examples
 from tests.scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
 
 VIEWS = [3, 0, 1, 5, 2]
@@ -25,7 +26,6 @@ def same(a: Evidence, b: Evidence) -> bool:
     )
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_view_weights_add_up_regions(seed):
     evidence = random_evidence(30, VIEWS, seed)
@@ -36,7 +36,6 @@ def test_view_weights_add_up_regions(seed):
     assert weights.weight.numel() == int((expected > 0).sum())
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, views=st.permutations(range(5)), keep=st.integers(0, 5))
 def test_select_views_takes_columns_in_the_order_asked(seed, views, keep):
     evidence = random_evidence(20, VIEWS, seed)
@@ -49,7 +48,6 @@ def test_select_views_takes_columns_in_the_order_asked(seed, views, keep):
     assert part.region_view.tolist() == [i for i, v in enumerate(chosen) for _ in range(VIEWS[v])]
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, cut=st.integers(0, 5))
 def test_merging_shards_gives_the_whole(seed, cut):
     whole = random_evidence(20, VIEWS, seed)
@@ -58,7 +56,6 @@ def test_merging_shards_gives_the_whole(seed, cut):
     assert same(Evidence.merge(whole), whole)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_regrouping_adds_up_columns(seed):
     evidence = random_evidence(30, VIEWS, seed)
@@ -107,7 +104,7 @@ def test_regrouping_refuses_columns_that_do_not_fit():
             evidence.regroup(torch.tensor(columns), views)
 
 
-@settings(deadline=None, max_examples=8)
+@examples(5)
 @given(seed=SEEDS, power=st.sampled_from([1, 2]), dtype=st.sampled_from([torch.float32, torch.float64]))
 def test_cells_give_the_evidence_of_every_level(seed, power, dtype):
     """Rasterized once on the joint cells, evidence is that of each level rasterized by itself."""
@@ -151,7 +148,6 @@ def test_views_must_exist_once():
             evidence.select_views(views)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, relative=st.floats(0, 1))
 def test_pruning_stays_within_its_bound(seed, relative):
     evidence = random_evidence(30, VIEWS, seed)
@@ -230,7 +226,6 @@ def test_disagreeing_arrays_are_refused():
         replace(e, region_view=e.region_view.flip(0))
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_sums_of_duplicates_do_not_depend_on_order_beyond_rounding(seed):
     g = generator(seed)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Lifted, SemanticField, lift, relevancy
@@ -80,7 +80,6 @@ def test_no_row_is_stored_without_evidence():
     assert len(field.store.coordinates) == int((lifted.scalars.norm > 0).sum()) < N
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**31), rank=st.integers(0, D))
 def test_bound_of_any_basis_holds_for_every_gaussian(seed, rank):
     lifted = lift(random_evidence(N, VIEWS, seed), unit_rows(S, D, seed))

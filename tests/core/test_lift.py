@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift
@@ -27,7 +27,6 @@ def evidence_of(matrix: list[list[float]], region_view: list[int], dtype: torch.
     return Evidence(rows, torch.tensor(region_view).int(), blank, views)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, unlabeled=st.sampled_from(["ignore", "dilute"]), beta=st.floats(0, 10))
 def test_equals_the_definition(seed, unlabeled, beta):
     evidence, features = random_evidence(25, VIEWS, seed), unit_rows(S, D, seed)
@@ -64,7 +63,6 @@ def test_equals_the_definition(seed, unlabeled, beta):
         assert (directions[j] - f / f.norm()).abs().max() < 1e-11
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_identities(seed):
     evidence, features = random_evidence(25, VIEWS, seed), unit_rows(S, D, seed)
@@ -81,7 +79,6 @@ def test_identities(seed):
     assert (weaker.scalars.reliability <= lifted.scalars.reliability).all()
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_direction_is_the_optimum_of_cosine_alignment(seed):
     """u* beats random directions on sum_i A_ij <u, B_i>, and its value is W_j ||f_j|| (eq. 4, 5)."""
@@ -94,7 +91,6 @@ def test_direction_is_the_optimum_of_cosine_alignment(seed):
     assert torch.allclose(value, lifted.scalars.weight * lifted.scalars.norm, rtol=1e-10, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, scale=st.floats(1e-3, 1e3), cut=st.integers(1, 4))
 def test_invariances(seed, scale, cut):
     """Order of views, shards, subsets of Gaussians, a common scale of all weights, rotation of the feature space."""

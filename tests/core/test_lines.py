@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.core.disk.lines import append_line, read_lines
@@ -20,7 +20,6 @@ class Line:
 LINES = [Line('fox "\n\u2028 é 🦊', 1.5), Line("", 2.0), Line("}{", -3.0)]
 
 
-@settings(deadline=None)
 @given(st.integers(0, 200))
 def test_torn_lines_are_left_out(tmp_path_factory, cut):
     folder = tmp_path_factory.mktemp("lines")

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.core.metrics import (
@@ -21,6 +21,7 @@ from normlift_ns.core.metrics import (
     spearman,
     spearman_test,
 )
+from tests.examples import examples
 
 
 def scores_by_sets(truth: list[int], found: list[int], classes: int) -> tuple[list[float], list[float]]:
@@ -40,7 +41,7 @@ def mean_of_present(values: list[float]) -> float:
     return sum(present) / len(present) if present else math.nan
 
 
-@settings(deadline=None, max_examples=100)
+@examples(25)
 @given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), min_size=1, max_size=40))
 def test_scores_equal_their_definition_by_sets(pairs):
     truth, found = (list(x) for x in zip(*pairs))
@@ -105,7 +106,7 @@ def mean_ranks(x: list[float]) -> list[float]:
     return [sum(y < v for y in x) + (sum(y == v for y in x) + 1) / 2 for v in x]
 
 
-@settings(deadline=None, max_examples=50)
+@examples(25)
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=2, max_size=15))
 def test_rank_correlations_equal_their_definitions(pairs):
     a, b = ([float(x) for x in side] for side in zip(*pairs))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import nearest_neighbors
@@ -48,7 +48,6 @@ def test_equals_all_pairs_ties_by_index(name, k):
     assert torch.allclose(found.distance, distance, rtol=1e-12, atol=0)
 
 
-@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**31), side=st.integers(1, 6), n=st.integers(1, 60), k=st.integers(1, 12))
 def test_equals_all_pairs_on_lattices(seed, side, n, k):
     means = torch.randint(0, side, (n, 3), generator=generator(seed)).float()

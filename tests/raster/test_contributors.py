@@ -2,10 +2,11 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Contributors, GaussianScene, RasterSettings, contributors, rasterize_evidence, render
+from tests.examples import examples
 from tests.raster.oracle import compositing_matrix
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
 
@@ -25,7 +26,7 @@ def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
     return full
 
 
-@settings(deadline=None, max_examples=10)
+@examples(5)
 @given(seed=st.integers(0, 2**31), count=st.integers(0, 40), backend=st.sampled_from(BACKENDS), blurred=st.booleans())
 def test_they_are_those_of_the_python_loops(seed, count, backend, blurred):
     scene, camera = random_scene(40, seed=seed, size=0.4), orbit_camera(seed % 7, width=37, height=21)

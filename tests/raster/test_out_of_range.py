@@ -7,13 +7,14 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.raster import triton
 from normlift_ns.raster.backend import Batch, Job
+from tests.examples import examples
 from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.scenes import dense, orbit, orbit_camera, random_labels, random_scene
 
@@ -74,14 +75,13 @@ def check_any_parameters(rows):
                 assert int(weights.count_nonzero()) == 0
 
 
-@settings(deadline=None, max_examples=3)
+@examples(2)
 @given(rows=st.lists(ROW, min_size=1, max_size=4))
 def test_any_parameters(rows):
     check_any_parameters(rows)
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=40)
 @given(rows=st.lists(ROW, min_size=1, max_size=4))
 def test_any_parameters_at_length(rows):
     check_any_parameters(rows)

@@ -4,16 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
 from normlift_ns.runs.transfer import nearest_rows, places, read_cloud, write_cloud
+from tests.examples import examples
 
 
 @given(st.integers(0, 2**16), st.floats(0.01, 2))
-@settings(max_examples=25, deadline=None)
+@examples(8)
 def test_nearest_rows_are_those_of_loops(seed, most):
     g = np.random.default_rng(seed)
     points, means = g.normal(size=(20, 3)), g.normal(size=(15, 3))
