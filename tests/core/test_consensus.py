@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, lift
+from normlift_ns import Evidence
 from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
@@ -151,16 +151,6 @@ def test_a_region_that_overlaps_nothing_keeps_its_feature():
     assert bool((found[:20] != features[:20]).any(dim=1).all())
 
 
-def test_regions_of_different_levels_are_not_compared():
-    evidence = things(3)
-    features = unit_rows(20, 6, 3)
-    level = torch.arange(20) % 4 // 2
-    found = consensus(evidence, features, level=level)
-    assert len(found.agreement) == 2
-    changed = torch.where((level == 1)[:, None], unit_rows(20, 6, 4), features)
-    assert torch.equal(consensus(evidence, changed, level=level).features[level == 0], found.features[level == 0])
-
-
 @pytest.mark.parametrize("device", DEVICES)
 @examples(5)
 @given(seed=SEEDS)
@@ -186,41 +176,6 @@ def test_levels_together_are_levels_apart(device, seed):
     assert found.agreement == pytest.approx([of_level.agreement[0] for of_level in expected[::-1]], abs=1e-6)
     mixed = consensus(of_dense(together, [7] * 5), features).features
     assert not torch.allclose(mixed, found.features.cpu(), atol=1e-3)  # as one level they are another thing
-
-
-def test_things_without_a_mask_do_not_lie_in_the_masks_of_their_neighbours():
-    """Five of six views have no mask of the small thing, and the frayed one of the large thing takes a tenth of it: as
-    much weight as others have, of the few Gaussians that it reaches.
-    """
-    small, large, views = 20, 80, 6
-    weight = torch.zeros(small + large, views, 2, dtype=torch.float64)
-    weight[:small, 0, 0] = 1
-    weight[small:, :, 1] = 1
-    weight[: small // 2, 1:, 1] = 0.9  # large Gaussians: of 9.0 in all
-    features = torch.eye(2, dtype=torch.float64).repeat(views, 1)
-    evidence = of_dense(weight.flatten(1), [2] * views)
-    blank = torch.zeros(small + large, views, dtype=torch.float64)
-    blank[:small, 1:] = 8.1
-    row, view = blank.nonzero(as_tuple=True)
-    seen = replace(evidence, unlabeled=SparseRows.from_coo(row, view.int(), blank[row, view], len(blank)))
-    assert float(consensus(evidence, features, power=0.0).features[0, 0]) < 0.9  # as if nothing else was there
-    assert float(consensus(seen, features, power=0.0).features[0, 0]) == 1.0
-
-
-def test_a_mask_of_two_things_does_not_speak_for_the_small_one():
-    """Half of the views join a small thing to a large one: its own masks keep their feature, and the joined ones, of
-    which the large thing is most, tell them nothing.
-    """
-    small, large, views = 10, 90, 6
-    weight = torch.zeros(small + large, views, 2, dtype=torch.float64)
-    weight[:small, :3, 0] = 1
-    weight[:small, 3:, 1] = 1
-    weight[small:, :, 1] = 1
-    features = torch.eye(2, dtype=torch.float64).repeat(views, 1)
-    evidence = of_dense(weight.flatten(1), [2] * views)
-    found = consensus(evidence, features).features
-    assert float(found[0, 0]) > 0.999
-    assert float(lift(evidence, found).directions(torch.tensor([0]))[0, 1]) == pytest.approx(0.5**0.5, abs=0.05)
 
 
 @pytest.mark.parametrize("side", [0.2, 0.4])

@@ -13,15 +13,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given
+from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from normlift_ns import Evidence, SemanticField, lift
-from normlift_ns.core.disk.manifest import MANIFEST, read_manifest, write_manifest
+from normlift_ns.core.disk.digests import text_digest
+from normlift_ns.core.disk.manifest import MANIFEST, check_files, read_manifest, write_manifest
 from normlift_ns.core.disk.tensors import check_tensor, load_tensors, save_tensors, tensor_digest
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.core.storage import StoredDirections, StoredEvidence
-from tests.examples import FACTOR
+from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.errors import InputError
+from tests.examples import FACTOR, examples
+from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
 from tests.scenes import generator, random_evidence, unit_rows
 
 VIEWS = [6, 5, 0, 7]
@@ -205,12 +210,13 @@ def test_arrays_that_lead_outside_are_refused(form: str, tmp_path: Path) -> None
 
 @pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
 def test_a_field_without_an_array_is_refused(tmp_path: Path) -> None:
-    example("float16").save(tmp_path)
-    as_version_0_1(tmp_path)
-    tensors = load_file(tmp_path / "field.safetensors")
-    save_file({name: x for name, x in tensors.items() if name != "n_eff"}, tmp_path / "field.safetensors")
-    with pytest.raises(ValueError, match="is damaged: 'n_eff' is missing"):
-        SemanticField.load(tmp_path)
+    for form, name in (("float16", "n_eff"), ("low_rank", "basis")):
+        example(form).save(tmp_path / form)
+        as_version_0_1(tmp_path / form)
+        path = tmp_path / form / "field.safetensors"
+        save_file({key: x for key, x in load_file(path).items() if key != name}, path)
+        with pytest.raises(ValueError, match=f"is damaged.*'{name}' is missing"):
+            SemanticField.load(tmp_path / form)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -247,8 +253,7 @@ def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
 def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
     path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
     evidence.save(path)
-    (tmp_path / MANIFEST).write_text("{}")
-    as_version_0_1(tmp_path)
+    save_file(load_file(path), path, metadata={k: v for k, v in load_tensors(path).facts.items() if k != "digest"})
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
     with pytest.raises(ValueError, match="names none"):
         Evidence.load(path, key="a")
@@ -304,15 +309,85 @@ def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
     path = tmp_path / MANIFEST
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))  # as a copy by way of Windows may have it
     assert read_manifest(tmp_path)[1] == {"a": "b"}
-    for text in ("[" * 100_000, "[]", "null", "{", '{"schema_version": 1, "digest": 7}', b"\xff\xfe"):
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        with pytest.raises(ValueError, match=r"damaged|schema version None"):
+    deep = '{"schema_version": 1, "encoder": ' + "[" * 900 + "]" * 900 + "}"
+    for text in ("[" * 10**6, '{"a":' * 10**6, deep, "[]", "null", "{", '{"schema_version": 1, "digest": 7}', "ÿ"):
+        path.write_bytes(text.encode("latin1"))
+        with pytest.raises(InputError, match=r"manifest\.json|schema version None"):
             read_manifest(tmp_path)
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(InputError, match=r"1,099,511,627,776"):
+        read_manifest(tmp_path)
 
 
-def test_low_rank_needs_its_basis(tmp_path: Path) -> None:
-    field = example("low_rank")
-    assert isinstance(field.store, StoredDirections)
-    replace(field, store=replace(field.store, basis=None)).save(tmp_path / "a")
-    with pytest.raises(ValueError, match="'basis' is missing"):
-        SemanticField.load(tmp_path / "a")
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("sealed", [True, False])
+def test_manifests_with_hostile_values(sealed: bool, tmp_path: Path) -> None:
+    """With a right digest, and without any as version 0.1 wrote them."""
+    field = example("float16")
+    more = {
+        "encoder": {"encoder": "open_clip", "text_vectors": None},
+        "features": {"kind": "given", "content": "0"},
+    }
+    SemanticField(field.scalars, field.source, field.store, {**field.manifest, **more}, field.means).save(tmp_path)
+    if not sealed:
+        as_version_0_1(tmp_path)
+    facts = json.loads((tmp_path / MANIFEST).read_text())
+    facts.pop("digest", None)
+
+    def seal(content: bytes) -> bytes:
+        text = content.decode().replace("{", '{"digest": "", ', 1)
+        return text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1).encode()
+
+    def load() -> None:
+        survives(lambda: check_files(tmp_path))
+        SemanticField.load(tmp_path, field.means)
+
+    contents = hostile_json(facts)
+    fuzz(15, contents.map(seal) if sealed else contents, tmp_path / MANIFEST, load)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("digests", [True, False])
+def test_damaged_files(digests: bool, tmp_path: Path) -> None:
+    field = example("evidence")
+    field.save(tmp_path)
+    if not digests:
+        as_version_0_1(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        fuzz(10, damaged(whole), path, lambda: SemanticField.load(tmp_path, field.means))
+        path.write_bytes(whole)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
+    """With right digests."""
+    path = tmp_path / "e.safetensors"
+    random_evidence(15, VIEWS, 3).save(path)
+    tensors, facts, _ = load_tensors(path)
+
+    @examples(15, suppress_health_check=list(HealthCheck))
+    @given(st.data())
+    def test(data: st.DataObject) -> None:
+        fact, array = data.draw(st.sampled_from(sorted(facts))), data.draw(st.sampled_from(sorted(tensors)))
+        other = tensors[data.draw(st.sampled_from(sorted(tensors)))]
+        value = data.draw(st.sampled_from(["", "-1", "1e3", "99999999999999", "9" * 5000, "nan", "²", facts[fact]]))
+        given = {name: tensor for name, tensor in tensors.items() if name != array}
+        if data.draw(st.booleans()):
+            given[array] = other[: data.draw(st.integers(0, 4))].clone() if data.draw(st.booleans()) else -other
+        save_tensors(path, given, {**facts, fact: value}, overwrite=True)
+        survives(lambda: Evidence.load(path))
+
+    test()
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    example().save(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        for _ in no_files(path):
+            with pytest.raises((InputError, FileNotFoundError), match=path.name):
+                SemanticField.load(tmp_path)
+        path.write_bytes(whole)
+    SemanticField.load(tmp_path)

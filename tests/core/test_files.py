@@ -244,16 +244,6 @@ def test_a_killed_process_loses_no_folder(every: int, system: str, tmp_path: Pat
 
 @pytest.mark.usefixtures("unsynced")
 @pytest.mark.parametrize("every", EVERY)
-def test_a_killed_process_writes_no_half_file(every: int, tmp_path: Path):
-    path, seen = tmp_path / "a" / "a.txt", []
-    new, old = (lambda text=text: write_text(path, text, overwrite=True) for text in ("new", "old"))
-    seen = [path.read_text() for _ in after_kills(new, old, path.parent, every)]
-    assert (seen[0], seen[-1]) == ("old", "new") and set(seen) == {"old", "new"}
-    assert list(path.parent.iterdir()) == [path]  # the last one cleaned up after all others
-
-
-@pytest.mark.usefixtures("unsynced")
-@pytest.mark.parametrize("every", EVERY)
 @pytest.mark.parametrize("overwrite", [True, False])
 def test_files_that_belong_together_are_completed_after_a_kill(every: int, overwrite: bool, tmp_path: Path):
     """All are old, or all are new once the next process looks; none is of another turn."""

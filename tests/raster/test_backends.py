@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import threading
 from importlib import metadata
 from types import SimpleNamespace
 from typing import Any
@@ -50,3 +51,13 @@ def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
         if not taken:
             with pytest.raises(InputError, match=r"Triton 3, .*PyTorch 2\.4"):
                 choose_backend("triton", ON_GPU, pictures=False)
+
+
+def test_a_gpu_that_cannot_start_is_told_of_where_it_is_wanted(monkeypatch):
+    told = []
+    monkeypatch.setattr(threading, "excepthook", told.append)
+    before = set(threading.enumerate())
+    gpu.wake("cuda:99")
+    for thread in set(threading.enumerate()) - before:
+        thread.join()
+    assert told == []

@@ -19,6 +19,7 @@ from normlift_ns import Camera, GaussianScene, RasterSettings, rasterize_evidenc
 from normlift_ns.raster import numba as backend
 from normlift_ns.raster import numba_kernels as kernels
 from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.raster.numba_compiling import compiled
 from normlift_ns.raster.projection import assign_tiles, project
 from tests.examples import examples
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
@@ -176,3 +177,19 @@ def test_a_second_process_compiles_nothing_even_beside_code_that_cannot_be_writt
     (first, path), (second, _) = (run.stdout.split("\n")[:2] for run in runs)
     assert [first, second] == ["0 5", "5 0"]
     assert Path(path).is_relative_to(tmp_path / "cache")
+
+
+def test_without_a_place_for_a_cache_kernels_are_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    njit, asked = numba.njit, []
+
+    def nowhere(cache: bool = False, **options: object):
+        asked.append(cache)
+        if cache:
+            raise RuntimeError("cannot cache function 'twice': no locator available for file 'twice.py'")
+        return njit(**options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(numba, "njit", nowhere)
+        twice = compiled()(lambda x: 2 * x)
+    assert twice(21) == 42
+    assert asked == [True, False]
