@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from normlift_ns.core.disk import claims as module
 from normlift_ns.core.disk.claims import (
-    BEATS,
     LEFT,
     NEW,
     Claim,
@@ -23,7 +23,6 @@ from normlift_ns.core.disk.claims import (
     free,
     read_pulse,
     read_states,
-    states,
 )
 from tests.processes import together
 
@@ -102,10 +101,10 @@ def test_what_another_ends_is_waited_for_and_only_what_was_left_is_taken(outcome
     clock, found = Clock(0.0, lambda seconds: end(other, outcome)), []
     for mine in claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
         found.append(mine.number)
-        assert 0 < clock.now < PATIENCE / BEATS + 5
+        assert 0 < clock.now < PATIENCE / 6 + 5
         end(mine, "done")
     assert found == [2] * taken
-    assert clock.now < PATIENCE / BEATS + 5
+    assert clock.now < PATIENCE / 6 + 5
 
 
 def test_what_had_ended_before_is_tried_again_by_one(tmp_path):
@@ -142,10 +141,11 @@ def test_the_last_attempt_counts_in_whatever_order_files_are_listed(attempts, dr
         for number, outcome in enumerate(outcomes, start=1):
             names += [f"{key}.{number}", *([] if outcome is None else [f"{key}.{number}.{outcome}"])]
     draw.shuffle(names)
-    assert states(names) == {key: State(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()}
+    assert module.states(names) == {key: State(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()}
 
 
 def test_what_is_free():
+    assert module.BEATS == 6
     assert free(NEW, NEW) and free(State(1, LEFT), NEW) and free(State(2, "done"), State(2, "done"))
     assert not any(free(State(2, outcome), State(1, outcome)) for outcome in ("done", "failed"))
     assert not free(State(1, None), State(1, None))

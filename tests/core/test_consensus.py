@@ -229,7 +229,7 @@ def large(regions: int, gaussians: int, views: int) -> Evidence:
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_sample_tells_what_the_whole_does_with_the_same_bits_each_time(device):
     evidence, features = large(300, 15_000, 10).to(device), unit_rows(300, 32, 0, torch.float32).to(device)
-    sampled, again, whole = (consensus(evidence, features, sample=k) for k in (50, 50, 10**6))
+    sampled, again, whole = (consensus(evidence, features, **how) for how in ({"sample": 50}, {}, {"sample": 10**6}))
     assert sampled.gaussians < 3000 and whole.gaussians == 15_000
     assert torch.equal(again.features, sampled.features) and again.agreement == sampled.agreement
     assert (1 - (sampled.features * whole.features).sum(1)).mean() < 0.01

@@ -325,10 +325,7 @@ def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
 def test_manifests_with_hostile_values(sealed: bool, tmp_path: Path) -> None:
     """With a right digest, and without any as version 0.1 wrote them."""
     field = example("float16")
-    more = {
-        "encoder": {"encoder": "open_clip", "text_vectors": None},
-        "features": {"kind": "given", "content": "0"},
-    }
+    more = {"encoder": {"encoder": "open_clip", "text_vectors": None}, "features": {"kind": "given", "content": "0"}}
     SemanticField(field.scalars, field.source, field.store, {**field.manifest, **more}, field.means).save(tmp_path)
     if not sealed:
         as_version_0_1(tmp_path)

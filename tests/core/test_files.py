@@ -23,17 +23,7 @@ from normlift_ns.core import files
 from normlift_ns.core.disk import atomic, journal
 from normlift_ns.core.disk.journal import write_journal
 from normlift_ns.core.disk.tensors import save_tensors
-from normlift_ns.core.files import (
-    clean,
-    draft_directory,
-    file_name,
-    new_file,
-    new_files,
-    numbered,
-    publish,
-    refuse_existing,
-    write_text,
-)
+from normlift_ns.core.files import clean, draft_directory, new_file, new_files, publish, refuse_existing, write_text
 from tests.processes import FORK, instants, killed_at, together
 
 PROCESSES, TURNS = 4, 3
@@ -56,7 +46,7 @@ def names_in(folder: Path) -> list[str]:
 def test_a_text_never_leaves_its_folder(tmp_path: Path):
     texts = ["../../etc/passwd", 'a\\b:c*?"<>|', "x" * 300, "tea\npot\0", "..", "~", "größe 7"]
     for text in texts:
-        path = tmp_path / f"{file_name(text)}.ply"
+        path = tmp_path / f"{files.file_name(text)}.ply"
         assert path.resolve().parent == tmp_path.resolve() and len(path.name) <= 44, text
         path.write_text("")
     assert len(names_in(tmp_path)) == len(texts)
@@ -171,7 +161,7 @@ def test_of_processes_that_write_at_once_none_loses_anything(system: str, tmp_pa
     def number(i: int, place: Path) -> str:
         with draft_directory(place) as draft:
             write_text(draft / "name.txt", str(i))
-            return next(path.name for path in numbered(place) if publish(draft, path))
+            return next(path.name for path in files.numbered(place) if publish(draft, path))
 
     def work(i: int) -> list[tuple[bool, bool, str, bool]]:
         found = []

@@ -124,6 +124,8 @@ def test_jaccard_of_the_lowest_and_bins_by_hand(metrics):
     assert metrics.lowest_jaccard(a, b, 0.2) == 1 / 3  # {0, 1} and {2, 0}
     assert metrics.lowest_jaccard(a, a, 0.2) == 1
     assert metrics.lowest_jaccard(torch.zeros(10), a, 0.2) == 1  # ties go in by index
+    assert metrics.lowest_jaccard(a, b) == 1 / 3  # the default
+    assert len(metrics.bin_means(torch.arange(40.0), torch.arange(40.0))[0]) == 10
     keys, values = metrics.bin_means(torch.tensor([3.0, 1, 2, 4]), torch.tensor([0.0, 1, 1, 0]), 2)
     assert (keys.tolist(), values.tolist()) == ([1.5, 3.5], [1, 0])
     with pytest.raises(ValueError, match="5 bins need"):

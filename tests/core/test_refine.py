@@ -16,15 +16,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns import (
-    InputError,
-    RefineConfig,
-    lift,
-    nearest_neighbors,
-    refine,
-    refine_variant,
-    unsupported,
-)
+from normlift_ns import InputError, RefineConfig, lift, nearest_neighbors, refine, refine_variant, unsupported
 from normlift_ns.core.ablations import Variant
 from normlift_ns.core.refine import possible
 from normlift_ns.evaluation.votes import own_vote

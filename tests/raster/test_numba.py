@@ -11,8 +11,6 @@ import numba
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 import normlift_ns
 from normlift_ns import Camera, GaussianScene, RasterSettings, rasterize_evidence, render
@@ -21,7 +19,6 @@ from normlift_ns.raster import numba_kernels as kernels
 from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.numba_compiling import compiled
 from normlift_ns.raster.projection import assign_tiles, project
-from tests.examples import examples
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
 
 DTYPES = [torch.float32, torch.float64]
@@ -41,31 +38,6 @@ def listed(scene: GaussianScene, camera: Camera, dtype: torch.dtype, rules: Rast
     job = Job(scene, False, rules, dtype)
     projected = project(job.world, camera, rules, antialiased=False)
     return job, projected, backend._tiles(projected, camera, rules)
-
-
-@examples(5)
-@given(seed=st.integers(0, 2**31), dtype=st.sampled_from(DTYPES), size=st.sampled_from([5, 16, 20]))
-def test_culling_leaves_out_what_no_pixel_feels(seed, dtype, size):
-    """The lists are those of `assign_tiles`, in its order, but for Gaussians without alpha >= min_alpha in the tile."""
-    rules = replace(SETTINGS, tile_size=size)
-    camera = orbit_camera(0.4, width=75, height=53)
-    _, projected, (_, _, (offsets, members, _)) = listed(shapes_of_all_kinds(120, seed, dtype), camera, dtype, rules)
-    tiles = assign_tiles(projected, camera.width, camera.height, size)
-    a, b, c = projected.conics.unbind(1)
-    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    dx = projected.means2d[:, 0, None, None] - (x.to(dtype) + 0.5)
-    dy = projected.means2d[:, 1, None, None] - (y.to(dtype) + 0.5)
-    a, b, c, opacity = (t[:, None, None] for t in (a, b, c, projected.opacities))
-    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    felt = (sigma >= 0) & (opacity * torch.exp(-sigma) >= rules.min_alpha)
-    columns = -(-camera.width // size)
-    for tile, (start, stop) in enumerate(zip(offsets[:-1].tolist(), offsets[1:].tolist())):
-        whole = tiles.members[tiles.offsets[tile] : tiles.offsets[tile + 1]].long()
-        kept = torch.from_numpy(members[start:stop]).long()
-        top, left = tile // columns * size, tile % columns * size
-        needed = whole[felt[whole, top : top + size, left : left + size].flatten(1).any(1)]
-        assert torch.equal(kept, whole[torch.isin(whole, kept)])
-        assert torch.isin(needed, kept).all()
 
 
 @pytest.mark.parametrize(("dtype", "seed"), [(torch.float32, 0), (torch.float64, 1)])
