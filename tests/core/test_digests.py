@@ -310,9 +310,13 @@ def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))  # as a copy by way of Windows may have it
     assert read_manifest(tmp_path)[1] == {"a": "b"}
     deep = '{"schema_version": 1, "encoder": ' + "[" * 900 + "]" * 900 + "}"
-    for text in ("[" * 10**6, '{"a":' * 10**6, deep, "[]", "null", "{", '{"schema_version": 1, "digest": 7}', "ÿ"):
+    for text in ("[" * 10**6, '{"a":' * 10**6, deep, "[]", "null", "{", "ÿ"):
         path.write_bytes(text.encode("latin1"))
         with pytest.raises(InputError, match=r"manifest\.json|schema version None"):
+            read_manifest(tmp_path)
+    for text, found in (('{"schema_version": 1, "digest": 7}', "damaged.* 7"), ('{"schema_version": 99}', " 99.* 1")):
+        path.write_text(text)
+        with pytest.raises(InputError, match=found):
             read_manifest(tmp_path)
     with path.open("wb") as file:
         file.truncate(2**40)

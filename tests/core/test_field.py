@@ -1,6 +1,5 @@
 """What is stored answers like the lift that made it, within the bound it states."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -62,6 +61,11 @@ def test_auto_takes_the_smallest_form_within_the_tolerance():
     lifted, means, _ = example(rank=2)
     forms = SemanticField.build(lifted, means, tolerance=2e-3).manifest["forms"]
     assert set(forms) == set(FORMS)
+    default, given = (
+        SemanticField.build(lifted, means),
+        SemanticField.build(lifted, means, tolerance=1e-3, storage="auto"),
+    )
+    assert default.manifest == given.manifest
     assert forms["low_rank"]["rank"] == 2
     for tolerance, expected in ((2e-3, min(FORMS, key=lambda name: forms[name]["bytes"])), (1e-6, "evidence")):
         assert SemanticField.build(lifted, means, tolerance=tolerance).manifest["form"] == expected
@@ -92,7 +96,8 @@ def views_of_clip(noise: float, seed: int = 0, views: int = 12, names: int = 15)
 
 
 @needs_shared
-@pytest.mark.parametrize("noise", [0.2, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 0.05, 1.0))])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.2, *(pytest.param(x, marks=pytest.mark.extra) for x in (0.05, 1.0))])
 def test_measured_error_never_exceeds_the_bound_on_real_clip_vectors(noise):
     text, means = clip_vectors(), torch.rand(300, 3)
     lifted = lift(random_evidence(300, [15] * 12, 0, fill=0.05), views_of_clip(noise))
@@ -156,27 +161,6 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     other.save(tmp_path, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["field.safetensors", "manifest.json"]
     assert SemanticField.load(tmp_path, means).manifest["form"] == "float16"
-
-
-def test_damaged_and_incomplete_fields_are_named(tmp_path):
-    lifted, means, source = example()
-    with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):
-        SemanticField.load(tmp_path)
-    SemanticField.build(lifted, means, source).save(tmp_path)
-    path = tmp_path / "field.safetensors"
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-10])
-    with pytest.raises(ValueError, match="is damaged"):
-        SemanticField.load(tmp_path)
-    path.write_bytes(whole)
-    manifest = tmp_path / "manifest.json"
-    text = manifest.read_text()
-    manifest.write_text(text[:-20])
-    with pytest.raises(ValueError, match="is damaged"):
-        SemanticField.load(tmp_path)
-    manifest.write_text(json.dumps({**json.loads(text), "schema_version": 99}))
-    with pytest.raises(ValueError, match=r" 99.* 1"):
-        SemanticField.load(tmp_path)
 
 
 def test_a_full_disk_leaves_no_manifest(tmp_path, monkeypatch):

@@ -71,9 +71,8 @@ def test_identities(seed):
     assert torch.allclose(lifted.directions()[found].norm(dim=1), torch.ones(int(found.sum())).double(), atol=1e-12)
     weaker = lift(evidence, features, beta=2.0)
     assert (weaker.scalars.reliability <= lifted.scalars.reliability).all()
-    assert torch.equal(
-        lift(evidence, features, beta=1.0, unlabeled="ignore").scalars.reliability, lifted.scalars.reliability
-    )  # the defaults
+    same = lift(evidence, features, beta=1.0, unlabeled="ignore")  # the defaults
+    assert torch.equal(same.scalars.reliability, lifted.scalars.reliability)
     # the direction beats others on sum_i A_ij <u, B_i>, and its value is W_j ||f_j|| (equations 4 and 5)
     gradient = dense(evidence.rows, S) @ features
     value = (lifted.directions() * gradient).sum(1)

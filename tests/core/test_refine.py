@@ -173,14 +173,14 @@ def test_margins_are_compared_with_supports_in_their_own_units(seed, dtype, kind
     means[::3] *= 4  # some far from everybody
     own, config = 5 * r, RefineConfig(vote=kind, k=9, sigma_d=2.0)
     arrays, compared = [x.to(dtype) for x in (means, u, r)], 0
-    for i, score in enumerate(scores(means, u, r, config, own)[:20]):
+    for i, score in enumerate(scores(means, u, r, config, own)[:10]):
         ahead = float(max(score[j] for j in score if j != i) - score[i])
         slack = 1e-12 if dtype == torch.float64 else 1e-5 * float(max(score.values()))
         if ahead > 3 * slack:
             compared += 1
             deltas = (max(0.0, ahead - slack), ahead + slack)
             assert [int(refine(*arrays, replace(config, delta=x), own=own)[i]) != i for x in deltas] == [True, False]
-    assert compared > 3
+    assert compared > 1
 
 
 def test_chunks_and_blocks_change_nothing_and_progress_comes_in_blocks(monkeypatch):
@@ -230,17 +230,16 @@ def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
     """A Gaussian without evidence, 1,000 spacings from a cluster: exp(-500,000) is 0 in any format of the machine. It
     takes the mode at Delta = 0, and clears no margin in the paper's vote.
     """
-    means, u, r = scene(3)
+    means, u, r = scene(3, n=25)
     means[0] = torch.tensor([1000.0, 0, 0])
     u[0], r[0] = 0, 0
-    for kind, own in itertools.product(VOTES, (torch.zeros(60).double(), 5 * r)):
+    for kind, own in itertools.product(VOTES, (torch.zeros(25).double(), 5 * r)):
         config = RefineConfig(vote=kind, k=12)
-        expected = scores(means, u, r, config, own)[0]
-        assert kind != "paper" or 0 < max(expected.values()) < Decimal(10) ** -50_000
-        assert vote(means, u, r, config, own)[0] != 0
+        best, winner = max(scores(means, u, r, config, own)[0].values()), vote(means, u, r, config, own)[0]
+        assert (kind != "paper" or 0 < best < Decimal(10) ** -50_000) and winner != 0
         for delta in (0.0, 1e-30, 0.1):
             found = refine(*(x.to(dtype) for x in (means, u, r)), replace(config, delta=delta), own=own)[0]
-            assert int(found) == (0 if kind == "paper" and delta > 0 else vote(means, u, r, config, own)[0])
+            assert int(found) == (0 if kind == "paper" and delta > 0 else winner)
 
 
 def test_a_reliable_cluster_far_away_never_changes():
@@ -305,6 +304,8 @@ def test_defaults_are_those_of_the_kind_of_vote_and_stand_in_the_help():
     """A number given counts for either kind; the help repeats the table."""
     assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTES["posterior"]._replace(tau=0.5)
     assert RefineConfig(vote="paper") == replace(RefineConfig(vote="posterior"), vote="paper")
+    assert RefineConfig().numbers == VOTES["posterior"] == VoteNumbers(2.0, 0.9, 0.05, 0.0)
+    assert VOTES["paper"] == VoteNumbers(1.0, 0.95, 0.4, 0.0) and RefineConfig().vote == "posterior"
     text = " ".join(inspect.getsource(RefineConfig).split())
     for name in VoteNumbers._fields:
         values = {kind: f"{getattr(numbers, name):g}" for kind, numbers in VOTES.items()}

@@ -16,19 +16,9 @@ pytestmark = pytest.mark.slow
 FLIPS = 60 if SHORT else 1000
 TRANSFORMS = "dataparser_transforms.json"
 KINDS = {
-    ".cache/evidence",
-    ".cache/features",
-    ".cache/regions",
-    ".cache/texts",
-    "config.yml",
-    "dataparser_transforms.json",
-    "nerfstudio_models/*.ckpt",
-    "normlift/field.safetensors",
-    "normlift/manifest.json",
-    "normlift/queries.safetensors",
-    "normlift/texts.npz",
-    "splat.json",
-    "transforms.json",
+    *(f".cache/{name}" for name in ("evidence", "features", "regions", "texts")),
+    *(f"normlift/{name}" for name in ("field.safetensors", "manifest.json", "queries.safetensors", "texts.npz")),
+    *("config.yml", TRANSFORMS, "nerfstudio_models/*.ckpt", "splat.json", "transforms.json"),
 }
 
 
