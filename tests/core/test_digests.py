@@ -361,6 +361,30 @@ def test_damaged_files(digests: bool, tmp_path: Path) -> None:
         path.write_bytes(whole)
 
 
+def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    random_evidence(15, VIEWS, 3).save(path)
+    tensors, facts, _ = load_tensors(path)
+    views = tensors["region_view"]
+    for facts_changed, tensors_changed, message in (
+        ({"num_views": "-1"}, {}, "num_views.*-1, 1, 0"),
+        ({"weight_power": "3"}, {}, "weight_power.*4, 3, 0"),
+        ({"num_excluded": "16"}, {}, "num_excluded.*4, 1, 16"),
+        ({"num_excluded": "-1"}, {}, "num_excluded.*4, 1, -1"),
+        ({"format": "other"}, {}, "'other'"),
+        ({}, {"region_view": views.flip(0)}, "rising"),
+        ({}, {"region_view": views + 1}, r"1\.\.4.* 0\.\.3"),
+        ({}, {"region_view": views.long()}, "region_view .*int64.*int32"),
+        ({"num_excluded": "15"}, {}, None),
+    ):
+        save_tensors(path, {**tensors, **tensors_changed}, {**facts, **facts_changed}, overwrite=True)
+        if message is None:
+            assert Evidence.load(path).num_excluded == 15
+        else:
+            with pytest.raises(InputError, match=message):
+                Evidence.load(path)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
     """With right digests."""
