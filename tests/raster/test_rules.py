@@ -150,7 +150,7 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
 
 
 def test_pictures_of_any_number_of_channels():
-    scene, (camera,) = hard_scene(), orbit(1, width=18, height=9)
+    scene, (camera,) = hard_scene(), orbit(1, width=18, height=17)
     job = Job(scene.to(DEVICE), False, RasterSettings(), torch.float32)
     for channels in (0, 19):
         values = torch.rand(len(scene), channels, generator=generator(0))

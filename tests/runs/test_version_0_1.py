@@ -74,6 +74,7 @@ def test_stock_nerfstudio_loads_them(config: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("config", ["lifted", pytest.param("trained", marks=pytest.mark.extra)], indirect=True)
 def test_stock_commands_run_on_them(config: Path, tmp_path: Path) -> None:
     from tests.scripts.test_stock_processes import viewer_page  # noqa: PLC0415
 

@@ -7,6 +7,7 @@ import json
 import shutil
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ import torch
 from PIL import Image
 
 from normlift_ns import open_run, open_scene
-from normlift_ns.demo import DemoRoom
 from normlift_ns.encoders import RegionFeatures, write_langsplat
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
@@ -23,8 +23,17 @@ from normlift_ns.runs.question import load_question
 from normlift_ns.scripts import export, lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from normlift_ns.team import seen
-from tests.encoders.tiny import CLIP, write_clip, write_sam
 from tests.scripts.conftest import QUICK, run_entry, said
+
+if TYPE_CHECKING:
+    from normlift_ns.demo import DemoRoom
+
+TWO = ("--max-views", "2", "--refine", "False")
+
+
+def field_of(outputs: Path, name: str) -> Any:
+    """Of a lifted run in the folder that --output-dir names."""
+    return open_run(outputs / "room" / "normlift" / name / "config.yml").field
 
 
 def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoom):
@@ -35,33 +44,22 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
         float(iou_per_class(field.query(answer, refined=refined).argmax(1), room.labels, len(room.names)).mean())
         for refined in (False, True)
     )
-    print(f"mIoU {before:.3f} before, {after:.3f} after refinement")
-    assert after > 0.7
+    assert after > 0.7 and after > before
     assert field.manifest["encoder"]["encoder"] == "colour"
     assert field.manifest["statistics"]["views"] == 12
     question = load_question(lifted.parent / "normlift")
-    assert question is not None
-    assert question.texts == ("red", "yellow")
+    assert question is not None and question.texts == ("red", "yellow")
     assert sorted(p.name for p in lifted.parent.iterdir()) == [
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
     ]  # fmt: skip
 
 
 def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
-    outputs = (
-        "--json",
-        tmp_path / "a.json",
-        "--output-path",
-        tmp_path / "a.npz",
-        "--render-dir",
-        tmp_path / "pictures",
-    )
+    outputs = ("--json", tmp_path / "a.json", "--output-path", tmp_path / "a.npz", "--render-dir", tmp_path / "pictures")
     flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
     shown = capsys.readouterr().out
-    assert "sky blue" in shown
-    assert "reliability" in shown
-
+    assert "sky blue" in shown and "reliability" in shown and str(tmp_path / "pictures") in shown
     document = json.loads((tmp_path / "a.json").read_text())
     red, blue = document["queries"]
     assert {"text", "fraction", "centroid", "peak", "mean_reliability"} <= set(red)
@@ -88,32 +86,28 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
         assert (np.ptp(pixels, axis=2) > 60).mean() > 0.001, path  # something is coloured, over a grey image
 
 
-@pytest.mark.parametrize("output", ["--json", "--output-path", "--render-dir"])
-def test_a_query_replaces_nothing_unasked(output, lifted, tmp_path, monkeypatch, capsys):
-    existing = tmp_path / ("0003_1_sky_blue.png" if output == "--render-dir" else "mine")
-    existing.write_text("mine")
-    place = tmp_path if output == "--render-dir" else existing
-    flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place)
-    with monkeypatch.context() as patch:
-        patch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
-        named = ("--render-views", "0002", "images/0003.png") if output == "--render-dir" else ()
-        for views in ((), named):
-            assert run_entry(patch, query.entrypoint, *flags, *views) == 1
-            shown = said(capsys)
-            assert f"{existing.name} exists; give another {output}, or --overwrite True." in shown
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
-    views = ("--render-views", "0003") if output == "--render-dir" else ()
-    asked = (*flags, *views, "--overwrite", True)
-    assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
-    assert existing.stat().st_size > 100
-    assert len(list(tmp_path.iterdir())) == (2 if output == "--render-dir" else 1)
-
-
-def test_pictures_of_other_texts_and_views_may_join_a_folder(lifted, tmp_path, monkeypatch):
-    flags = ("--load-config", lifted, "--render-dir", tmp_path, "--render-views")
-    for views, text in (("0003", "red"), ("0003", "yellow"), ("0007", "red")):
-        assert run_entry(monkeypatch, query.entrypoint, *flags, views, "--text", text) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0003_0_red.png", "0003_0_yellow.png", "0007_0_red.png"]
+def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys):
+    for output in ("--json", "--output-path", "--render-dir"):
+        folder = tmp_path / output
+        folder.mkdir()
+        pictures = output == "--render-dir"
+        existing = folder / ("0003_1_sky_blue.png" if pictures else "mine")
+        existing.write_text("mine")
+        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, folder if pictures else existing)
+        with monkeypatch.context() as patch:
+            patch.setattr("normlift_ns.quick.open_quick", None)  # refused before anything is opened
+            for views in ((), ("--render-views", "0002", "images/0003.png") if pictures else ()):
+                assert run_entry(patch, query.entrypoint, *flags, *views) == 1
+                shown = said(capsys)
+                assert f"{existing.name} exists" in shown and output in shown and "--overwrite True" in shown
+        assert [path.read_text() for path in folder.iterdir()] == ["mine"]
+        views = ("--render-views", "0003") if pictures else ()
+        assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
+        assert existing.stat().st_size > 100
+        assert len(list(folder.iterdir())) == (2 if pictures else 1)
+    named = ("--load-config", lifted, "--text", "yellow", "--render-dir", folder, "--render-views", "0003")
+    assert run_entry(monkeypatch, query.entrypoint, *named) == 0  # of another text
+    assert {path.name for path in folder.iterdir()} == {"0003_0_red.png", "0003_1_sky_blue.png", "0003_0_yellow.png"}
 
 
 def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
@@ -126,31 +120,29 @@ def test_a_query_does_not_write_into_a_run(lifted, monkeypatch, capsys):
     assert {path: path.read_bytes() for path in lifted.parent.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("name", ["field.safetensors", "manifest.json", "queries.safetensors"])
-def test_a_damaged_run_is_refused_with_a_message(name, lifted, tmp_path, monkeypatch, capsys):
-    shutil.copytree(lifted.parent, tmp_path / "outputs" / "room" / "normlift" / "one")
-    config = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
-    path = config.parent / "normlift" / name
-    content = bytearray(path.read_bytes())
-    content[-9] ^= 1
-    path.write_bytes(content)
-    flags = ("--load-config", config, "--data", lifted.parents[4] / "room")
-    assert run_entry(monkeypatch, export.entrypoint, *flags, "--output-dir", tmp_path / "out") == 1
-    shown = said(capsys)
-    assert "is damaged" in shown and name in shown
-    assert "ns-normlift --load-config" in shown or "ns-normlift-query --load-config" in shown
-    assert not (tmp_path / "out").exists()
+def test_a_damaged_run_is_refused_with_a_message(lifted, tmp_path, monkeypatch, capsys):
+    run = tmp_path / "outputs" / "room" / "normlift" / "one"
+    shutil.copytree(lifted.parent, run)
+    flags = ("--load-config", run / "config.yml", "--data", lifted.parents[4] / "room", "--output-dir", tmp_path / "out")
+    for name in ("field.safetensors", "manifest.json", "queries.safetensors"):
+        path = run / "normlift" / name
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
+        assert run_entry(monkeypatch, export.entrypoint, *flags) == 1
+        shown = said(capsys)
+        assert "is damaged" in shown and name in shown and "ns-normlift" in shown
+        assert not (tmp_path / "out").exists()
+        path.write_bytes(whole)
 
 
 def test_lifts_without_a_name_at_the_same_second_both_remain(trained, tmp_path, monkeypatch):
     monkeypatch.setattr("normlift_ns.runs.files.datetime", Clock)
-    flags = ("--load-config", trained, *QUICK, "--output-dir", tmp_path, "--max-views", "2", "--refine", "False")
+    flags = ("--load-config", trained, *QUICK, *TWO, "--output-dir", tmp_path)
+    names = ["2024-05-01_120000", "2024-05-01_120000_2"]
     for overwrite in ("False", "True"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", overwrite) == 0
-    runs = tmp_path / "room" / "normlift"
-    names = ["2024-05-01_120000", "2024-05-01_120000_2"]
-    assert sorted(path.name for path in runs.iterdir()) == [".cache", *names]
-    assert [len(open_run(runs / name / "config.yml").field) > 0 for name in names] == [True, True]
+    assert sorted(path.name for path in (tmp_path / "room" / "normlift").iterdir()) == [".cache", *names]
+    assert [len(field_of(tmp_path, name)) > 0 for name in names] == [True, True]
 
 
 class Clock:
@@ -161,15 +153,12 @@ class Clock:
         return datetime(2024, 5, 1, 12)
 
 
-def test_a_second_lift_rasterizes_and_encodes_nothing(trained, monkeypatch, capsys):
-    def never(*_args, **_kwargs):
-        raise AssertionError("rasterized again")
-
-    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", never)
-    monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", never)
-    flags = ("--load-config", trained, *QUICK, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
+def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
+    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
+    monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", None)
+    flags = ("--load-config", own, *QUICK, "--timestamp", "two", "--beta", "2.0", "--refine", "False")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (open_run(trained.parents[2] / "normlift" / t / "config.yml").field for t in ("one", "two"))
+    first, second = (field_of(own.parents[3], t) for t in ("one", "two"))
     assert torch.equal(first.scalars.norm, second.scalars.norm)
     assert (second.scalars.reliability <= first.scalars.reliability).all()
     assert torch.equal(second.source, torch.arange(len(second), dtype=torch.int32))
@@ -205,40 +194,16 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(trained, mo
     assert len(fresh) == 1  # of three blocks, two were kept
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (("--encoder", "words"), "unknown encoder 'words'; --encoder is one of"),
-        (("--encoder", "colour", "--queries", ""), "is empty"),
-        (("--encoder", "colour", "--queries", "oragne"), "orange"),
-        (("--encoder", "colour", "--max-views", "0"), "--max-views must be at least 1, got 0"),
-        (("--encoder", "colour", "--device", "tpu"), "--device must be auto, cpu or cuda"),
-        (("--encoder", "colour", "--timestamp", "one"), "exists; give another --timestamp"),
-        (("--encoder", "colour", "--regions", "files"), "--regions-dir"),
-        (("--encoder", "colour", "--regions", "files", "--regions-dir", "nowhere"), "nowhere"),
-        (("--encoder", "colour", "--data", "nowhere"), "nowhere"),
-        (("--encoder", "open_clip", "--encoder-pretrained", "missing.pt"), "missing.pt"),
-        (("--encoder", "colour", "--tau", "2"), "--tau must be in -1..1"),
-    ],
-)
-def test_bad_flags_have_a_message_and_exit_code_1(flags, message, trained, lifted, monkeypatch, capsys):
-    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *flags) == 1
-    shown = capsys.readouterr()
-    assert message in " ".join((shown.out + shown.err).split())
-    assert "Traceback" not in shown.out + shown.err
-
-
 def test_label_maps_of_another_size_are_refused_or_resampled(trained, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "labels"
     folder.mkdir()
     for path in (trained.parents[4] / "room" / "instance").iterdir():
         Image.open(path).resize((80, 60), Image.Resampling.NEAREST).save(folder / path.name)
-    flags = ("--load-config", trained, *QUICK, "--regions", "files", "--regions-dir", folder, "--timestamp", "maps")
-    flags = (*flags, "--max-views", "3")
+    flags = ("--load-config", trained, *QUICK, *TWO, "--regions", "files", "--regions-dir", folder)
+    flags = (*flags, "--output-dir", tmp_path / "out")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     shown = said(capsys)
-    assert "80" in shown
-    assert "160" in shown
+    assert "80" in shown and "160" in shown and "--regions-resample" in shown
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--regions-resample", "True") == 0
 
 
@@ -251,7 +216,7 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
         monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
-    fields = [open_run(tmp_path / "out" / "room" / "normlift" / t / "config.yml").field for t in ("0", "1")]
+    fields = [field_of(tmp_path / "out", level) for level in ("0", "1")]
     weights = [field.scalars.weight for field in fields]
     assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
     classes, whole = (field.scalars.c_intra for field in fields)
@@ -259,26 +224,18 @@ def test_another_level_of_label_files_rasterizes_nothing(trained, tmp_path, monk
     assert float(classes[classes > 0].min()) < 0.9
     capsys.readouterr()
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--timestamp", "none") == 1
-    assert "has 2 levels of regions, 0..1; choose one with --level" in said(capsys)
+    shown = said(capsys)
+    assert "2 levels" in shown and "0..1" in shown and "--level" in shown
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> tuple[object, ...]:
     """Flags of a small CLIP with random weights."""
+    from tests.encoders.tiny import CLIP, write_clip  # noqa: PLC0415
+
     folder = tmp_path_factory.mktemp("clip")
     write_clip(folder)
-    return (
-        "--encoder-model",
-        CLIP,
-        "--encoder-pretrained",
-        folder / "tiny.pt",
-        "--max-views",
-        "2",
-        "--refine",
-        "False",
-        "--check",
-        "False",
-    )
+    return ("--encoder-model", CLIP, "--encoder-pretrained", folder / "tiny.pt", *TWO, "--check", "False")
 
 
 def test_clip_by_patches_and_questions_without_a_network(trained, clip, tmp_path, monkeypatch, capsys):
@@ -300,6 +257,8 @@ def test_clip_by_patches_and_questions_without_a_network(trained, clip, tmp_path
 
 def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
     """All levels are found at once, so that another one asks SAM and the rasterizer nothing."""
+    from tests.encoders.tiny import write_sam  # noqa: PLC0415
+
     write_sam(tmp_path / "sam.pth", seed=1, gain=6)
     rules = MaskRules(points_per_side=4, predicted_iou=0.5, stability=0.3)
     monkeypatch.setattr("normlift_ns.encoders.build.SamMasks", functools.partial(SamMasks, rules=rules))
@@ -308,7 +267,7 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
     for level in ("l", "s"):
         more = () if level == "l" else ("--level", level)
         assert run_entry(monkeypatch, lift.entrypoint, *flags, *more, "--timestamp", level) == 0
-        field = open_run(tmp_path / "room" / "normlift" / level / "config.yml").field
+        field = field_of(tmp_path, level)
         assert field.manifest["features"]["regions"]["kind"] == "sam"
         assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
         shares.append(field.manifest["statistics"]["zero_evidence_share"])
@@ -317,28 +276,20 @@ def test_levels_of_sam(trained, clip, tmp_path, monkeypatch, capsys):
     assert shares[0] != shares[1] and max(shares) < 1
 
 
-def test_fewer_smaller_and_rendered_views(trained, monkeypatch, capsys):
+def test_fewer_smaller_and_rendered_views(trained, tmp_path, monkeypatch):
     flags = ("--max-views", "5", "--lift-downscale", "2", "--image-source", "render", "--timestamp", "less")
-    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", trained, *QUICK, *flags) == 0
-    field = open_run(trained.parents[2] / "normlift" / "less" / "config.yml").field
-    assert field.manifest["statistics"]["views"] == 5
-    assert 0 < field.manifest["statistics"]["zero_evidence_share"] < 0.5
+    given = ("--load-config", trained, *QUICK, "--refine", "False", "--output-dir", tmp_path)
+    assert run_entry(monkeypatch, lift.entrypoint, *given, *flags) == 0
+    found = field_of(tmp_path, "less").manifest["statistics"]
+    assert found["views"] == 5 and 0 < found["zero_evidence_share"] < 0.5
 
 
 def test_pictures_of_an_unknown_view_are_refused(lifted, tmp_path, monkeypatch, capsys):
     flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999", "--json", tmp_path / "a.json")
-    assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
-    assert "--render-views has no effect without --render-dir" in said(capsys)
-    flags = (*flags, "--render-dir", tmp_path / "pictures")
-    assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--render-dir", tmp_path / "pictures") == 1
     shown = said(capsys)
-    assert "no training image '9999'; there are 12, from '0000' to '0011'" in shown
+    assert "'9999'" in shown and "12" in shown and "'0000'" in shown and "'0011'" in shown
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_query_of_a_run_without_semantics_says_what_to_do(trained, monkeypatch, capsys):
-    assert run_entry(monkeypatch, query.entrypoint, "--load-config", trained, "--text", "red") == 1
-    assert "ns-normlift --load-config" in said(capsys)
 
 
 def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch, capsys):
@@ -351,7 +302,7 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
     data = lifted.parents[4] / "room"
     flags = ("--load-config", copy / "config.yml", "--text", "red", "--data", data)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
-    assert checkpoint.name in (words := said(capsys)) and "copy it again from the whole run" in words
+    assert checkpoint.name in said(capsys)
 
 
 def test_selection_follows_threshold_and_reliability(lifted):
@@ -382,8 +333,8 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     vectors = ("--text-vectors", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    ours, theirs = (tmp_path / "out" / "room" / "normlift" / t / "config.yml" for t in ("ours", "theirs"))
-    first, second = (open_run(config).field for config in (ours, theirs))
+    theirs = tmp_path / "out" / "room" / "normlift" / "theirs" / "config.yml"
+    first, second = (field_of(tmp_path / "out", name) for name in ("ours", "theirs"))
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
         assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
     assert torch.equal(first.source, second.source)
@@ -395,7 +346,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     (tmp_path / "texts.npz").rename(tmp_path / "moved.npz")
     capsys.readouterr()
     assert run_entry(monkeypatch, query.entrypoint, *asking) == 1
-    assert "give texts with vectors of the same network, --text-vectors" in said(capsys)
+    assert "--text-vectors" in said(capsys)
     assert run_entry(monkeypatch, query.entrypoint, *asking, "--text-vectors", tmp_path / "moved.npz") == 0
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["negatives"] == []  # the file has no vectors of LERF's words
@@ -404,7 +355,8 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(trained, t
     np.savez(tmp_path / "short.npz", red=np.ones(5))
     flags = (*output, *importing, "--text-vectors", tmp_path / "short.npz", "--queries", "red", "--timestamp", "t")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
-    assert "the vectors of --queries have 5 numbers, the features 343" in said(capsys)
+    shown = said(capsys)
+    assert "--queries" in shown and "5" in shown and "343" in shown
 
 
 def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monkeypatch, capsys):
@@ -416,25 +368,24 @@ def test_images_without_features_are_listed_and_left_out(trained, tmp_path, monk
     flags = (
         *("--load-config", trained, "--features", "langsplat", "--features-dir", tmp_path / "features"),
         *("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t"),
-        *("--check", "False", "--k", "12"),
+        *("--check", "False", "--refine", "False"),
     )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 1
     assert "1 of 12 images have no features" in said(capsys)
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--features-missing", "skip") == 0
     shown = capsys.readouterr()
     assert "1 images without features" in shown.out
-    assert "Warning: 1 of 12 images have no features in " in shown.err
-    assert "images/0003.png; they are left out" in " ".join(shown.err.split())
-    field = open_run(tmp_path / "out" / "room" / "normlift" / "t" / "config.yml").field
+    assert "Warning: 1 of 12 images" in shown.err and "images/0003.png" in shown.err
+    field = field_of(tmp_path / "out", "t")
     assert field.manifest["statistics"]["views"] == 11
     assert int(field.scalars.view_count.max()) <= 11
 
 
 @pytest.mark.slow
-def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, monkeypatch):
-    flags = ("--load-config", trained, *QUICK, "--timestamp", "double", "--precision", "double")
+def test_double_precision_differs_from_the_default_by_rounding(trained, lifted, tmp_path, monkeypatch):
+    flags = ("--load-config", trained, *QUICK, "--timestamp", "double", "--precision", "double", "--output-dir", tmp_path)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    double, single = (open_run(config).field for config in (lifted.parents[1] / "double" / "config.yml", lifted))
+    double, single = field_of(tmp_path, "double"), open_run(lifted).field
     assert double.manifest["options"]["precision"] == "double"
     difference = (double.scalars.reliability - single.scalars.reliability).abs()
     assert 0 < float(difference.quantile(0.99)) < 1e-6
