@@ -129,7 +129,7 @@ def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record:
     place.restore()
     mixed = [*(place.lift("--k", 6) for _ in range(3)), *(export(place, "red", "--overwrite", True) for _ in range(3))]
     codes, logs = together(place, tmp_path, *mixed, save(TEXTS[0]), save(TEXTS[1]))
-    assert codes == [0] * len(mixed), logs
+    assert set(codes) == {0}, logs
     assert len(list(place.runs.glob("[!.]*"))) == 4
     assert tree(place.config.parent) in known
     assert len(tree(place.folder / "out")) == 4
