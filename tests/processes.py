@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 FORK = multiprocessing.get_context("fork")
+_RENAMES = {"os.rename", "ctypes.dlopen"}
+"""Accesses; renames of Linux are seen by the library that they load."""
 
 
 def together(count: int, action: Callable[[int], Any]) -> list[Any]:
@@ -33,28 +35,59 @@ def together(count: int, action: Callable[[int], Any]) -> list[Any]:
     return [found[i] for i in range(count)]
 
 
+def _watched(action: Callable[[], object], folder: Path, seen: Callable[[str], object]) -> int:
+    """Runs an action in a process of its own and tells, there, of each access to files before it happens.
+
+    The first one concerns the folder. Returns how the process ended.
+    """
+    pid = os.fork()
+    if pid == 0:
+        begun = False
+
+        def hook(event: str, arguments: tuple[Any, ...]) -> None:
+            nonlocal begun
+            begun = begun or any(str(folder) in str(x) for x in arguments)
+            if begun and event.split(".", maxsplit=1)[0] in ("open", "os", "shutil", "ctypes"):
+                seen(event)
+
+        sys.addaudithook(hook)
+        try:
+            action()
+        finally:
+            os._exit(0)
+    return os.waitpid(pid, 0)[1]
+
+
 def killed_at(step: int, action: Callable[[], object], folder: Path) -> bool:
     """Runs an action in a process that is killed before its `step`th access to files; False if it ends before that.
 
     Steps are counted from the first one that concerns the folder or comes after it.
     """
-    pid = os.fork()
-    if pid == 0:
-        done = 0
+    done = 0
 
-        def count(event: str, arguments: tuple[Any, ...]) -> None:
-            nonlocal done
-            inside = done > 0 or any(str(folder) in str(x) for x in arguments)
-            if inside and event.split(".", maxsplit=1)[0] in ("open", "os", "shutil", "ctypes"):
-                done += 1
-                if done == step:
-                    os.kill(os.getpid(), signal.SIGKILL)
+    def kill(event: str) -> None:
+        nonlocal done
+        done += 1
+        if done == step:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-        sys.addaudithook(count)
-        try:
-            action()
-        finally:
-            os._exit(0)
-    _, status = os.waitpid(pid, 0)
+    status = _watched(action, folder, kill)
     assert os.WIFSIGNALED(status) or os.WEXITSTATUS(status) == 0
     return os.WIFSIGNALED(status)
+
+
+def instants(action: Callable[[], object], folder: Path, every: int = 0) -> list[int]:
+    """Steps for `killed_at`: each so many; 0: the last three renames and what follows them, the first and the last.
+
+    The action is run to find them.
+    """
+    reader, writer = os.pipe()
+    _watched(action, folder, lambda event: os.write(writer, f"{event}\n".encode()))
+    os.close(writer)
+    with os.fdopen(reader) as file:
+        events = dict(enumerate(file.read().split(), start=1))
+    if every > 0:
+        return sorted({*range(1, len(events), every), len(events)})
+    renames = [step for step, event in events.items() if event in _RENAMES][-3:]
+    after = next(step for step, event in events.items() if step > renames[-1] and not event.startswith("ctypes"))
+    return sorted({1, *renames, after, len(events)})

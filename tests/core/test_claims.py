@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import random
+import time
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from normlift_ns.core.disk import claims as module
 from normlift_ns.core.disk.claims import (
-    BEATS,
     LEFT,
     NEW,
     Claim,
@@ -22,7 +23,6 @@ from normlift_ns.core.disk.claims import (
     free,
     read_pulse,
     read_states,
-    states,
 )
 from tests.processes import together
 
@@ -43,47 +43,34 @@ class Clock:
         self.meanwhile(self.now - self.begun)
 
 
-def race(tmp_path: Path, after: int) -> list[int]:
-    """How many of 12 processes get each of 40 claims, in orders of their own."""
-
-    def take(i: int) -> list[int]:
-        keys = list(range(40))
-        random.Random(i).shuffle(keys)
-        return [key for key in keys if claim(tmp_path, f"k{key}", after) is not None]
-
-    won = together(12, take)
-    return [sum(key in each for each in won) for key in range(40)]
+def claimed(folder: Path) -> Claim:
+    found = claim(folder, "a", 0)
+    assert found is not None
+    return found
 
 
-def test_one_process_gets_a_claim(tmp_path):
-    assert race(tmp_path, 0) == [1] * 40
-    assert read_states(tmp_path) == {f"k{key}": State(1, None) for key in range(40)}
+def test_processes_share_work_of_which_each_piece_is_done_once(tmp_path):
+    """Races for new claims and for those of the dead, in orders of their own; then work by all until it is done."""
+    keys = [f"k{i}" for i in range(20)]
 
-
-def test_one_process_takes_the_work_of_the_dead_over(tmp_path):
-    assert race(tmp_path, 0) == race(tmp_path, 1) == race(tmp_path, 2) == [1] * 40
-    assert set(read_states(tmp_path).values()) == {State(3, None)}
-
-
-def test_all_work_is_done_once_by_processes_that_share_it(tmp_path):
-    keys = [f"k{i}" for i in range(60)]
-
-    def work(i: int) -> list[str]:
+    def work(i: int) -> list[list[str]]:
+        mixed = random.Random(i).sample(keys, len(keys))
+        won = [[key for key in mixed if claim(tmp_path / "race", key, after) is not None] for after in range(3)]
         done = []
-        for mine in claims(tmp_path, keys, {}, PATIENCE):
+        for mine in claims(tmp_path / "work", keys, {}, PATIENCE, sleep=lambda seconds: time.sleep(0.001)):
             done.append(mine.key)
             end(mine, "done")
-        return done
+        return [*won, done]
 
-    done = together(8, work)
-    assert sorted(key for each in done for key in each) == sorted(keys)
-    assert read_states(tmp_path) == {key: State(1, "done") for key in keys}
+    for won in zip(*together(4, work)):
+        assert sorted(key for each in won for key in each) == sorted(keys)
+    assert read_states(tmp_path / "race") == dict.fromkeys(keys, State(3, None))
+    assert read_states(tmp_path / "work") == dict.fromkeys(keys, State(1, "done"))
 
 
 @pytest.mark.parametrize("skew", [-1e6, 0.0, 1e6])
 def test_the_work_of_a_dead_owner_is_taken_over_after_the_patience(tmp_path, skew):
-    dead = claim(tmp_path, "a", 0)
-    assert dead is not None
+    dead = claimed(tmp_path)
     clock, taken = Clock(skew), []
     for mine in claims(tmp_path, ["a", "b"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
         taken.append((mine.key, mine.number, clock.now - skew))
@@ -95,8 +82,7 @@ def test_the_work_of_a_dead_owner_is_taken_over_after_the_patience(tmp_path, ske
 
 
 def test_a_heartbeat_keeps_a_claim_until_it_stops(tmp_path):
-    other = claim(tmp_path, "a", 0)
-    assert other is not None
+    other = claimed(tmp_path)
 
     def live(seconds: float) -> None:
         if seconds < 1000:
@@ -111,20 +97,18 @@ def test_a_heartbeat_keeps_a_claim_until_it_stops(tmp_path):
 
 @pytest.mark.parametrize(("outcome", "taken"), [("done", 0), ("failed", 0), (LEFT, 1)])
 def test_what_another_ends_is_waited_for_and_only_what_was_left_is_taken(outcome, taken, tmp_path):
-    other = claim(tmp_path, "a", 0)
-    assert other is not None
-    clock = Clock(0.0, lambda seconds: end(other, outcome))
-    found = list(claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep)) if taken == 0 else None
-    if found is None:
-        found = [next(claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep))]
-    assert [mine.number for mine in found] == [2] * taken
-    assert clock.now < PATIENCE / BEATS + 5
+    other = claimed(tmp_path)
+    clock, found = Clock(0.0, lambda seconds: end(other, outcome)), []
+    for mine in claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
+        found.append(mine.number)
+        assert 0 < clock.now < PATIENCE / 6 + 5
+        end(mine, "done")
+    assert found == [2] * taken
+    assert clock.now < PATIENCE / 6 + 5
 
 
 def test_what_had_ended_before_is_tried_again_by_one(tmp_path):
-    first = claim(tmp_path, "a", 0)
-    assert first is not None
-    end(first, "failed")
+    end(claimed(tmp_path), "failed")
     at_start = read_states(tmp_path)
     one = claims(tmp_path, ["a"], at_start, PATIENCE)
     again = next(one)
@@ -133,20 +117,16 @@ def test_what_had_ended_before_is_tried_again_by_one(tmp_path):
     assert list(one) == list(claims(tmp_path, ["a"], at_start, PATIENCE)) == []
 
 
-def test_heartbeats_that_cannot_be_written_are_no_errors(tmp_path):
-    gone = Claim(tmp_path / "gone", "a", 1)
-    assert beat(gone, 1) and read_pulse(gone) == b"" and read_states(tmp_path / "gone") == {}
-
-
-def test_heartbeats_differ_and_say_who_writes_them(tmp_path):
-    mine = claim(tmp_path, "a", 0)
-    assert mine is not None
+def test_heartbeats_differ_say_who_writes_them_and_may_fail(tmp_path):
+    mine = claimed(tmp_path)
     seen = [read_pulse(mine)]
     for count in (1, 2, 10**11):
         beat(mine, count)
         seen.append(read_pulse(mine))
     assert len(set(seen)) == 4
     assert mine.path.read_text().split()[0] == "100000000000" and len(mine.path.read_text().split()) == 3
+    gone = Claim(tmp_path / "gone", "a", 1)
+    assert beat(gone, 1) and read_pulse(gone) == b"" and read_states(tmp_path / "gone") == {}
 
 
 _ATTEMPTS = st.dictionaries(
@@ -154,7 +134,6 @@ _ATTEMPTS = st.dictionaries(
 )
 
 
-@settings(deadline=None)
 @given(_ATTEMPTS, st.randoms())
 def test_the_last_attempt_counts_in_whatever_order_files_are_listed(attempts, draw):
     names = ["notes.txt", "a", ".a.1", "a.0", "a.01", "A.1", "a.1.done.x"]
@@ -162,10 +141,11 @@ def test_the_last_attempt_counts_in_whatever_order_files_are_listed(attempts, dr
         for number, outcome in enumerate(outcomes, start=1):
             names += [f"{key}.{number}", *([] if outcome is None else [f"{key}.{number}.{outcome}"])]
     draw.shuffle(names)
-    assert states(names) == {key: State(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()}
+    assert module.states(names) == {key: State(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()}
 
 
 def test_what_is_free():
+    assert module.BEATS == 6
     assert free(NEW, NEW) and free(State(1, LEFT), NEW) and free(State(2, "done"), State(2, "done"))
     assert not any(free(State(2, outcome), State(1, outcome)) for outcome in ("done", "failed"))
     assert not free(State(1, None), State(1, None))

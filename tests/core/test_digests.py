@@ -8,26 +8,35 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given
+from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from normlift_ns import Evidence, SemanticField, lift
-from normlift_ns.core.disk.manifest import MANIFEST, read_manifest, write_manifest
+from normlift_ns.core.disk.digests import text_digest
+from normlift_ns.core.disk.manifest import MANIFEST, check_files, read_manifest, write_manifest
 from normlift_ns.core.disk.tensors import check_tensor, load_tensors, save_tensors, tensor_digest
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.core.storage import StoredDirections, StoredEvidence
+from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.errors import InputError
+from tests.examples import FACTOR, examples
+from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
 from tests.scenes import generator, random_evidence, unit_rows
 
 VIEWS = [6, 5, 0, 7]
 S, D, N = sum(VIEWS), 12, 40
 FORMS = ["evidence", "float16", "low_rank"]
-FLIPS = 150
+FLIPS = 20 * FACTOR
+"""Of each file, besides its first bit and its last."""
 
 
+@cache
 def example(form: str = "evidence", seed: int = 0) -> SemanticField:
     table = torch.nn.functional.normalize(unit_rows(S, 4, seed) @ unit_rows(4, D, seed + 1), dim=1).float()
     lifted = lift(random_evidence(N, VIEWS, seed, fill=0.15, dtype=torch.float32), table)
@@ -41,45 +50,49 @@ def flipped(content: bytes, bit: int) -> bytes:
     return bytes(changed)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_every_flipped_bit_of_a_field_is_noticed(form: str, tmp_path: Path) -> None:
-    example(form).save(tmp_path)
-    files = sorted(tmp_path.iterdir())
-    assert len(files) == (3 if form == "evidence" else 2)
-    for path in files:
-        whole = path.read_bytes()
-        for bit in random.Random(0).sample(range(8 * len(whole)), FLIPS):
-            path.write_bytes(flipped(whole, bit))
-            with pytest.raises(ValueError, match=rf"{path}|schema version .* this program reads 1"):
-                SemanticField.load(tmp_path)
-        path.write_bytes(whole)
-    assert SemanticField.load(tmp_path).manifest == example(form).manifest
+def some_bits(content: bytes) -> list[int]:
+    size = 8 * len(content)
+    return [0, size - 1, *random.Random(0).sample(range(size), FLIPS)]
+
+
+def test_every_flipped_bit_of_a_field_is_noticed(tmp_path: Path) -> None:
+    for form in FORMS:
+        example(form).save(tmp_path / form)
+        files = sorted((tmp_path / form).iterdir())
+        assert len(files) == (3 if form == "evidence" else 2)
+        for path in files:
+            whole = path.read_bytes()
+            for bit in some_bits(whole):
+                path.write_bytes(flipped(whole, bit))
+                with pytest.raises(ValueError, match=rf"{path}|schema version"):
+                    SemanticField.load(path.parent)
+            path.write_bytes(whole)
+        assert SemanticField.load(tmp_path / form).manifest == example(form).manifest
 
 
 def test_a_message_says_what_was_found_expected_and_what_to_type(tmp_path: Path) -> None:
     example("float16").save(tmp_path)
     path = tmp_path / "field.safetensors"
     path.write_bytes(flipped(path.read_bytes(), 8 * path.stat().st_size - 1))
-    with pytest.raises(ValueError, match="is damaged") as caught:
-        SemanticField.load(tmp_path)
     with safe_open(path, "pt") as file:
         written = file.metadata()["digest"]
     found = tensor_digest(load_file(path), {})
-    assert str(caught.value) == (
-        f"{path} is damaged: its content has digest {found}, expected {written}; lift again with: "
-        "ns-normlift --load-config ..."
-    )
+    with pytest.raises(ValueError, match=rf"^{path} .*{found}.*{written}.*ns-normlift --load-config"):
+        SemanticField.load(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["field.safetensors", "evidence.safetensors", "manifest.json"])
-def test_files_of_different_lifts_do_not_pass_together(name: str, tmp_path: Path) -> None:
-    for seed in (0, 1):
-        example(seed=seed).save(tmp_path / str(seed))
-    shutil.copy(tmp_path / "1" / name, tmp_path / "0" / name)
-    with pytest.raises(
-        ValueError, match=r"safetensors and the manifest beside it are of different lifts: .*lift again"
-    ):
-        SemanticField.load(tmp_path / "0")
+def test_files_of_different_lifts_do_not_pass_together(tmp_path: Path) -> None:
+    """Also where one is of version 0.1, without digests."""
+    for name in ("right", "old"):
+        example().save(tmp_path / name)
+    example(seed=1).save(tmp_path / "other")
+    as_version_0_1(tmp_path / "old")
+    for other in ("other", "old"):
+        for name in ("field.safetensors", "evidence.safetensors", "manifest.json"):
+            mixed = shutil.copytree(tmp_path / "right", tmp_path / f"{other} {name}")
+            shutil.copy(tmp_path / other / name, mixed)
+            with pytest.raises(ValueError, match=r"safetensors .* different lifts: .*lift again"):
+                SemanticField.load(mixed)
 
 
 def test_a_field_that_is_loaded_and_saved_again_has_its_own_digests(tmp_path: Path) -> None:
@@ -106,7 +119,7 @@ def test_a_field_of_version_0_1_opens_with_a_note(form: str, tmp_path: Path) -> 
     field = example(form)
     field.save(tmp_path)
     as_version_0_1(tmp_path)
-    with pytest.warns(UserWarning, match=rf"^{tmp_path} was written by version 0\.1, without digests: .*lift again"):
+    with pytest.warns(UserWarning, match=rf"^{tmp_path} .*0\.1.*lift again"):
         loaded = SemanticField.load(tmp_path)
     assert torch.equal(loaded.query(torch.eye(D)), field.query(torch.eye(D)))
     assert loaded.manifest == field.manifest
@@ -114,16 +127,6 @@ def test_a_field_of_version_0_1_opens_with_a_note(form: str, tmp_path: Path) -> 
         warnings.simplefilter("error")
         loaded.save(tmp_path / "again")
         SemanticField.load(tmp_path / "again")
-
-
-@pytest.mark.parametrize("part", ["field.safetensors", "evidence.safetensors", "manifest.json"])
-def test_digests_that_are_missing_in_one_place_are_missed(part: str, tmp_path: Path) -> None:
-    example().save(tmp_path / "new")
-    example().save(tmp_path / "old")
-    as_version_0_1(tmp_path / "old")
-    shutil.copy(tmp_path / "old" / part, tmp_path / "new" / part)
-    with pytest.raises(ValueError, match="different lifts"):
-        SemanticField.load(tmp_path / "new")
 
 
 def with_value(tensor: torch.Tensor, value: float) -> torch.Tensor:
@@ -158,80 +161,69 @@ def with_table(make: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Semant
     return change
 
 
+NAN, INF = float("nan"), float("inf")
+TABLE = "(features|coordinates)"
 WRONG = {
-    "negative source": (lambda f: replace(f, source=with_value(f.source, -1)), "source has numbers in -1"),
-    "source out of range": (lambda f: replace(f, source=with_value(f.source, N)), rf"source has numbers in .*\.\.{N}"),
-    "short source": (lambda f: replace(f, source=f.source[1:]), r"source is int32 \(39,\), expected"),
-    "long source": (lambda f: replace(f, source=f.source.long()), r"source is int64 \(40,\), expected"),
-    "NaN norm": (with_scalar("norm", float("nan")), "norm has numbers in nan"),
-    "negative weight": (with_scalar("weight", -1.0), "weight has numbers in -1"),
-    "infinite reliability": (with_scalar("reliability", float("inf")), r"reliability has numbers in .*\.\.inf"),
-    "short table": (with_table(lambda x: x[:-1]), r"(features|coordinates) is .*, expected"),
-    "narrow table": (with_table(lambda x: x[:, 1:]), r"(features|coordinates) is .*, expected"),
-    "wrong type": (with_table(lambda x: x.double()), r"(features|coordinates) is float64 .*, expected"),
-    "NaN in the table": (
-        with_table(lambda x: with_value(x, float("nan"))),
-        "(features|coordinates) has numbers in nan",
-    ),
-    "infinite table": (with_table(lambda x: with_value(x, float("inf"))), "(features|coordinates) has numbers in"),
+    "negative source": (lambda f: replace(f, source=with_value(f.source, -1)), "source .* -1"),
+    "source out of range": (lambda f: replace(f, source=with_value(f.source, N)), rf"source .*\.\.{N}"),
+    "short source": (lambda f: replace(f, source=f.source[1:]), r"source is int32 \(39,\)"),
+    "long source": (lambda f: replace(f, source=f.source.long()), r"source is int64 \(40,\)"),
+    "NaN norm": (with_scalar("norm", NAN), "norm .* nan"),
+    "negative weight": (with_scalar("weight", -1.0), "weight .* -1"),
+    "infinite reliability": (with_scalar("reliability", INF), r"reliability .*\.\.inf"),
+    "short table": (with_table(lambda x: x[:-1]), rf"{TABLE} is .*, expected"),
+    "narrow table": (with_table(lambda x: x[:, 1:]), rf"{TABLE} is .*, expected"),
+    "wrong type": (with_table(lambda x: x.double()), rf"{TABLE} is float64 .*, expected"),
+    "NaN in the table": (with_table(lambda x: with_value(x, NAN)), rf"{TABLE} .* nan"),
+    "infinite table": (with_table(lambda x: with_value(x, INF)), rf"{TABLE} .*inf"),
 }
 WRONG_ROWS = {
-    "column out of range": (
-        with_rows(column=lambda x: with_value(x, 10**6)),
-        "columns are in .*..1000000, expected 0..17",
-    ),
-    "negative column": (with_rows(column=lambda x: with_value(x, -7)), "columns are in -7"),
+    "column out of range": (with_rows(column=lambda x: with_value(x, 10**6)), r"columns .*\.\.1000000, .* 0\.\.17"),
+    "negative column": (with_rows(column=lambda x: with_value(x, -7)), "columns .* -7"),
     "falling offsets": (with_rows(offsets=lambda x: with_value(x, 10**9)), "offsets must rise"),
     "offsets past the end": (with_rows(offsets=lambda x: x + 1), "offsets must rise"),
     "no offsets": (with_rows(offsets=lambda x: x[:0]), "offsets must rise"),
-    "short offsets": (
-        with_rows(offsets=lambda x: torch.cat([x[:5], x[-1:]])),
-        "evidence.*5 Gaussians have weights of regions, 40 of",
-    ),
+    "short offsets": (with_rows(offsets=lambda x: torch.cat([x[:5], x[-1:]])), r"evidence.*\(5 Gaussians .*40"),
     "short columns": (with_rows(column=lambda x: x[:-1]), "offsets must rise"),
     "narrow columns": (with_rows(column=lambda x: x.to(torch.int16)), r"columns are int16"),
-    "NaN weight": (with_rows(weight=lambda x: with_value(x, float("nan"))), r"weights are in nan"),
-    "negative weight": (with_rows(weight=lambda x: with_value(x, -1.0)), r"weights are in -1"),
+    "NaN weight": (with_rows(weight=lambda x: with_value(x, NAN)), r"weights .* nan"),
+    "negative weight of a region": (with_rows(weight=lambda x: with_value(x, -1.0)), r"weights .* -1"),
     "integer weights": (with_rows(weight=lambda x: x.int()), r"weights are int32"),
 }
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("digests", [True, False])
-@pytest.mark.parametrize(
-    ("form", "change", "message"),
-    [
-        *((form, *case) for form in ("float16", "low_rank", "evidence") for case in WRONG.values()),
-        *(("evidence", *case) for case in WRONG_ROWS.values()),
-    ],
-)
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
-def test_arrays_that_lead_outside_are_refused(form, change, message, digests: bool, tmp_path: Path) -> None:
+def test_arrays_that_lead_outside_are_refused(form: str, tmp_path: Path) -> None:
     """Also where somebody wrote them with right digests."""
-    change(example(form)).save(tmp_path)
-    if not digests:
-        as_version_0_1(tmp_path)
-    with pytest.raises(ValueError, match=message) as caught:
-        SemanticField.load(tmp_path)
-    assert str(tmp_path) in str(caught.value)
-    assert "lift again with: ns-normlift" in str(caught.value)
+    for name, (change, message) in (WRONG | WRONG_ROWS if form == "evidence" else WRONG).items():
+        folder = tmp_path / name
+        change(example(form)).save(folder)
+        for old in (False, True):
+            if old:
+                as_version_0_1(folder)
+            with pytest.raises(ValueError, match=message) as caught:
+                SemanticField.load(folder)
+            assert str(folder) in str(caught.value) and "ns-normlift" in str(caught.value), name
 
 
 @pytest.mark.filterwarnings("ignore:.*was written by version 0.1")
 def test_a_field_without_an_array_is_refused(tmp_path: Path) -> None:
-    example("float16").save(tmp_path)
-    as_version_0_1(tmp_path)
-    tensors = load_file(tmp_path / "field.safetensors")
-    save_file({name: x for name, x in tensors.items() if name != "n_eff"}, tmp_path / "field.safetensors")
-    with pytest.raises(ValueError, match="is damaged: 'n_eff' is missing"):
-        SemanticField.load(tmp_path)
+    for form, name in (("float16", "n_eff"), ("low_rank", "basis")):
+        example(form).save(tmp_path / form)
+        as_version_0_1(tmp_path / form)
+        path = tmp_path / form / "field.safetensors"
+        save_file({key: x for key, x in load_file(path).items() if key != name}, path)
+        with pytest.raises(ValueError, match=f"is damaged.*'{name}' is missing"):
+            SemanticField.load(tmp_path / form)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_a_product_never_reads_outside_of_its_table() -> None:
     rows = SparseRows(torch.tensor([0, 2]), torch.tensor([0, 5]).int(), torch.ones(2))
     assert rows.num_columns == 6
-    with pytest.raises(ValueError, match="a matrix with 6 columns needs as many rows, got 5"):
+    with pytest.raises(ValueError, match=r" 6 columns.* 5"):
         rows.matmul(torch.ones(5, 1))
     assert rows.matmul(torch.ones(6, 1)).tolist() == [[2.0]]
     for broken in (
@@ -249,10 +241,10 @@ def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
     digest = evidence.save(path, key="a")
     assert digest == Evidence.read(path, key="a")[1] != evidence.save(tmp_path / "f.safetensors")
     for key in ("", "b"):
-        with pytest.raises(ValueError, match="is damaged: its content has digest"):
+        with pytest.raises(ValueError, match=r"is damaged.*digest"):
             Evidence.load(path, key=key)
     whole = path.read_bytes()
-    for bit in random.Random(1).sample(range(8 * len(whole)), FLIPS):
+    for bit in some_bits(whole):
         path.write_bytes(flipped(whole, bit))
         with pytest.raises(ValueError, match=r"e\.safetensors is damaged"):
             Evidence.load(path, key="a")
@@ -261,10 +253,9 @@ def test_flips_and_other_keys_of_evidence_are_noticed(tmp_path: Path) -> None:
 def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> None:
     path, evidence = tmp_path / "e.safetensors", random_evidence(15, VIEWS, 3)
     evidence.save(path)
-    (tmp_path / MANIFEST).write_text("{}")
-    as_version_0_1(tmp_path)
+    save_file(load_file(path), path, metadata={k: v for k, v in load_tensors(path).facts.items() if k != "digest"})
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
-    with pytest.raises(ValueError, match="expected one, but it names none"):
+    with pytest.raises(ValueError, match="names none"):
         Evidence.load(path, key="a")
 
 
@@ -287,30 +278,26 @@ def test_a_digest_covers_names_types_shapes_numbers_facts_and_key() -> None:
     assert tensor_digest({**base, "a": strided}, facts) == digests[0]
 
 
-@pytest.mark.parametrize(
-    "tensor",
-    [torch.zeros(0, 3), torch.tensor(3.0), torch.ones(2).bfloat16(), torch.tensor([True]), torch.ones(2).half()],
-)
-def test_tensors_of_any_kind_come_back(tensor: torch.Tensor, tmp_path: Path) -> None:
-    digest = save_tensors(tmp_path / "a.safetensors", {"größe/\n": tensor}, {"fact": "ü"})
-    tensors, facts, found = load_tensors(tmp_path / "a.safetensors")
-    assert (facts, found) == ({"fact": "ü"}, digest)
-    assert torch.equal(tensors["größe/\n"], tensor)
-    check_tensor("a", tensor, tensor.dtype, tensor.shape, 0, 3)
-    with pytest.raises(ValueError, match="a is "):
-        check_tensor("a", tensor, tensor.dtype, (*tensor.shape, 1), 0, 3)
+def test_tensors_of_any_kind_come_back(tmp_path: Path) -> None:
+    kinds = (torch.zeros(0, 3), torch.tensor(3.0), torch.ones(2).bfloat16(), torch.tensor([True]), torch.ones(2).half())
+    for i, tensor in enumerate(kinds):
+        digest = save_tensors(tmp_path / str(i), {"größe/\n": tensor}, {"fact": "ü"})
+        tensors, facts, found = load_tensors(tmp_path / str(i))
+        assert (facts, found) == ({"fact": "ü"}, digest)
+        assert torch.equal(tensors["größe/\n"], tensor)
+        check_tensor("a", tensor, tensor.dtype, tensor.shape, 0, 3)
+        with pytest.raises(ValueError, match="a is "):
+            check_tensor("a", tensor, tensor.dtype, (*tensor.shape, 1), 0, 3)
 
 
 def test_the_same_content_is_the_same_file(tmp_path: Path) -> None:
     contents = set()
+    tensors = {"größe": torch.ones(3), "b\n\x01": torch.zeros(2).half()}
+    facts = {"a": "1\t/", "b": "ü\x7f\\", "c": '"'}
     for i in range(20):  # safetensors alone makes many files of it
-        tensors, facts = (
-            {"größe": torch.ones(3), "b\n\x01": torch.zeros(2).half()},
-            {"a": "1\t/", "b": "ü\x7f\\", "c": '"'},
-        )
         save_tensors(tmp_path / str(i), tensors, facts)
         contents.add((tmp_path / str(i)).read_bytes())
-        assert load_tensors(tmp_path / str(i)).facts == facts
+    assert load_tensors(tmp_path / "0").facts == facts
     assert len(contents) == 1
 
 
@@ -322,15 +309,110 @@ def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
     path = tmp_path / MANIFEST
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))  # as a copy by way of Windows may have it
     assert read_manifest(tmp_path)[1] == {"a": "b"}
-    for text in ("[" * 100_000, "[]", "null", "{", '{"schema_version": 1, "digest": 7}', b"\xff\xfe"):
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        with pytest.raises(ValueError, match=r"damaged|schema version None"):
+    deep = '{"schema_version": 1, "encoder": ' + "[" * 900 + "]" * 900 + "}"
+    for text in ("[" * 10**6, '{"a":' * 10**6, deep, "[]", "null", "{", "ÿ"):
+        path.write_bytes(text.encode("latin1"))
+        with pytest.raises(InputError, match=r"manifest\.json|schema version None"):
             read_manifest(tmp_path)
+    for text, found in (('{"schema_version": 1, "digest": 7}', "damaged.* 7"), ('{"schema_version": 99}', " 99.* 1")):
+        path.write_text(text)
+        with pytest.raises(InputError, match=found):
+            read_manifest(tmp_path)
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(InputError, match=r"1,099,511,627,776"):
+        read_manifest(tmp_path)
 
 
-def test_low_rank_needs_its_basis(tmp_path: Path) -> None:
-    field = example("low_rank")
-    assert isinstance(field.store, StoredDirections)
-    replace(field, store=replace(field.store, basis=None)).save(tmp_path / "a")
-    with pytest.raises(ValueError, match="'basis' is missing"):
-        SemanticField.load(tmp_path / "a")
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("sealed", [True, False])
+def test_manifests_with_hostile_values(sealed: bool, tmp_path: Path) -> None:
+    """With a right digest, and without any as version 0.1 wrote them."""
+    field = example("float16")
+    more = {"encoder": {"encoder": "open_clip", "text_vectors": None}, "features": {"kind": "given", "content": "0"}}
+    SemanticField(field.scalars, field.source, field.store, {**field.manifest, **more}, field.means).save(tmp_path)
+    if not sealed:
+        as_version_0_1(tmp_path)
+    facts = json.loads((tmp_path / MANIFEST).read_text())
+    facts.pop("digest", None)
+
+    def seal(content: bytes) -> bytes:
+        text = content.decode().replace("{", '{"digest": "", ', 1)
+        return text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1).encode()
+
+    def load() -> None:
+        survives(lambda: check_files(tmp_path))
+        SemanticField.load(tmp_path, field.means)
+
+    contents = hostile_json(facts)
+    fuzz(15, contents.map(seal) if sealed else contents, tmp_path / MANIFEST, load)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("digests", [True, False])
+def test_damaged_files(digests: bool, tmp_path: Path) -> None:
+    field = example("evidence")
+    field.save(tmp_path)
+    if not digests:
+        as_version_0_1(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        fuzz(10, damaged(whole), path, lambda: SemanticField.load(tmp_path, field.means))
+        path.write_bytes(whole)
+
+
+def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    random_evidence(15, VIEWS, 3).save(path)
+    tensors, facts, _ = load_tensors(path)
+    views = tensors["region_view"]
+    for facts_changed, tensors_changed, message in (
+        ({"num_views": "-1"}, {}, "num_views.*-1, 1, 0"),
+        ({"weight_power": "3"}, {}, "weight_power.*4, 3, 0"),
+        ({"num_excluded": "16"}, {}, "num_excluded.*4, 1, 16"),
+        ({"num_excluded": "-1"}, {}, "num_excluded.*4, 1, -1"),
+        ({"format": "other"}, {}, "'other'"),
+        ({}, {"region_view": views.flip(0)}, "rising"),
+        ({}, {"region_view": views + 1}, r"1\.\.4.* 0\.\.3"),
+        ({}, {"region_view": views.long()}, "region_view .*int64.*int32"),
+        ({"num_excluded": "15"}, {}, None),
+    ):
+        save_tensors(path, {**tensors, **tensors_changed}, {**facts, **facts_changed}, overwrite=True)
+        if message is None:
+            assert Evidence.load(path).num_excluded == 15
+        else:
+            with pytest.raises(InputError, match=message):
+                Evidence.load(path)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_evidence_with_hostile_facts_and_arrays(tmp_path: Path) -> None:
+    """With right digests."""
+    path = tmp_path / "e.safetensors"
+    random_evidence(15, VIEWS, 3).save(path)
+    tensors, facts, _ = load_tensors(path)
+
+    @examples(15, suppress_health_check=list(HealthCheck))
+    @given(st.data())
+    def test(data: st.DataObject) -> None:
+        fact, array = data.draw(st.sampled_from(sorted(facts))), data.draw(st.sampled_from(sorted(tensors)))
+        other = tensors[data.draw(st.sampled_from(sorted(tensors)))]
+        value = data.draw(st.sampled_from(["", "-1", "1e3", "99999999999999", "9" * 5000, "nan", "²", facts[fact]]))
+        given = {name: tensor for name, tensor in tensors.items() if name != array}
+        if data.draw(st.booleans()):
+            given[array] = other[: data.draw(st.integers(0, 4))].clone() if data.draw(st.booleans()) else -other
+        save_tensors(path, given, {**facts, fact: value}, overwrite=True)
+        survives(lambda: Evidence.load(path))
+
+    test()
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    example().save(tmp_path)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        for _ in no_files(path):
+            with pytest.raises((InputError, FileNotFoundError), match=path.name):
+                SemanticField.load(tmp_path)
+        path.write_bytes(whole)
+    SemanticField.load(tmp_path)

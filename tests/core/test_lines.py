@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
-import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.core.disk.lines import append_line, read_lines
@@ -20,7 +20,6 @@ class Line:
 LINES = [Line('fox "\n\u2028 é 🦊', 1.5), Line("", 2.0), Line("}{", -3.0)]
 
 
-@settings(deadline=None)
 @given(st.integers(0, 200))
 def test_torn_lines_are_left_out(tmp_path_factory, cut):
     folder = tmp_path_factory.mktemp("lines")
@@ -34,14 +33,22 @@ def test_torn_lines_are_left_out(tmp_path_factory, cut):
     assert read_lines(folder, Line) == LINES[: sum(end <= cut for end in ends)] + LINES
 
 
-@pytest.mark.parametrize(
-    "junk", [b"", b"\n\n", b"\xff\xfe\n", b"null\n", b"[1]\n", b'{"name": 1}\n', b"[" * 100_000 + b"\n", b"\0\n"]
-)
-def test_what_is_no_line_of_that_kind_is_left_out(junk, tmp_path):
-    append_line(tmp_path / "a.jsonl", LINES[0])
-    with (tmp_path / "a.jsonl").open("ab") as file:
-        file.write(junk)
-    append_line(tmp_path / "a.jsonl", LINES[1])
-    (tmp_path / "notes.txt").write_text('{"name": "x", "number": 1}\n')
-    assert read_lines(tmp_path, Line) == LINES[:2]
+def test_what_is_no_line_of_that_kind_is_left_out(tmp_path):
+    junk = (b"", b"\n\n", b"\xff\xfe\n", b"null\n", b"[1]\n", b'{"name": 1}\n', b"[" * 100_000 + b"\n", b"\0\n")
+    for i, content in enumerate(junk):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        append_line(folder / "a.jsonl", LINES[0])
+        with (folder / "a.jsonl").open("ab") as file:
+            file.write(content)
+        append_line(folder / "a.jsonl", LINES[1])
+        (folder / "notes.txt").write_text('{"name": "x", "number": 1}\n')
+        assert read_lines(folder, Line) == LINES[:2], content[:20]
     assert read_lines(tmp_path / "nowhere", Line) == []
+
+
+def test_a_line_reaches_the_disk(tmp_path, monkeypatch):
+    flushed = []
+    monkeypatch.setattr(os, "fsync", lambda number: flushed.append((os.fstat(number).st_ino, os.fstat(number).st_size)))
+    append_line(tmp_path / "a.jsonl", LINES[0])
+    assert flushed == [((tmp_path / "a.jsonl").stat().st_ino, (tmp_path / "a.jsonl").stat().st_size)]

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import nearest_neighbors
@@ -13,42 +13,42 @@ from tests.scenes import generator
 
 def all_pairs(means: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
     distance = torch.linalg.vector_norm(means.double()[:, None] - means.double()[None], dim=-1)
-    index = torch.full((len(means), k), -1)
-    sorted_distance = torch.full((len(means), k), math.inf, dtype=torch.float64)
-    for i, row in enumerate(distance.tolist()):
-        order = sorted((d, j) for j, d in enumerate(row) if j != i)[:k]
-        for place, (d, j) in enumerate(order):
-            index[i, place], sorted_distance[i, place] = j, d
-    return index, sorted_distance
+    found = distance.fill_diagonal_(math.inf).sort(dim=1, stable=True)
+    index = torch.where(found.values < math.inf, found.indices, -1)
+    pad = (0, max(0, k - len(means)))
+    return (torch.nn.functional.pad(index, pad, value=-1)[:, :k],
+            torch.nn.functional.pad(found.values, pad, value=math.inf)[:, :k])  # fmt: skip
 
 
-def grid() -> torch.Tensor:
-    axis = torch.arange(4.0)
-    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+def lattice() -> torch.Tensor:
+    """Several points at one place."""
+    return torch.randint(0, 3, (90, 3), generator=generator(3)).float()
 
 
-SCENES = {
-    "random": torch.rand(120, 3, generator=generator(0)),
-    "grid": grid(),
-    "all at one place": torch.zeros(30, 3),
-    "few places": torch.rand(20, 3, generator=generator(1))[torch.randint(0, 20, (100,), generator=generator(2))],
-    "grid, several at a place": torch.randint(0, 3, (90, 3), generator=generator(3)).float(),
-    "dense and sparse": torch.cat([1e-4 * torch.rand(60, 3, generator=generator(4)), 1e3 * torch.rand(20, 3)]),
-    "one": torch.zeros(1, 3),
-    "two": torch.tensor([[0.0, 0, 0], [1, 0, 0]]),
-}
+def scenes() -> dict[str, torch.Tensor]:
+    some = torch.randint(0, 20, (100,), generator=generator(2))
+    sparse = 1e3 * torch.rand(20, 3, generator=generator(5))
+    return {
+        "random": torch.rand(120, 3, generator=generator(0)),
+        "grid": torch.cartesian_prod(*[torch.arange(4.0)] * 3),
+        "all at one place": torch.zeros(30, 3),
+        "few places": torch.rand(20, 3, generator=generator(1))[some],
+        "grid, several at a place": lattice(),
+        "dense and sparse": torch.cat([1e-4 * torch.rand(60, 3, generator=generator(4)), sparse]),
+        "one": torch.zeros(1, 3),
+        "two": torch.tensor([[0.0, 0, 0], [1, 0, 0]]),
+    }
 
 
-@pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("k", [1, 3, 7, 36, 130])
-def test_equals_all_pairs_ties_by_index(name, k):
-    found = nearest_neighbors(SCENES[name], k)
-    index, distance = all_pairs(SCENES[name], k)
-    assert torch.equal(found.index, index)
-    assert torch.allclose(found.distance, distance, rtol=1e-12, atol=0)
+def test_equals_all_pairs_ties_by_index():
+    for name, means in scenes().items():
+        index, distance = all_pairs(means, 130)
+        for k in (1, 3, 7, 36, 130):
+            found = nearest_neighbors(means, k)
+            assert torch.equal(found.index, index[:, :k]), (name, k)
+            assert torch.allclose(found.distance, distance[:, :k], rtol=1e-12, atol=0), (name, k)
 
 
-@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**31), side=st.integers(1, 6), n=st.integers(1, 60), k=st.integers(1, 12))
 def test_equals_all_pairs_on_lattices(seed, side, n, k):
     means = torch.randint(0, side, (n, 3), generator=generator(seed)).float()
@@ -82,12 +82,12 @@ def test_many_coincident_points_stay_cheap():
 
 
 def test_k_must_be_positive():
-    with pytest.raises(ValueError, match="k must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"k .* 0"):
         nearest_neighbors(torch.zeros(3, 3), 0)
 
 
 def test_progress_comes_in_blocks_and_blocks_change_nothing(monkeypatch):
-    means, told = SCENES["grid, several at a place"], []
+    means, told = lattice(), []
     whole = nearest_neighbors(means, 7)
     monkeypatch.setattr("normlift_ns.core.neighbors._BLOCK", 5)
     found = nearest_neighbors(means, 7, progress=lambda *step: told.append(step))

@@ -31,13 +31,13 @@ def test_cosine_is_itself_and_images_work_too():
 
 def test_forms_that_compare_need_negatives():
     for negative in (None, NEGATIVE[:, :0]):
-        with pytest.raises(ValueError, match="give at least one, for example object, things, stuff, texture"):
+        with pytest.raises(ValueError, match="object, things, stuff, texture"):
             relevancy(POSITIVE, negative, rule="lerf")
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_rule():
-    with pytest.raises(ValueError, match="rule must be one of cosine, lerf, margin; got"):
+    with pytest.raises(ValueError, match=r"rule .*cosine, lerf, margin.*dot"):
         relevancy(POSITIVE, NEGATIVE, rule="dot")
 
 

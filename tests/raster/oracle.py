@@ -62,19 +62,20 @@ def compositing_matrix(
         u, v = fx * x / z + cx, fy * y / z + cy
         if u + across <= 0 or u - across >= width or v + down <= 0 or v - down >= height:
             continue
-        splats.append((z, j, u, v, (across, down), np.linalg.inv(blurred), opacity))
-    splats.sort(key=lambda splat: (splat[0], splat[1]))
+        columns = range(math.floor((u - across) / TILE), math.ceil((u + across) / TILE))
+        rows = range(math.floor((v - down) / TILE), math.ceil((v + down) / TILE))
+        (a, b), (_, c) = np.linalg.inv(blurred).tolist()
+        splats.append((z, j, float(u), float(v), columns, rows, a, b, c, opacity))
+    splats.sort(key=lambda splat: splat[:2])
     weights = np.zeros((height, width, len(scene)))
     for row in range(height):
         for column in range(width):
             transmittance = 1.0
-            for _, j, u, v, (across, down), conic, opacity in splats:
-                if not math.floor((u - across) / TILE) <= column // TILE < math.ceil((u + across) / TILE):
+            for _, j, u, v, columns, rows, a, b, c, opacity in splats:
+                if column // TILE not in columns or row // TILE not in rows:
                     continue
-                if not math.floor((v - down) / TILE) <= row // TILE < math.ceil((v + down) / TILE):
-                    continue
-                d = np.array([column + 0.5 - u, row + 0.5 - v])
-                alpha = min(cap, opacity * math.exp(-0.5 * d @ conic @ d))
+                dx, dy = column + 0.5 - u, row + 0.5 - v
+                alpha = min(cap, opacity * math.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
                 if alpha < SKIP:
                     continue
                 if transmittance * (1 - alpha) <= STOP:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import threading
 from importlib import metadata
 from types import SimpleNamespace
 from typing import Any
@@ -40,18 +41,23 @@ def install(monkeypatch: pytest.MonkeyPatch, triton: str | None) -> None:
     monkeypatch.setattr(gpu, "version", version)
 
 
-@pytest.mark.parametrize(
-    ("triton", "backend"),
-    [("2.1.0", "gsplat"), ("2.3.1", "gsplat"), (None, "gsplat"), ("3.0.0", "triton"), ("3.6.0", "triton")],
-)
-def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch, triton, backend):
-    install(monkeypatch, triton)
-    assert _fastest(ON_GPU) == backend
-    if backend == "gsplat":
-        with pytest.raises(InputError, match=r"needs Triton 3, which comes with PyTorch 2\.4"):
-            choose_backend("triton", ON_GPU, pictures=False)
+def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
+    """A Triton without version is taken."""
+    for triton in ("3.0.0", "3.6.0", "", "2.1.0", "2.3.1", None):
+        install(monkeypatch, triton)
+        gpu.has_triton.cache_clear()
+        taken = triton in ("3.0.0", "3.6.0", "")
+        assert (gpu.has_triton(), _fastest(ON_GPU)) == (taken, "triton" if taken else "gsplat"), triton
+        if not taken:
+            with pytest.raises(InputError, match=r"Triton 3, .*PyTorch 2\.4"):
+                choose_backend("triton", ON_GPU, pictures=False)
 
 
-def test_a_triton_without_version_is_taken(monkeypatch):
-    install(monkeypatch, "")
-    assert gpu.has_triton()
+def test_a_gpu_that_cannot_start_is_told_of_where_it_is_wanted(monkeypatch):
+    told = []
+    monkeypatch.setattr(threading, "excepthook", told.append)
+    before = set(threading.enumerate())
+    gpu.wake("cuda:99")
+    for thread in set(threading.enumerate()) - before:
+        thread.join()
+    assert told == []

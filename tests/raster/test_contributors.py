@@ -2,10 +2,12 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Contributors, GaussianScene, RasterSettings, contributors, rasterize_evidence, render
+from normlift_ns.options import KNOWN_RULES
+from tests.examples import examples
 from tests.raster.oracle import compositing_matrix
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
 
@@ -25,44 +27,30 @@ def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
     return full
 
 
-@settings(deadline=None, max_examples=10)
-@given(seed=st.integers(0, 2**31), count=st.integers(0, 40), backend=st.sampled_from(BACKENDS), blurred=st.booleans())
-def test_they_are_those_of_the_python_loops(seed, count, backend, blurred):
+@examples(5)
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 40), rules=st.sampled_from(KNOWN_RULES), blurred=st.booleans())
+def test_they_are_those_of_the_python_loops(seed, count, rules, blurred):
     scene, camera = random_scene(40, seed=seed, size=0.4), orbit_camera(seed % 7, width=37, height=21)
+    scene.opacities[::3] = 0.999  # which rules cap
     pixels = some_pixels(count, 37, 21, seed)
     mode = "antialiased" if blurred else "classic"
-    found = contributors(scene, camera, pixels, backend=backend, rasterize_mode=mode)
-    expected = torch.from_numpy(compositing_matrix(scene, camera, blurred))[pixels[:, 1], pixels[:, 0]]
-    assert torch.allclose(matrix(found, 40), expected, rtol=0, atol=1e-12)
-    assert len(found.gaussian) == int((expected > 0).sum())
+    expected = torch.from_numpy(compositing_matrix(scene, camera, blurred, rules))[pixels[:, 1], pixels[:, 0]]
     depth = scene.means @ camera.world_to_camera[2, :3]
-    for start, stop in zip(found.offsets[:-1].tolist(), found.offsets[1:].tolist()):
-        assert (depth[found.gaussian[start:stop]].diff() >= 0).all()
+    for backend in BACKENDS:
+        how = {"rasterize_mode": mode, "settings": RasterSettings.of_gsplat(rules)}
+        found = contributors(scene, camera, pixels, backend=backend, **how)
+        assert torch.allclose(matrix(found, 40), expected, rtol=0, atol=1e-12)
+        assert len(found.gaussian) == int((expected > 0).sum())
+        for start, stop in zip(found.offsets[:-1].tolist(), found.offsets[1:].tolist()):
+            assert (depth[found.gaussian[start:stop]].diff() >= 0).all()
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_picture_and_evidence_are_made_of_them(device):
-    scene = random_scene(300, seed=3, size=0.3, dtype=torch.float32).to(device)
-    camera = orbit_camera(1.0, width=50, height=40)
-    y, x = torch.meshgrid(torch.arange(40), torch.arange(50), indexing="ij")
-    found = contributors(scene, camera, torch.stack([x, y], dim=2).view(-1, 2))
-    full = matrix(found, 300)
-    values = torch.rand(300, 3, generator=generator(1)).to(device)
-    image, alpha = render(scene, camera, values)
-    assert (full @ values.double().cpu() - image.double().cpu().view(-1, 3)).abs().max() < 2e-6
-    assert (full.sum(1) - alpha.double().cpu().flatten()).abs().max() < 2e-6
-    assert alpha.max() > 0.9
-    labels = random_labels(camera, 5, seed=2)
-    sums = dense(rasterize_evidence(scene, [camera], [labels], num_regions=[5]).rows, 5).double().cpu()
-    onehot = torch.nn.functional.one_hot(labels.long().flatten() % 6, 6)[:, :5].double()
-    assert (full.T @ onehot - sums).abs().max() < 1e-5 * sums.max()
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("rules", ["1.4", "1.5", "1.6"])
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_weights_of_the_pixels_of_a_region_add_up_to_its_evidence(mode, rules, device):
-    """And those of a pixel to its alpha, in both precisions, with Gaussians among them that cannot be drawn."""
+@pytest.mark.parametrize(("mode", "rules"), [("classic", "1.4"), ("antialiased", "1.5"), ("antialiased", "1.6")])
+def test_a_picture_and_evidence_are_made_of_them(mode, rules, device):
+    """Weights of a region's pixels add up to its evidence, those of a pixel to its alpha and color, in both precisions,
+    with Gaussians among them that cannot be drawn.
+    """
     scene = random_scene(80, seed=8, size=0.4)
     scene.means[3, 1], scene.opacities[4], scene.scales[5, 0], scene.quats[6] = torch.nan, torch.nan, torch.inf, 0
     camera = orbit_camera(0.7, width=33, height=21)
@@ -80,50 +68,33 @@ def test_weights_of_the_pixels_of_a_region_add_up_to_its_evidence(mode, rules, d
         flat = labels.long().flatten()
         found = torch.stack([full[flat == region].sum(dim=0) for region in range(4)], dim=1)
         assert (found - expected).abs().max() < error * expected.max()
-        _, alpha = render(here, camera, here.means.nan_to_num(), **how)
+        values = torch.rand(80, 3, generator=generator(1)).to(device, dtype)
+        image, alpha = render(here, camera, values, **how)
         assert (full.sum(dim=1) - alpha.double().cpu().flatten()).abs().max() < error
+        assert (full @ values.double().cpu() - image.double().cpu().view(-1, 3)).abs().max() < error
         assert bool((full[:, 3:7] == 0).all()) and int((full > 0).sum()) > 500
 
 
-def test_weights_differ_between_modes_and_rules():
-    """So that the test above would notice if one of them were not passed on."""
-    scene, camera = random_scene(60, seed=2, size=0.3), orbit_camera(0.1, width=20, height=20)
-    scene.opacities.fill_(0.999)
-    pixels = some_pixels(100, 20, 20, seed=0)
-    plain = matrix(contributors(scene, camera, pixels), 60)
-    for how in ({"rasterize_mode": "antialiased"}, {"settings": RasterSettings.of_gsplat("1.6")}):
-        assert (matrix(contributors(scene, camera, pixels, **how), 60) - plain).abs().max() > 1e-3
-
-
-def test_no_pixels_have_no_contributors():
-    found = contributors(random_scene(5), orbit_camera(0.0, width=20, height=10), torch.zeros(0, 2, dtype=torch.long))
-    assert found.offsets.tolist() == [0] and len(found.gaussian) == len(found.weight) == 0
-
-
-def test_a_pixel_that_nothing_covers_has_none():
+def test_pixels_of_all_kinds():
+    """None, one that nothing covers, one named twice, and others, which are refused."""
     scene, camera = random_scene(60, seed=5, size=0.5), orbit_camera(0.2, width=20, height=20)
+    found = contributors(scene, camera, torch.zeros(0, 2, dtype=torch.long))
+    assert found.offsets.tolist() == [0] and len(found.gaussian) == len(found.weight) == 0
     nothing = GaussianScene(scene.means + 1e4, scene.quats, scene.scales, scene.opacities)
     assert contributors(nothing, camera, torch.tensor([[0, 0], [19, 19]])).offsets.tolist() == [0, 0, 0]
-
-
-def test_a_pixel_named_twice_is_answered_twice():
-    scene, camera = random_scene(60, seed=5, size=0.5), orbit_camera(0.2, width=20, height=20)
     found = contributors(scene, camera, torch.tensor([[10, 9], [3, 4], [10, 9]]))
-    parts = [x.split(found.offsets.diff().tolist()) for x in (found.gaussian, found.weight)]
-    for part in parts:
-        assert torch.equal(part[0], part[2])
-    assert len(parts[0][0]) > 0
+    for x in (found.gaussian, found.weight):
+        first, _, again = x.split(found.offsets.diff().tolist())
+        assert torch.equal(first, again) and len(first) > 0
 
 
-@pytest.mark.parametrize(
-    ("pixels", "told"),
-    [
-        (torch.tensor([[0, 0], [20, 3]]), r"pixels\[1\] is \(20, 3\), but the camera has 20 columns and 10 rows"),
-        (torch.tensor([[0, -1]]), r"pixels\[0\] is \(0, -1\)"),
-        (torch.tensor([[0.5, 1.0]]), r"whole numbers \[P, 2\], \(column, row\), got torch.float32 \(1, 2\)"),
-        (torch.tensor([1, 2]), r"got torch.int64 \(2,\)"),
-    ],
-)  # fmt: skip
-def test_other_pixels_are_refused(pixels, told, unchecked):
-    with pytest.raises(ValueError, match=told):
-        contributors(random_scene(5), orbit_camera(0.0, width=20, height=10), pixels)
+def test_other_pixels_are_refused(unchecked):
+    for pixels, told in (
+        (torch.tensor([[0, 0], [20, 3]]), r"pixels\[1\] .*\(20, 3\).* 20 columns .*10 rows"),
+        (torch.tensor([[0, 10]]), r"pixels\[0\] .*\(0, 10\)"),
+        (torch.tensor([[0, -1]]), r"pixels\[0\] .*\(0, -1\)"),
+        (torch.tensor([[0.5, 1.0]]), r"\[P, 2\].* torch.float32 \(1, 2\)"),
+        (torch.tensor([1, 2]), r"torch.int64 \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            contributors(random_scene(5), orbit_camera(0.0, width=20, height=10), pixels)

@@ -28,22 +28,47 @@ def telling_scene() -> GaussianScene:
     return scene
 
 
-@pytest.mark.parametrize("rules", KNOWN_RULES)
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_every_backend_draws_by_the_rules(rules, antialiased):
-    scene, (camera,) = telling_scene(), orbit(1, width=50, height=41)
+WIDTH, HEIGHT = 50, 41
+
+
+def drawn_by(rules: str, antialiased: bool):
+    """What must come of the telling scene: its weights, labels of four regions, and the evidence of these."""
+    scene, (camera,) = telling_scene(), orbit(1, width=WIDTH, height=HEIGHT)
     weights = torch.from_numpy(compositing_matrix(scene, camera, antialiased, rules))
     labels = random_labels(camera, 4, seed=1)
     expected = torch.stack([(weights * (labels == region)[:, :, None]).sum((0, 1)) for region in range(4)], 1)
-    settings, mode = RasterSettings.of_gsplat(rules), "antialiased" if antialiased else "classic"
-    for backend in ("torch", "numba"):
-        how = {"backend": backend, "rasterize_mode": mode, "settings": settings}
-        evidence = rasterize_evidence(scene, [camera], [labels], num_regions=[4], **how)
-        assert (dense(evidence.rows, 4) - expected).abs().max() < 1e-9
-        _, alpha = render(scene, camera, torch.ones(18, 1, dtype=torch.float64), **how)
-        assert (alpha - weights.sum(2)).abs().max() < 1e-9
+    return scene, camera, labels, weights, expected
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_every_backend_draws_by_the_rules_and_these_differ(antialiased):
+    found = []
+    for rules in KNOWN_RULES:
+        scene, camera, labels, weights, expected = drawn_by(rules, antialiased)
+        found.append(weights)
+        for backend in ("torch", "numba"):
+            mode = "antialiased" if antialiased else "classic"
+            how = {"backend": backend, "rasterize_mode": mode, "settings": RasterSettings.of_gsplat(rules)}
+            evidence = rasterize_evidence(scene, [camera], [labels], num_regions=[4], **how)
+            assert (dense(evidence.rows, 4) - expected).abs().max() < 1e-9, (rules, backend)
+            _, alpha = render(scene, camera, torch.ones(18, 1, dtype=torch.float64), **how)
+            assert (alpha - weights.sum(2)).abs().max() < 1e-9, (rules, backend)
+    first, second, third = found
+    assert (first - second).abs().max() > 1e-3 and (third - second).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("rules", "antialiased"),
+    [
+        *(("1.4", False), ("1.6", True)),
+        *(pytest.param(*x, marks=pytest.mark.extra) for x in (("1.4", True), ("1.5", False), ("1.5", True))),
+        pytest.param("1.6", False, marks=pytest.mark.extra),
+    ],
+)
+def test_the_kernels_draw_by_the_rules(rules, antialiased):
+    scene, camera, labels, _, expected = drawn_by(rules, antialiased)
     single = GaussianScene(*(x.float().to(DEVICE) for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
-    job = Job(single, antialiased, settings, torch.float32)
+    job = Job(single, antialiased, RasterSettings.of_gsplat(rules), torch.float32)
     entries = triton.views_evidence(job, Batch([camera], [labels.to(DEVICE)], [4]))
     found = torch.zeros(18, 5)
     found[entries.gaussian.long().cpu(), entries.column.long().cpu()] = entries.weight.cpu()
@@ -51,17 +76,9 @@ def test_every_backend_draws_by_the_rules(rules, antialiased):
     assert (found[:, 1:] - expected).norm() < 1e-4 * expected.norm()
 
 
-def test_the_rules_differ():
-    scene, (camera,) = telling_scene(), orbit(1, width=50, height=41)
-    for antialiased in (False, True):
-        first, second, third = (compositing_matrix(scene, camera, antialiased, rules) for rules in KNOWN_RULES)
-        assert abs(first - second).max() > 1e-3
-        assert abs(third - second).max() > 1e-3
-
-
 def test_versions_have_rules(monkeypatch):
     assert RasterSettings.of_gsplat("1.4.0") == RasterSettings()
-    with pytest.raises(ValueError, match=r"nothing is known of the rules of gsplat 0.9; known are 1.4, 1.5, 1.6"):
+    with pytest.raises(ValueError, match=r"0\.9.* 1\.4, 1\.5, 1\.6"):
         RasterSettings.of_gsplat("0.9")
     monkeypatch.setattr(gsplat, "installed_version", lambda: "1.5.3")
     asked = (("auto", None), ("auto", "1.5"), ("1.6", "1.4"), ("installed", "1.4"))
@@ -132,10 +149,10 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
     assert torch.allclose(found.means2d[0, at], seen.means2d[listed])
 
 
-def test_pictures_of_any_number_of_channels(monkeypatch):
-    scene, (camera,) = hard_scene(), orbit(1, width=33, height=18)
+def test_pictures_of_any_number_of_channels():
+    scene, (camera,) = hard_scene(), orbit(1, width=18, height=17)
     job = Job(scene.to(DEVICE), False, RasterSettings(), torch.float32)
-    for channels in (0, 1, 3, 19):
+    for channels in (0, 19):
         values = torch.rand(len(scene), channels, generator=generator(0))
         found = triton.composite(job, camera, values.to(DEVICE))
         expected = render(scene, camera, values, backend="torch")

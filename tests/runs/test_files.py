@@ -15,6 +15,7 @@ from normlift_ns.encoders.texts.files import write_text_vectors
 from normlift_ns.errors import InputError
 from normlift_ns.runs.files import check_run, digests_beside, refuse_existing_run, sealed
 from tests.core.test_digests import as_version_0_1, example, flipped
+from tests.hostile import no_files
 
 CONFIG = "method_name: normlift\ntimestamp: größe\n"
 
@@ -53,28 +54,26 @@ def test_the_manifest_knows_the_files_of_the_run(tmp_path: Path) -> None:
         check_run(tmp_path / "no run")
 
 
-@pytest.mark.parametrize("name", BESIDE)
-def test_files_of_another_run_and_flipped_bits_are_refused(name: str, tmp_path: Path) -> None:
+def test_files_of_another_run_and_flipped_bits_are_refused(tmp_path: Path) -> None:
     run, other = write_run(tmp_path / "a" / "run"), write_run(tmp_path / "b" / "run", seed=1)
-    whole = (run / name).read_bytes()
-    for wrong in ((other / name).read_bytes(), whole[:-1], b"", *(flipped(whole, bit) for bit in range(0, 190, 13))):
-        (run / name).write_bytes(wrong)
-        with pytest.raises(InputError, match=rf"{run / name} is damaged, or not the file .* expected xxh3_128:.*copy"):
-            check_run(run)
-    (run / name).unlink()
-    check_run(run)  # who needs it says so
+    for path in (run / name for name in BESIDE):
+        whole, foreign = path.read_bytes(), (other / path.relative_to(run)).read_bytes()
+        for wrong in (foreign, whole[:-1], b"", *(flipped(whole, bit) for bit in range(0, 190, 13))):
+            path.write_bytes(wrong)
+            with pytest.raises(InputError, match=rf"{path} is damaged.* expected xxh3_128:.*copy"):
+                check_run(run)
+        path.unlink()
+        check_run(run)  # who needs it says so
 
 
 def test_an_edited_config_is_warned_of_until_its_first_line_goes(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     config = run / "config.yml"
     whole = config.read_bytes()
-    for bit in range(0, 8 * len(whole), 5):
+    for bit in range(0, 8 * len(whole), 29):
         config.write_bytes(flipped(whole, bit))
         if config.read_bytes().startswith(b"# Lines below: "):
-            with pytest.warns(
-                UserWarning, match=r"config\.yml is not as normlift_ns wrote it: .*delete its first line"
-            ):
+            with pytest.warns(UserWarning, match=r"config\.yml .*delete its first line"):
                 check_run(run)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -92,58 +91,39 @@ def test_runs_without_digests_are_not_checked(tmp_path: Path) -> None:
     check_run(run)
 
 
-@pytest.mark.parametrize("name", ["/etc/passwd", "../../x", "../a/b", "..", ".", "", "a/b", "a\0", "\udcff", "../.x"])
-def test_a_manifest_leads_nowhere_else(name: str, tmp_path: Path) -> None:
-    example("float16").save(tmp_path / "normlift", beside={name: "xxh3_128:0"})
-    with pytest.raises(InputError, match=r"manifest\.json is damaged"):
-        check_files(tmp_path / "normlift")
+def test_a_manifest_leads_nowhere_else(tmp_path: Path) -> None:
+    for i, name in enumerate(["/etc/passwd", "../../x", "../a/b", "..", ".", "", "a/b", "a\0", "\udcff", "../.x"]):
+        example("float16").save(tmp_path / str(i), beside={name: "xxh3_128:0"})
+        with pytest.raises(InputError, match=r"manifest\.json is damaged"):
+            check_files(tmp_path / str(i))
 
 
-@pytest.mark.parametrize("make", ["folder", "loop", "dangling", "fifo"])
-def test_what_is_no_file_is_refused_or_absent(make: str, tmp_path: Path) -> None:
-    import os  # noqa: PLC0415
-
+def test_what_is_no_file_is_refused_or_absent(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    for path in (run / BESIDE[0], run / "config.yml", run / "normlift" / MANIFEST):
-        path.unlink()
-        if make == "folder":
-            path.mkdir()
-        elif make == "fifo":
-            os.mkfifo(path)
-        else:
-            path.symlink_to(path.name if make == "loop" else "nowhere")
-    if make in ("folder", "fifo"):
-        with pytest.raises(InputError, match=r"manifest\.json: InputError: it is no file"):
+    paths = [run / BESIDE[0], run / "config.yml", run / "normlift" / MANIFEST]
+    for kinds in zip(*map(no_files, paths)):
+        if kinds[0] in ("nothing", "a link to nothing", "a link to itself"):
             check_run(run)
-    else:
-        check_run(run)
-        with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):
-            read_manifest(run / "normlift")
+            with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):
+                read_manifest(run / "normlift")
+        else:
+            with pytest.raises(InputError, match=r"manifest\.json"):
+                check_run(run)
 
 
-@pytest.mark.parametrize("overwrite", [True, False])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "config.yml",
-        "dataparser_transforms.json",
-        "splat.json",
-        "transforms.json",
-        "nerfstudio_models/new.json",
-        "normlift/field.safetensors",
-        "normlift/sub/a.png",
-    ],
-)
-def test_no_output_takes_the_place_of_a_part_of_a_run(name: str, overwrite: bool, tmp_path: Path) -> None:
+def test_no_output_takes_the_place_of_a_part_of_a_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    link = tmp_path / "link.json"
-    link.symlink_to(run / name)
+    parts = ("config.yml", "dataparser_transforms.json", "splat.json", "transforms.json", "nerfstudio_models/new.json")
     (tmp_path / "other").symlink_to(run)
-    for path in (run / name, link, tmp_path / "other" / name, run / "normlift" / ".." / name):
-        with pytest.raises(InputError, match=r"is part of the run .*give another --json"):
-            refuse_existing(path, overwrite=overwrite, instead="--json")
+    for i, name in enumerate((*parts, "normlift/field.safetensors", "normlift/sub/a.png")):
+        link = tmp_path / f"link{i}.json"
+        link.symlink_to(run / name)
+        for path in (run / name, link, tmp_path / "other" / name, run / "normlift" / ".." / name):
+            for overwrite in (True, False):
+                with pytest.raises(InputError, match=r"part of the run .* --json"):
+                    refuse_existing(path, overwrite=overwrite, instead="--json")
     for fine in (run / "answers.json", run / "ply" / "config.yml", tmp_path / "config.yml", run / "pictures" / "a.png"):
-        refuse_existing(fine, overwrite=overwrite, instead="--json")
+        refuse_existing(fine, overwrite=False, instead="--json")
         refuse_run_files(fine, instead="--json")
 
 
@@ -151,8 +131,8 @@ def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     refuse_existing_run(run, overwrite=True)
     refuse_existing_run(tmp_path / "new", overwrite=False)
-    with pytest.raises(FileExistsError, match="give another --timestamp"):
+    with pytest.raises(FileExistsError, match="--timestamp"):
         refuse_existing_run(run, overwrite=False)
     (tmp_path / "photos").mkdir()
-    with pytest.raises(FileExistsError, match=r"photos is no run \(it has no config\.yml\)"):
+    with pytest.raises(FileExistsError, match=r"photos .*config\.yml"):
         refuse_existing_run(tmp_path / "photos", overwrite=True)

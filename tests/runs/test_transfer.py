@@ -4,16 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
 from normlift_ns.runs.transfer import nearest_rows, places, read_cloud, write_cloud
+from tests.examples import examples
 
 
 @given(st.integers(0, 2**16), st.floats(0.01, 2))
-@settings(max_examples=25, deadline=None)
+@examples(8)
 def test_nearest_rows_are_those_of_loops(seed, most):
     g = np.random.default_rng(seed)
     points, means = g.normal(size=(20, 3)), g.normal(size=(15, 3))
@@ -28,10 +29,10 @@ def test_nearest_rows_are_those_of_loops(seed, most):
         assert found.near[i] == (min(distances) <= most)
 
 
-@pytest.mark.parametrize("far", [1e150, 1e200, 1e300, np.finfo(np.float64).max])
-def test_points_however_far_away_have_no_label(far):
-    found = nearest_rows(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
-    assert found.near.tolist() == [False, True] and set(found.row) <= {0, 1, 2}
+def test_points_however_far_away_have_no_label():
+    for far in (1e150, 1e200, 1e300, np.finfo(np.float64).max):
+        found = nearest_rows(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
+        assert found.near.tolist() == [False, True] and set(found.row) <= {0, 1, 2}, far
 
 
 def cloud(path: Path, *, text: bool = False, order: str = "<") -> np.ndarray:
@@ -58,30 +59,26 @@ def test_all_else_of_a_cloud_stays(how, tmp_path):
     assert again["vertex"]["class_id"].dtype == np.uint32
     assert np.array_equal(np.stack(again["face"]["vertex_indices"]), [[0, 1, 2], [2, 3, 4]])
     assert again.comments == ["made by hand"]
-    with pytest.raises(InputError, match="have class_id, relevancy_0 already"):
+    with pytest.raises(InputError, match="class_id, relevancy_0"):
         write_cloud(tmp_path / "c.ply", read_cloud(tmp_path / "b.ply"), columns)
     with pytest.raises(FileExistsError):
         write_cloud(tmp_path / "b.ply", read, columns)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "cannot be read"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "1 vertices with x"),
-        (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", "truncated"),
-        (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "0 vertices"),
-        (
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-            b"property list uchar int n\nend_header\n1 2 3 1 4\n",
-            "has lists at its vertices",
-        ),
-        (b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n", "cannot be read"),
-    ],
-)
-def test_what_is_no_cloud_is_refused(content, message, tmp_path):
-    (tmp_path / "a.ply").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_cloud(tmp_path / "a.ply")
-    with pytest.raises(FileNotFoundError, match="given with --transfer"):
+def test_what_is_no_cloud_is_refused(tmp_path):
+    start, end = "ply\nformat ascii 1.0\n", "end_header\n"
+    x = "property float x\n"
+    lists = f"{x}property float y\nproperty float z\nproperty list uchar int n\n"
+    for content, message in (
+        ("", "cannot be read"),
+        (f"{start}element vertex 1\n{x}{end}1\n", "1 vertices with x"),
+        (f"{start}element vertex 99999999999\n{x}{end}1\n", "truncated"),
+        (f"{start}element face 0\n{x}{end}", "0 vertices"),
+        (f"{start}element vertex 1\n{lists}{end}1 2 3 1 4\n", "lists"),
+        (f"{start}element vertex 2\n{x}{end}1\n", "cannot be read"),
+    ):
+        (tmp_path / "a.ply").write_text(content)
+        with pytest.raises(InputError, match=message):
+            read_cloud(tmp_path / "a.ply")
+    with pytest.raises(FileNotFoundError, match="--transfer"):
         read_cloud(tmp_path / "none.ply")

@@ -15,15 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 import normlift_ns as nl
-from normlift_ns.nerfstudio_plugin.config import rerooted
 from normlift_ns.scripts import evaluate, export, lift, query
 from tests.golden.summary import differences, without_news
 from tests.scripts.conftest import run_entry
-from tests.scripts.test_stock_processes import viewer_page
 
 QUERIES = {"lifted": ("--text", "red", "sky blue", "--threshold", 0.4), "trained": ("--text", "red")}
 STORED = {"lifted": ("red", "yellow"), "trained": ("red",)}
@@ -36,6 +33,7 @@ def config(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / "old" / "runs" / "scene" / "normlift" / request.param / "config.yml"
 
 
+@pytest.mark.usefixtures("nerfstudio")
 def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name, answers = config.parent.name, tmp_path / "answers.json"
     flags = ("--load-config", config, *QUERIES[name], "--json", answers)
@@ -58,7 +56,12 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
     assert lifted.ask("red").texts == ("red",)
 
 
+@pytest.mark.usefixtures("nerfstudio")
 def test_stock_nerfstudio_loads_them(config: Path) -> None:
+    from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
+
+    from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
+
     pipeline = eval_setup(config, update_config_callback=lambda loaded: rerooted(loaded, config))[1]
     run = nl.open_run(config)
     stored = run.ask_stored()
@@ -71,7 +74,10 @@ def test_stock_nerfstudio_loads_them(config: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("config", ["lifted", pytest.param("trained", marks=pytest.mark.extra)], indirect=True)
 def test_stock_commands_run_on_them(config: Path, tmp_path: Path) -> None:
+    from tests.scripts.test_stock_processes import viewer_page  # noqa: PLC0415
+
     old = tmp_path / "old"
     flags = ("dataset", "--load-config", config.relative_to(old), "--output-path", "out", "--image-format", "png")
     words = [str(Path(sys.executable).with_name("ns-render")), *map(str, flags), "--split", "train"]
@@ -82,7 +88,5 @@ def test_stock_commands_run_on_them(config: Path, tmp_path: Path) -> None:
     for name in ("rgb", "overlay", "relevancy_0"):
         pictures = sorted((old / "out" / "train" / name).iterdir())
         assert len(pictures) == 6
-        assert all(np.asarray(Image.open(path)).std() > 1 for path in pictures), (
-            name
-        )  # two steps of training show little
+        assert all(np.asarray(Image.open(path)).std() > 1 for path in pictures), name  # two steps show little
     assert b"<html" in viewer_page(config.relative_to(old), cwd=old, log=tmp_path / "log")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,16 +19,20 @@ LINE = torch.tensor([255, 176, 0], dtype=torch.uint8)
 
 
 @pytest.fixture(scope="module", params=["evidence", "float16"])
-def run(request, trained: Path, tmp_path_factory) -> nl.LiftedRun:
+def run(request, trained: Path, made_once) -> nl.LiftedRun:
     """A run that holds its evidence, and one that leaves it in the cache."""
-    how = {"source": nl.SourceOptions(encoder="colour"), "lift": nl.LiftOptions(storage=request.param, max_views=6)}
-    return nl.lift_run(trained, **how, output_dir=tmp_path_factory.mktemp(request.param), timestamp="one")
+
+    def make(folder: Path) -> None:
+        how = {"source": nl.SourceOptions(encoder="colour"), "lift": nl.LiftOptions(storage=request.param, max_views=6)}
+        nl.lift_run(trained, **how, output_dir=folder, timestamp="one", check=False)
+
+    return nl.open_run(next(made_once(f"votes-{request.param}", make).glob("*/normlift/one/config.yml")))
 
 
 def test_the_votes_are_those_of_the_lift(run: nl.LiftedRun) -> None:
     """Every scalar of some Gaussians comes out again."""
     seen = (run.field.scalars.norm > 0).nonzero().squeeze(1)
-    for j in seen[:: len(seen) // 20].tolist():
+    for j in seen[:: len(seen) // 8].tolist():
         mask = torch.zeros(len(run.field), dtype=torch.bool)
         mask[j] = True
         why = run.votes.explain(mask, refined=False)
@@ -44,7 +49,11 @@ def test_a_finding_is_explained_with_the_evidence_that_it_copied(run: nl.LiftedR
     assert why.copied == int((red.mask & ~own).sum()) > 0
     assert run.why(run.ask("red", refined=False)).copied == 0
     assert why.c_inter > 0.9
-    assert "The photographs agree" in why.words
+    assert len(why.words) > 0
+    with pytest.raises(nl.InputError, match="part "):
+        run.why("red")  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="nothing is selected"):
+        run.why(torch.zeros(len(run.field), dtype=torch.bool))
 
 
 def test_pictures_outline_what_is_red(run: nl.LiftedRun) -> None:
@@ -67,22 +76,30 @@ def test_what_the_cache_no_longer_holds_is_named(run: nl.LiftedRun, tmp_path: Pa
     if isinstance(run.field.store, StoredEvidence):
         assert votes.explain(mask).views == run.why(run.ask("red")).views
         return
-    with pytest.raises(nl.InputError, match=r"no longer holds the evidence of the lift.*lift again with: ns-normlift"):
+    with pytest.raises(nl.InputError, match=r"emptied/evidence .*ns-normlift"):
         votes.explain(mask)
 
 
-def test_photographs_that_are_gone_or_replaced_are_named(run: nl.LiftedRun, trained: Path, tmp_path: Path) -> None:
+def test_photographs_that_are_gone_replaced_or_unknown_are_named(
+    run: nl.LiftedRun, trained: Path, tmp_path: Path
+) -> None:
+    names = run.field.manifest["views_lifted"]
+    for told, message in ((None, "older version"), ([1], "older version"), ([*names, "x.png"], r"1 of 7 .*x\.png")):
+        other = replace(run.field, manifest={**run.field.manifest, "views_lifted": told})
+        with pytest.raises(nl.InputError, match=message):
+            _ = Votes(run.scene, other, tmp_path).names
     if not isinstance(run.field.store, StoredEvidence):
-        pytest.skip("such a run finds its evidence by the content of the photographs")
+        return  # such a run finds its evidence by the content of the photographs
+    fewer = replace(run.field, manifest={**run.field.manifest, "views_lifted": names[:-1]})
+    with pytest.raises(nl.InputError, match=r" 5 .* 6"):
+        _ = Votes(run.scene, fewer, tmp_path).names
     moved = tmp_path / "room"
     shutil.copytree(trained.parents[4] / "room", moved)
     opened = nl.open_run(run.config, data=moved)
-    why = opened.why(opened.ask("red"))
-    first = why.views[0]
+    first = opened.why(opened.ask("red")).views[0]
     file = moved / opened.votes.names[first.view]
-    size = Image.open(file).size
-    Image.new("RGB", size, "green").save(file)
-    with pytest.raises(nl.InputError, match="no longer has the regions that were lifted"):
+    Image.new("RGB", Image.open(file).size, "green").save(file)
+    with pytest.raises(nl.InputError, match="regions"):
         list(opened.votes.pictures([first]))
     file.unlink()
     with pytest.raises((nl.InputError, FileNotFoundError), match=file.name):
@@ -92,18 +109,11 @@ def test_photographs_that_are_gone_or_replaced_are_named(run: nl.LiftedRun, trai
 def test_features_of_ones_own_have_votes_but_no_pictures(trained: Path, room: DemoRoom, tmp_path: Path) -> None:
     scene = nl.open_scene(trained)
     halves = [(torch.arange(160).expand(120, 160) // 80, torch.eye(2)) for _ in scene.train.names]
-    how = {"lift": nl.LiftOptions(storage="evidence", refine=False), "output_dir": tmp_path}
+    how = {"lift": nl.LiftOptions(storage="evidence", refine=False), "output_dir": tmp_path, "check": False}
     run = nl.lift_run(scene, features=halves, texts={"left": torch.tensor([1.0, 0.0])}, **how)
     found = run.ask("left")
     assert 0 < int(found.mask.sum()) < len(found.mask)  # cosines of an unknown encoder: the threshold is suggested
     why = run.why(found)
     assert {one.region for vote in why.views for one in vote.regions} == {0, 1}
-    with pytest.raises(nl.InputError, match="they were given from Python"):
+    with pytest.raises(nl.InputError, match="Python"):
         list(run.votes.pictures(why.views[:1]))
-
-
-def test_masks_that_are_none(run: nl.LiftedRun) -> None:
-    with pytest.raises(nl.InputError, match="part must be an answer of this run"):
-        run.why("red")  # type: ignore[arg-type]
-    with pytest.raises(nl.InputError, match="nothing is selected"):
-        run.why(torch.zeros(len(run.field), dtype=torch.bool))

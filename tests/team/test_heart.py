@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from normlift_ns.errors import InputError
 from normlift_ns.team import heart as module
-from normlift_ns.team.heart import Heart, Lost
+from normlift_ns.team.heart import PATIENCE, Heart, Lost
 from normlift_ns.team.launch import rank_of, told
 
 
@@ -38,65 +40,99 @@ class Store:
         return int(self.values[key])
 
     def wait(self, keys: list[str], patience: Any) -> None:
-        until = time.monotonic() + patience.total_seconds()
-        while not self.check(keys) and time.monotonic() < until:
-            time.sleep(0.01)
+        until(lambda: self.check(keys))
 
 
-HEARTS: list[Heart] = []
+def until(found: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not found():
+        assert time.monotonic() < end
+        time.sleep(0.001)
 
 
-@pytest.fixture(autouse=True)
-def fast(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """Heartbeats of milliseconds; signals are noted. All hearts are stopped in the end: one that is not ends the
-    process."""
-    sent: list[int] = []
-    monkeypatch.setattr(module, "BEAT", 0.02)
-    monkeypatch.setattr(module, "PATIENCE", 0.4)
-    monkeypatch.setattr("normlift_ns.team.heart.os.kill", lambda pid, number: sent.append(number))
-    yield sent
-    for one in HEARTS:
+class World:
+    """A team, its clock, and what it does to this process."""
+
+    def __init__(self) -> None:
+        self.store, self.hearts, self.now = Store(), [], 0.0
+        self.signals: list[int] = []
+        self.exits: list[int] = []
+        self.words: list[Lost] = []
+        self.threads: list[threading.Thread] = []
+
+    def team(self, size: int) -> list[Heart]:
+        self.hearts = [Heart(self.store, rank, size, self.words.append) for rank in range(size)]
+        for one in self.hearts:
+            before = set(threading.enumerate())
+            one.start()
+            self.threads += set(threading.enumerate()) - before
+        self.pass_by(0)
+        return self.hearts
+
+    def kill(self, rank: int) -> None:
+        """Its heart stands still."""
+        self.hearts[rank]._stop.set()
+        self.threads[rank].join(60)
+        self.pass_by(0)
+
+    def pass_by(self, seconds: float) -> None:
+        """Time passes, and then all who are well have beaten, and have heard all the others."""
+        self.now += seconds
+        for _ in range(2):
+            alive = [f"beat/{one.rank}" for one in self.hearts if not one._stop.is_set() and one.lost is None]
+            before = {key: self.store.values.get(key) for key in alive}
+            until(lambda before=before: all(self.store.values.get(key) != beat for key, beat in before.items()))
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    """All hearts are stopped in the end: one that is not ends the process."""
+    assert (module.BEAT, PATIENCE, module._GRACE) == (2, 30, 10)
+    found = World()
+    monkeypatch.setattr(module, "BEAT", 0.002)
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: found.now))
+    monkeypatch.setattr(os, "kill", lambda pid, number: found.signals.append(number))
+    monkeypatch.setattr(os, "_exit", found.exits.append)
+    yield found
+    for one in found.hearts:
         one._stop.set()
-    HEARTS.clear()
 
 
-def team(size: int) -> tuple[Store, list[Heart]]:
-    store = Store()
-    hearts = [Heart(store, rank, size, lambda lost: None) for rank in range(size)]
-    HEARTS.extend(hearts)
-    for one in hearts:
-        one.start()
-    return store, hearts
-
-
-def test_a_slow_process_is_waited_for(fast: list[int]) -> None:
-    _, hearts = team(3)
-    time.sleep(1)  # more than twice the patience, in which nothing else happens
+def test_a_slow_process_is_waited_for(world: World) -> None:
+    hearts = world.team(3)
+    for _ in range(4):
+        world.pass_by(0.95 * PATIENCE)
     assert [one.lost for one in hearts] == [None] * 3
     for one in reversed(hearts):
         one.stop(well=True)
-    assert fast == []
+    assert world.signals == []
 
 
-def test_a_heartbeat_that_stands_still_is_noticed_by_all_others() -> None:
-    _, hearts = team(3)
-    time.sleep(0.1)
-    hearts[1]._stop.set()  # as if it had been killed
+def test_a_heartbeat_that_stands_still_is_noticed_by_all_others(world: World) -> None:
+    hearts = world.team(3)
+    world.kill(1)
+    hearts[0]._waiting = hearts[2]._waiting = True
+    world.pass_by(0.4 * PATIENCE)
+    world.pass_by(0.5 * PATIENCE)
+    assert hearts[0].lost is hearts[2].lost is None
+    world.now += 0.2 * PATIENCE
     found = [hearts[r].wait_for_a_loss() for r in (0, 2)]
     assert [lost is not None and (lost.rank, lost.failed) for lost in found] == [(1, False)] * 2
-    assert "process" in found[0].place  # type: ignore[union-attr]
+    assert str(os.getpid()) in found[0].place and world.signals == []  # type: ignore[union-attr]
 
 
-def test_one_that_ends_well_is_not_missed(fast: list[int]) -> None:
-    _, hearts = team(2)
+def test_one_that_ends_well_is_not_missed(world: World) -> None:
+    hearts = world.team(2)
     hearts[1].stop(well=True)
-    time.sleep(0.8)
-    assert hearts[0].lost is None and fast == []
+    for _ in range(3):
+        world.pass_by(0.9 * PATIENCE)
+    assert hearts[0].lost is None and world.signals == []
     hearts[0].stop(well=True)
 
 
-def test_one_that_fails_says_so_and_only_the_first_one_speaks() -> None:
-    _, hearts = team(3)
+def test_one_that_fails_says_so_and_only_the_first_one_speaks(world: World) -> None:
+    hearts = world.team(3)
+    hearts[0]._waiting = hearts[1]._waiting = True
     assert hearts[2].stop(well=False)
     for r in (0, 1):
         lost = hearts[r].wait_for_a_loss()
@@ -104,33 +140,36 @@ def test_one_that_fails_says_so_and_only_the_first_one_speaks() -> None:
         assert not hearts[r].stop(well=False)
 
 
-def test_a_process_that_does_not_wait_is_asked_to_end(fast: list[int]) -> None:
-    store, hearts = team(2)
-    hearts[1]._stop.set()
-    store.values["end/1"] = b"failed"
-    time.sleep(0.3)
-    assert fast == [15]
-    hearts[0].stop(well=False)
+def test_a_process_that_does_not_wait_is_asked_to_end_and_then_ended(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_GRACE", 0.01)
+    world.team(2)
+    world.kill(1)
+    world.store.values["end/1"] = b"failed"
+    until(lambda: len(world.exits) > 0)
+    assert (world.signals, world.exits) == ([15], [1])
+    assert [(lost.rank, lost.failed) for lost in world.words] == [(1, True)]
 
 
-def test_a_store_that_is_gone_is_process_0() -> None:
-    store, hearts = team(2)
-    time.sleep(0.1)
-    store.gone = True
+def test_a_store_that_is_gone_is_process_0(world: World) -> None:
+    hearts = world.team(2)
+    hearts[0]._waiting = True
+    world.store.gone = True
     lost = hearts[1].wait_for_a_loss()
-    assert lost is not None and lost.rank == 0
-    assert threading.active_count() < 50
+    assert lost is not None and (lost.rank, lost.failed) == (0, False)
+    assert hearts[1].stop(well=False)  # to nobody
 
 
-@pytest.mark.parametrize("change", [{"RANK": "x"}, {"RANK": "2"}, {"WORLD_SIZE": "-1"}])
-def test_an_environment_that_cannot_be(change: dict[str, str]) -> None:
+def test_an_environment_that_cannot_be() -> None:
     good = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
     assert rank_of(good) == (1, 2)
     assert rank_of(good | {"RANK": "0", "WORLD_SIZE": "1"}) is None
-    with pytest.raises(InputError, match="torchrun"):
-        rank_of(good | change)
+    for change in ({"RANK": "x"}, {"RANK": "2"}, {"RANK": "-1"}, {"WORLD_SIZE": "-1"}):
+        with pytest.raises(InputError, match="torchrun"):
+            rank_of(good | change)
 
 
 def test_what_people_are_told() -> None:
     text = told(Lost(1, False, "there, process 7"))
-    assert text.startswith("Process 1 (there, process 7) is gone") and "start the command again" in text
+    assert "Process 1 (there, process 7)" in text

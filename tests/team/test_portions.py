@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, RefineConfig, consensus, lift, nearest_neighbors
@@ -39,7 +39,6 @@ def world(seed: int) -> tuple[torch.Tensor, Evidence, torch.Tensor]:
 
 
 @given(n=st.integers(0, 70), size=st.integers(1, 5), seed=st.integers(0, 9))
-@settings(max_examples=40, deadline=None)
 def test_everybody_is_of_one_portion(n: int, size: int, seed: int) -> None:
     means = torch.randn(n, 3, generator=generator(seed))
 
@@ -54,8 +53,7 @@ def test_everybody_is_of_one_portion(n: int, size: int, seed: int) -> None:
     assert all(torch.equal(joined, means) for _, joined in found)
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "size"), [(0, 1), (0, 3), (1, 2)])
 def test_evidence_changes_hands(seed: int, size: int) -> None:
     means, evidence, _ = world(seed)
     chunks = [[0], [1, 2], [3], [4]]
@@ -86,6 +84,12 @@ def lifted_by(team: Team, seed: int, vote: str, storage: Storage) -> SemanticFie
     return SemanticField.build_together(lifted, means, copied, portion, **how)
 
 
+def stored(field: SemanticField) -> list[torch.Tensor]:
+    if isinstance(field.store, StoredEvidence):
+        return [getattr(field.store.evidence.rows, name) for name in ("offsets", "column", "weight")]
+    return [field.store.coordinates]
+
+
 @pytest.mark.parametrize(
     ("vote", "storage", "seed"),
     [("posterior", "low_rank", 0), ("paper", "float16", 1), ("posterior", "evidence", 2), ("posterior", "auto", 3)],
@@ -94,7 +98,7 @@ def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
     expected = lifted_by(ALONE, seed, vote, storage)
     assert expected is not None
     assert float((expected.source != torch.arange(N)).float().mean()) > 0.1
-    for size in (2, 3, 13):  # of which some have nothing
+    for size in (2, 13):  # of which some have nothing
         found, *others = together(size, lambda team: lifted_by(team, seed, vote, storage))
         assert others == [None] * (size - 1)
         assert found is not None
@@ -102,13 +106,8 @@ def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
         assert torch.equal(found.source, expected.source)
         for field in fields(Scalars):
             assert torch.equal(getattr(found.scalars, field.name), getattr(expected.scalars, field.name)), field.name
-        if isinstance(expected.store, StoredEvidence):
-            assert isinstance(found.store, StoredEvidence)
-            for name in ("offsets", "column", "weight"):
-                a, b = (getattr(x.store.evidence.rows, name) for x in (found, expected))  # type: ignore[union-attr]
-                assert torch.equal(a, b)
-        else:
-            assert torch.equal(found.store.coordinates, expected.store.coordinates)  # type: ignore[union-attr]
+        for a, b in zip(stored(found), stored(expected)):
+            assert torch.equal(a, b)
 
 
 def test_neighbours_of_some_are_those_of_all() -> None:

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[2]
-INSTANTS = int(os.environ.get("NORMLIFT_TORTURE", "10"))
-"""At which processes are killed, per command; make torture sets 40."""
+INSTANTS = int(os.environ.get("NORMLIFT_TORTURE", "2"))
+"""At which processes are killed, per command; make torture sets 40. With few, all else that is tried is short too."""
+SHORT = INSTANTS < 10
 ROW = "row of docs/reliability.md"
 """Under which a test keeps its rows; they reach the table from any process that runs tests."""
 Record = Callable[[str, object, str], None]

@@ -19,6 +19,7 @@ from normlift_ns.encoders.cache import _read, _write
 from normlift_ns.errors import InputError
 from normlift_ns.front_door import lift_run, open_run
 from normlift_ns.lifted_run import LiftedRun
+from tests.core.test_digests import flipped
 
 KEPT = {"regions": "labels", "features": "features", "texts": "text"}
 """Folders of the cache, and the tensor in their files."""
@@ -49,12 +50,6 @@ def main(folder: Path, seed: int, count: int, output: Path) -> None:
         found[kind(path, runs)][outcome] += 1
         path.write_bytes(whole)
     output.write_text(json.dumps(found))
-
-
-def flipped(content: bytes, bit: int) -> bytes:
-    changed = bytearray(content)
-    changed[bit // 8] ^= 1 << bit % 8
-    return bytes(changed)
 
 
 def kind(path: Path, runs: Path) -> str:

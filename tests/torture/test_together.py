@@ -1,4 +1,4 @@
-"""Eight processes at once on one capture: no run is lost, and no files of two of them are mixed."""
+"""Eight processes, or two, at once on one capture: no run is lost, and no files of two of them are mixed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import Any
 
 import pytest
 
-from tests.torture.conftest import Record, Server
+from tests.torture.conftest import SHORT, Record, Server
 from tests.torture.test_kills import Place, differing, tree, without_cache
 
-pytestmark = pytest.mark.slow
-
-EIGHT = 8
-TEXTS = ("red", "yellow", "blue", "green", "white", "brown", "black", "orange")
+EIGHT = 2 if SHORT else 8
+TEXTS = ("red", "yellow", "blue", "green", "white", "brown", "black", "orange")[:EIGHT]
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +38,7 @@ def answers(place: Place, run: Path) -> Any:
     return json.loads(output.read_text())
 
 
+@pytest.mark.extra
 def test_lifts_with_default_names_all_succeed(place: Place, tmp_path: Path, record: Record) -> None:
     place.restore()
     lifts = [place.lift("--queries", text, "--k", 6) for text in TEXTS]
@@ -52,20 +51,22 @@ def test_lifts_with_default_names_all_succeed(place: Place, tmp_path: Path, reco
     expected = answers(place, place.runs / "one")
     assert all(answers(place, run) == expected for run in runs)
     assert list(place.folder.rglob(".normlift-*")) == []
-    record("8 lifts at once, default names", EIGHT, f"{EIGHT} runs, all whole")
+    record(f"{EIGHT} lifts at once, default names", EIGHT, f"{EIGHT} runs, all whole")
 
 
+@pytest.mark.slow
 def test_of_lifts_with_one_name_one_succeeds(place: Place, tmp_path: Path, record: Record) -> None:
     place.restore()
     codes, logs = together(place, tmp_path, *(place.lift("--timestamp", "two", "--queries", text) for text in TEXTS))
     assert sorted(codes) == [0] + [1] * (EIGHT - 1), logs
     refused = [log for code, log in zip(codes, logs) if code == 1]
-    assert all("two exists; give another --timestamp" in log for log in refused), refused
+    assert all("two exists" in log and "--timestamp" in log for log in refused), refused
     answers(place, place.runs / "two")
     assert sorted(path.name for path in place.runs.iterdir()) == [".cache", "one", "two"]
-    record("8 lifts at once, one `--timestamp`", EIGHT, f"1 run, whole; {EIGHT - 1} refused by name")
+    record(f"{EIGHT} lifts at once, one `--timestamp`", EIGHT, f"1 run, whole; {EIGHT - 1} refused by name")
 
 
+@pytest.mark.extra
 def test_lifts_that_replace_one_run_leave_one_whole(place: Place, tmp_path: Path, record: Record) -> None:
     replaced = [place.lift("--timestamp", "one", "--k", k, "--queries", text, "--overwrite", True)
                 for k, text in ((6, "yellow"), (9, "blue"))]  # fmt: skip
@@ -79,7 +80,7 @@ def test_lifts_that_replace_one_run_leave_one_whole(place: Place, tmp_path: Path
     assert codes == [0] * EIGHT, logs
     found = without_cache(tree(place.runs))
     assert [] in [differing(found, whole) for whole in known]
-    record("8 lifts at once, `--overwrite True` of one run", EIGHT, "1 run, equal to that of one of them")
+    record(f"{EIGHT} lifts at once, `--overwrite True` of one run", EIGHT, "1 run, equal to that of one of them")
 
 
 def export(place: Place, text: str, *flags: object) -> tuple[object, ...]:
@@ -87,6 +88,7 @@ def export(place: Place, text: str, *flags: object) -> tuple[object, ...]:
     return (*words, "--output-dir", place.folder / "out", *flags)
 
 
+@pytest.mark.extra
 def test_exports_never_mix(place: Place, tmp_path: Path, record: Record) -> None:
     known = []
     for text in TEXTS[:2]:
@@ -101,11 +103,16 @@ def test_exports_never_mix(place: Place, tmp_path: Path, record: Record) -> None
     place.restore()
     codes, logs = together(place, tmp_path, *(export(place, TEXTS[i % 2]) for i in range(EIGHT)))
     assert sorted(codes) == [0] + [1] * (EIGHT - 1), logs
-    assert all("exists; give another" in log for code, log in zip(codes, logs) if code == 1), logs
+    assert all("exists" in log for code, log in zip(codes, logs) if code == 1), logs
     assert tree(place.folder / "out") in known
-    record("8 exports at once into one folder, with and without `--overwrite True`", 2 * EIGHT, "files of one of them")
+    record(
+        f"{EIGHT} exports at once into one folder, with and without `--overwrite True`",
+        2 * EIGHT,
+        "files of one of them",
+    )
 
 
+@pytest.mark.extra
 def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record: Record) -> None:
     def save(text: str) -> tuple[object, ...]:
         return ("query", "--load-config", place.config, "--text", text, "--save", True)
@@ -122,8 +129,10 @@ def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record:
     place.restore()
     mixed = [*(place.lift("--k", 6) for _ in range(3)), *(export(place, "red", "--overwrite", True) for _ in range(3))]
     codes, logs = together(place, tmp_path, *mixed, save(TEXTS[0]), save(TEXTS[1]))
-    assert codes == [0] * EIGHT, logs
+    assert set(codes) == {0}, logs
     assert len(list(place.runs.glob("[!.]*"))) == 4
     assert tree(place.config.parent) in known
     assert len(tree(place.folder / "out")) == 4
-    record("8 saves at once; 3 lifts, 3 exports and 2 saves at once", 2 * EIGHT, "the question of one; no run lost")
+    record(
+        f"{EIGHT} saves at once; 3 lifts, 3 exports and 2 saves at once", 2 * EIGHT, "the question of one; no run lost"
+    )
