@@ -20,8 +20,6 @@ from hypothesis import strategies as st
 from normlift_ns import InputError
 from tests.examples import examples
 
-EXAMPLES = [pytest.param(10, id="few")]
-"""How many files a loader is tried on: `@pytest.mark.parametrize("examples", EXAMPLES)`."""
 VALUES: list[Any] = [
     None, True, False, 0, -1, 1, 2**31, 2**63, 2**64, 10**40, -(10**40), 10**400, 0.5, -0.0, 1e308, 1e-320, "", " ",
     "0", "1", "false", "nan", "a\0b", "\ud800", "[/red]", "$\\frac{$", "../x", "/", "\n", "x" * 5000, [], {}, [[]],
