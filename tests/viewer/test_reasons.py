@@ -17,9 +17,8 @@ from normlift_ns.runs.votes import Picture
 from normlift_ns.session import actions
 from normlift_ns.session.state import State
 from normlift_ns.viewer.reasons import Reasons, reasons_mdx
-from tests.session.worlds import BLOCK, cubes, rows
+from tests.session.worlds import BLOCK, rows, world
 
-SPACE = cubes()
 NAMES = ("a/[x](y).png", "b.png", "c.png", "d.png", "e.png")
 
 
@@ -73,25 +72,20 @@ def test_names_are_text():
     assert not any(set("[]()/") & set(line) for line in found)
 
 
-@pytest.mark.parametrize("problem", [InputError("they were given from Python"), FileNotFoundError("b.png is missing")])
-def test_pictures_that_cannot_be_had_are_no_reason_to_say_nothing(problem):
-    text = html.unescape(told(FakeVotes(problem), 0))
-    assert f"The photographs cannot be shown: {problem}" in text
-    assert "33% of the weight" in text
-    assert "data:image" not in text
-
-
-def test_a_selection_of_nothing_is_an_error():
-    reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
-    state = State(SPACE)
-    with pytest.raises(InputError, match="nothing is selected"):
-        reasons.find(reasons.start(state), state)
-    assert (reasons.content, reasons.busy) == ("", "")
+def test_pictures_that_cannot_be_had_are_no_reason_to_say_nothing():
+    for problem in (InputError("they were given from Python"), FileNotFoundError("b.png is missing")):
+        text = html.unescape(told(FakeVotes(problem), 0))
+        assert f": {problem}" in text
+        assert "33% of the weight" in text
+        assert "data:image" not in text
 
 
 def test_reasons_belong_to_their_selection():
     reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
-    state = actions.select(State(SPACE), rows(0))
+    with pytest.raises(InputError, match="nothing is selected"):
+        reasons.find(reasons.start(State(world())), State(world()))
+    assert (reasons.content, reasons.busy) == ("", "")
+    state = actions.select(State(world()), rows(0))
     reasons.find(reasons.start(state), state)
     assert "These weigh most" in reasons.content
     reasons.follow(actions.hide(state))  # the selection is the same
@@ -113,7 +107,7 @@ def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
             return super().explain(selected, refined=refined)
 
     reasons = Reasons(Slow)  # type: ignore[arg-type]
-    state, raised = actions.select(State(SPACE), rows(0)), []
+    state, raised = actions.select(State(world()), rows(0)), []
 
     def find() -> None:
         try:
