@@ -12,7 +12,7 @@ import pytest
 
 from tests.browser.own_viewer import Own
 from tests.browser.person import chromium
-from tests.browser.server import OWN, STOCK, Server, faults
+from tests.browser.server import OWN, STOCK, Server, copied, faults
 from tests.browser.viewer import Tab
 
 if TYPE_CHECKING:
@@ -48,9 +48,7 @@ def own_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 def served(program: str, config: Path, folder: Path) -> Iterator[Server]:
     """A server of a copy of a run, which has printed no traceback in the end."""
-    shutil.copytree(config.parents[3], folder / "outputs")
-    copy = folder / "outputs" / config.relative_to(config.parents[3])
-    server = Server(program, copy, folder / "viewer.log", cwd=folder)
+    server = Server(program, copied(config, folder), folder / "viewer.log", cwd=folder)
     yield server
     server.stop()
     assert faults(server.said()) == []

@@ -28,7 +28,7 @@ PANEL = 320
 """Width of viser's control panel in pixels."""
 COARSE = 0.4
 """Pixels of a picture per pixel of the page: enough for the tests, and quick."""
-RED, YELLOW, BLUE, PURPLE = ((0, 0.9), (1 / 6, 0.8), (0.6, 0.85), (0.79, 0.6))
+RED, YELLOW, BLUE = ((0, 0.9), (1 / 6, 0.8), (0.6, 0.85))
 """Hue (in turns) and least saturation of things in the room, as they are drawn."""
 _UNHURRIED = """
 const [soon, never, waiting] = [requestAnimationFrame, cancelAnimationFrame, new Map()];

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -83,6 +84,12 @@ class Server:
         finally:
             self.stop()
         assert faults(self.said()) == []
+
+
+def copied(config: Path, folder: Path) -> Path:
+    """config.yml of a copy of a run, with all runs beside it."""
+    shutil.copytree(config.parents[3], folder / "outputs")
+    return folder / "outputs" / config.relative_to(config.parents[3])
 
 
 def faults(log: str) -> Sequence[str]:

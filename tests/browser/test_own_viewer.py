@@ -11,7 +11,7 @@ from plyfile import PlyData
 
 from normlift_ns.runs.question import load_question
 from tests.browser.own_viewer import ARMED, Own
-from tests.browser.person import PURPLE, RED, changed, coloured, hue_mask, iou, middle, needs_chromium
+from tests.browser.person import RED, YELLOW, changed, coloured, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
 
 if TYPE_CHECKING:
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.slow, needs_chromium]
 
 
-def red_and_purple(page: Own) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def red_and_yellow(page: Own) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The picture once the room is drawn, and where two of its things are."""
-    photo = page.sees(lambda seen: min(hue_mask(seen, *rule).sum() for rule in (RED, PURPLE)) > 1000, "the room")
-    return photo, hue_mask(photo, *RED), hue_mask(photo, *PURPLE)
+    photo = page.sees(lambda seen: min(hue_mask(seen, *rule).sum() for rule in (RED, YELLOW)) > 1000, "the room")
+    return photo, hue_mask(photo, *RED), hue_mask(photo, *YELLOW)
 
 
 def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictures: Path, tmp_path: Path) -> None:
-    _, red, purple = red_and_purple(page)
-    page.ask("red, zebra; purple", key=True)
+    _, red, yellow = red_and_yellow(page)
+    page.ask("red, zebra; yellow", key=True)
     both = page.selects(lambda count: count > 0, "an answer")
     page.says(r"⚠\s+zebra")
-    overlay = page.sees(lambda seen: iou(coloured(seen), red | purple) > 0.75, "an overlay of both")
+    overlay = page.sees(lambda seen: iou(coloured(seen), red | yellow) > 0.75, "an overlay of both")
     page.page.screenshot(path=pictures / "view_asked.png")
     page.type("Threshold", "0.97")
     page.selects(lambda count: count < both, "a higher threshold selects less")
@@ -41,12 +41,12 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictur
     page.arm("Select")
     page.press("Cancel")
     page.until(lambda: ARMED not in page.text(), "cancelled")
-    page.click(middle(purple))  # does nothing, or there would be one more to undo below
+    page.click(middle(yellow))  # does nothing, or there would be one more to undo below
     page.arm("Select")
     page.click(middle(red))
     ball = page.selects(lambda count: 0 < count < both, "the connected object")
     page.arm("Add")
-    page.click(middle(purple))
+    page.click(middle(yellow))
     page.selects(lambda count: count > ball, "added")
     page.page.keyboard.press("Escape")
     page.until(lambda: ARMED not in page.text(), "Escape ends it")
@@ -58,16 +58,40 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictur
 
     page.press("Hide")
     page.sees(lambda seen: hue_mask(seen, *RED).sum() < 50, "the ball is hidden")
-    page.ask("purple")
-    page.says("purple object 1")
+    page.ask("yellow")
+    page.says("yellow object 1")
     page.press("Hide")
-    page.sees(lambda seen: coloured(seen)[red | purple].mean() < 0.05, "both stay hidden")
+    page.sees(lambda seen: coloured(seen)[red | yellow].mean() < 0.05, "both stay hidden")
     page.page.screenshot(path=pictures / "view_hidden.png")
     for _ in range(3):
         page.press("Undo")
     page.selects(lambda count: count == ball, "hides undone")
 
-    page.ask("red, purple")
+    page.page.get_by_text("Box", exact=True).click()
+    bare = page.sees(lambda seen: coloured(seen)[yellow].mean() < 0.05, "only the ball is coloured")
+    page.press("Around")
+
+    def outlined(seen: np.ndarray) -> bool:
+        line = np.abs(seen.astype(int) - bare).max(axis=2) > 60
+        return 200 < line.sum() < 0.1 * line.size and bool((np.diff(seen[line].mean(axis=0)) < -30).all())  # orange
+
+    page.sees(outlined, "the outline of the box")
+    page.press("Outside")
+    page.selects(lambda count: count == 0, "cut")
+    page.press("None")
+    page.selects(lambda count: count == ball, "whole again")
+
+    page.ask("red, maroon")
+    page.until(lambda: page.images("svg") == 2, "two histograms")
+    page.press("Why?")
+    page.until(lambda: page.images("jpeg") >= 3, "photographs")
+    page.press("Go to nearest: maroon")
+    page.sees(lambda seen: changed(seen, overlay) > 3, "the camera is there")
+    page.press("Select likely floaters")
+    page.until(lambda: page.images("jpeg") == 0, "the reasons of another selection are gone")
+    page.selects(lambda count: count > 0, "floaters")
+    page.page.screenshot(path=pictures / "view_floaters.png")
+    page.ask("red, yellow")
     page.says("red object 1")
     page.press("go to")
     near = page.sees(lambda seen: changed(seen, overlay) > 3, "the camera has moved")
@@ -89,50 +113,15 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictur
     page.until(lambda: page.text().count("■") >= 2, "the click is asked again")
 
 
-def test_a_person_asks_why_and_takes_floaters_away(own: Server, browser: Browser, pictures: Path) -> None:
-    page = Own(browser, own.address, (960, 1400))
-    page.ask("red, maroon")
-    both = page.selects(lambda count: count > 0, "an answer")
-    page.until(lambda: page.images("svg") == 2, "two histograms")
-    page.press("Suggested")
-    page.selects(lambda count: count != both, "another threshold")
-    page.press("Undo")
-    page.selects(lambda count: count == both, "undone")
-    page.press("Why?")
-    page.until(lambda: page.images("jpeg") >= 3, "photographs")
-    page.page.screenshot(path=pictures / "view_why.png")
-    photo = page.sees(lambda seen: coloured(seen).sum() > 500, "an overlay")
-    page.press("Select likely floaters")
-    page.until(lambda: page.images("jpeg") == 0, "the reasons of another selection are gone")
-    page.selects(lambda count: 0 < count < 1500 and count != both, "floaters")
-    page.sees(lambda seen: coloured(seen).sum() > 20 and changed(seen, photo) > 0.05, "floaters are drawn")
-    page.page.screenshot(path=pictures / "view_floaters.png")
-    page.press("Hide")
-    page.sees(lambda seen: changed(seen, photo) > 0.05, "floaters are hidden")
-    page.press("Undo")
-    page.press("Undo")
-    page.selects(lambda count: count == both, "floaters are back")
-
-    page.ask("maroon")
-    page.until(lambda: page.images("svg") == 1, "one prompt, one histogram")
-    before = page.sees(lambda seen: coloured(seen).sum() < 50, "nothing is found")
-    page.page.screenshot(path=pictures / "view_absent.png")
-    page.press("Go to nearest: maroon")
-    page.sees(lambda seen: changed(seen, before) > 3, "the camera is there")
-    page.ask("red")
-    page.until(lambda: page.button("Go to nearest: maroon").count() == 0, "red is there")
-    page.leave()
-
-
 def test_browsers_have_their_own_questions_and_outlive_the_server(
     own: Server, browser: Browser, pictures: Path
 ) -> None:
     one, two = Own(browser, own.address), Own(browser, own.address)
     one.ask("red")
-    two.ask("purple, teal")
+    two.ask("yellow, teal")
     red = one.selects(lambda count: count > 0, "one asks")
     teal = two.selects(lambda count: count not in (0, red), "two asks something else")
-    assert "purple" not in one.text()
+    assert "yellow" not in one.text()
     one.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
     one.press("Hide")
     one.sees(lambda seen: coloured(seen).sum() < 50, "hidden")
@@ -146,7 +135,7 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(
         one.sees(lambda seen, hides=hides: (coloured(seen).sum() < 50) == hides, f"history comes back too: {button}")
 
     two.arm("More like this")
-    two.click(middle(hue_mask(two.shot(), *PURPLE)))
+    two.click(middle(hue_mask(two.shot(), *YELLOW)))
     two.until(lambda: two.typed("Prompts") == "like click 1" and two.selected() not in (-1, teal), "what is like it")
     alike = two.selected()
     two.press("Save prompts in run")
@@ -188,25 +177,25 @@ def test_a_phone(own: Server, browser: Browser, pictures: Path) -> None:
 def test_a_browser_without_webgl_gets_pictures_from_the_server(
     page: Own, own: Server, browser: Browser, pictures: Path
 ) -> None:
-    _, *drawn = red_and_purple(page)
+    _, *drawn = red_and_yellow(page)
     assert page.page.locator("#normlift_still").count() == 0
     blind = Own(browser, own.address, webgl=False)
     blind.says("no WebGL 2")
     blind.until(lambda: blind.page.locator("#normlift_still").count() == 1, "a picture")
 
     def as_drawn(seen: np.ndarray) -> bool:
-        return all(iou(mask, hue_mask(seen, *rule)) > 0.8 for mask, rule in zip(drawn, (RED, PURPLE)))
+        return all(iou(mask, hue_mask(seen, *rule)) > 0.8 for mask, rule in zip(drawn, (RED, YELLOW)))
 
     photo = blind.sees(as_drawn, "what the browser draws")
     blind.page.screenshot(path=pictures / "view_without_webgl.png")
-    red, purple = hue_mask(photo, *RED), hue_mask(photo, *PURPLE)
+    red, yellow = hue_mask(photo, *RED), hue_mask(photo, *YELLOW)
     blind.ask("red", key=True)
     blind.sees(lambda seen: iou(coloured(seen), red) > 0.7, "an overlay")
     blind.arm("Select")
-    blind.click(middle(purple))
-    blind.sees(lambda seen: iou(coloured(seen), purple) > 0.7, "the other object")
+    blind.click(middle(yellow))
+    blind.sees(lambda seen: iou(coloured(seen), yellow) > 0.7, "the other object")
     blind.press("Hide")
-    before = blind.sees(lambda seen: hue_mask(seen, *PURPLE).sum() < 50, "hidden")
+    before = blind.sees(lambda seen: hue_mask(seen, *YELLOW).sum() < 50, "hidden")
     blind.drag(80, 20)
     blind.sees(lambda seen: changed(seen, before) > 3, "the camera has turned")
     blind.page.screenshot(path=pictures / "view_without_webgl_turned.png")
@@ -214,7 +203,7 @@ def test_a_browser_without_webgl_gets_pictures_from_the_server(
 
 
 def test_held_keys_add_and_take_away(page: Own, pictures: Path) -> None:
-    _, red, purple = red_and_purple(page)
+    _, red, yellow = red_and_yellow(page)
 
     def click_holding(key: str, mask: np.ndarray) -> None:
         page.page.keyboard.down(key)
@@ -225,9 +214,9 @@ def test_held_keys_add_and_take_away(page: Own, pictures: Path) -> None:
 
     click_holding("Shift", red)
     ball = page.selects(lambda count: count > 0, "the ball")
-    click_holding("Shift", purple)
+    click_holding("Shift", yellow)
     both = page.selects(lambda count: count > ball, "both")
-    page.sees(lambda seen: iou(coloured(seen), red | purple) > 0.6, "an overlay of both")
+    page.sees(lambda seen: iou(coloured(seen), red | yellow) > 0.6, "an overlay of both")
     page.page.screenshot(path=pictures / "view_shift.png")
     click_holding("Alt", red)
     page.selects(lambda count: count == both - ball, "the ball is taken away")
@@ -247,34 +236,3 @@ SESSION = """() => new Promise((done) => setTimeout(() => {
   done(row.querySelector("input").value);
 }))"""
 """What the page has told the server of itself, after what waits for a moment."""
-
-
-def test_a_box_is_drawn_and_cuts(page: Own, pictures: Path) -> None:
-    page.ask("purple")
-    whole = page.selects(lambda count: count > 0, "an answer")
-    bare = page.sees(lambda seen: coloured(seen).sum() > 500, "an overlay")
-    page.page.get_by_text("Box", exact=True).click()
-    page.press("Around")
-
-    def line_in(seen: np.ndarray) -> np.ndarray:
-        return np.abs(seen.astype(int) - bare).max(axis=2) > 60
-
-    boxed = page.sees(lambda seen: line_in(seen).sum() > 200, "the outline")
-    page.page.screenshot(path=pictures / "view_box.png")
-    line = line_in(boxed)
-    red, green, blue = boxed[line].mean(axis=0)
-    assert line.sum() < 0.1 * line.size and red > green + 30 > blue + 60
-    assert page.selected() == whole
-    (top, bottom), (left, right) = ((np.nonzero(line)[i].min(), np.nonzero(line)[i].max()) for i in (0, 1))
-    inside = coloured(bare)[top : bottom + 1, left : right + 1]
-    assert inside.sum() > 0.95 * coloured(bare).sum()
-
-    row = page.page.get_by_text("Size", exact=True).locator("xpath=ancestor::*[.//input][1]")
-    height = row.locator("input").last
-    with page.sending():
-        height.fill(f"{float(height.input_value()) / 2:.3f}")
-    page.press("Inside")
-    page.selects(lambda count: 0 < count < whole, "cut")
-    page.press("None")
-    page.selects(lambda count: count == whole, "whole again")
-    page.sees(lambda seen: changed(seen, bare) < 1, "the picture as before")
