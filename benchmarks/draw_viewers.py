@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Page
 
 from benchmarks.plots import DOCS
 from tests.browser.own_viewer import Own, own_viewer
-from tests.browser.person import PANEL, chromium
+from tests.browser.person import PANEL, chromium, coloured
 from tests.browser.viewer import TITLE, Tab, ns_viewer
 
 CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
@@ -40,7 +40,7 @@ def own(browser: Browser, address: str) -> None:
     page = Own(browser, address, size=(1200, 640), sharpness=1)
     page.ask(OWN)
     page.selects(lambda count: count > 0, "an answer")
-    page.sees(lambda _: True, "an overlay")
+    page.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
     shot(page.page, "viewer_own")
 
 
@@ -50,7 +50,7 @@ def stock(browser: Browser, address: str) -> None:
     tab.fresh()
     tab.asks(STOCK, answered=2)
     tab.show("overlay")
-    tab.sees(lambda _: True, "an overlay")
+    tab.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
     shot(tab.page, "viewer_overlay")
     tab.press("Clear")
     tab.show("rgb")
@@ -59,7 +59,7 @@ def stock(browser: Browser, address: str) -> None:
     tab.selects(lambda count: count > 0, "clicked")
     tab.press("Only")
     tab.show("rgb")
-    tab.sees(lambda _: True, "one thing")
+    tab.sees(lambda seen: (seen.std(axis=2) < 20).mean() > 0.7, "one thing before the background")
     shot(tab.page, "viewer_isolated")
 
 

@@ -238,7 +238,7 @@ def test_everything_by_buttons(crowd):
         page.says(message)
 
 
-def test_the_histogram_and_the_suggested_threshold(crowd):
+def test_histograms_floaters_and_reasons_belong_to_what_is_selected(crowd, run):
     page = opened(crowd)
     page.asks("red, blue", 3 * BLOCK)
     page.until(lambda: page.drawings("svg") == 2)
@@ -254,29 +254,6 @@ def test_the_histogram_and_the_suggested_threshold(crowd):
     page.press("Suggested")
     page.says("no threshold")
 
-
-def test_floaters_are_selected_hidden_and_brought_back(crowd, run):
-    page = opened(crowd)
-    page.asks("blue", BLOCK)
-    vars(run)["floaters"] = rows(0, 3)
-    page.press("Select likely floaters")
-    page.selects(2 * BLOCK)
-    page.press("Selection", "Hide")
-    page.draws(2 * BLOCK)
-    page.press("History", "Undo")
-    page.draws(4 * BLOCK)
-    page.press("History", "Undo")
-    page.selects(BLOCK)
-    vars(run)["floaters"] = rows()
-    page.press("Select likely floaters")
-    page.says("no likely floaters")
-    page.until(lambda: not page.gui["Ask"].disabled)
-    del vars(run)["floaters"]
-    assert torch.equal(run.floaters, find_floaters(run.scene.gaussians, run.space.field.scalars).mask)
-
-
-def test_why_is_told_and_belongs_to_the_selection(crowd, run):
-    page = opened(crowd)
     page.asks("blue", BLOCK)
     page.press("Why?")
     page.says("without the photographs")
@@ -286,11 +263,26 @@ def test_why_is_told_and_belongs_to_the_selection(crowd, run):
     page.press("Selection", "Hide")
     page.draws(3 * BLOCK)
     assert page.drawings("jpeg") == 3
-    page.ask("red")
+    page.press("Selection", "Unhide")
+    vars(run)["floaters"] = rows(0, 3)
+    page.press("Select likely floaters")
+    page.selects(2 * BLOCK)
     page.until(lambda: page.drawings("jpeg") == 0)
+    page.press("Selection", "Hide")
+    page.draws(2 * BLOCK)
+    for _ in range(2):
+        page.press("History", "Undo")
+    page.draws(4 * BLOCK)
+    page.selects(BLOCK)
+    vars(run)["floaters"] = rows()
+    page.press("Select likely floaters")
+    page.says("no likely floaters")
+    page.until(lambda: not page.gui["Ask"].disabled)
     page.asks("green", 0)
     page.press("Why?")
     page.says("nothing is selected")
+    del vars(run)["floaters"]
+    assert torch.equal(run.floaters, find_floaters(run.scene.gaussians, run.space.field.scalars).mask)
 
 
 def test_a_box_cuts_and_is_drawn(crowd, run):
