@@ -18,7 +18,7 @@ from msgspec import structs
 from normlift_ns.insight.floaters import find_floaters
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.runs.question import load_question
-from normlift_ns.viewer import painter
+from normlift_ns.viewer import painter, person
 from normlift_ns.viewer.links import View, read_link, write_link
 from normlift_ns.viewer.people import People
 from normlift_ns.viewer.shared import Run
@@ -32,7 +32,7 @@ class Widget:
 
     def __init__(self, label: str, value: Any) -> None:
         self.label, self._value, self.disabled, self.visible, self.content = label, value, False, True, ""
-        self.options, self.removed, self._told, self.order = (), False, [], 0.0
+        self.options, self.range, self.removed, self._told, self.order = (), (), False, [], 0.0
         self._impl = SimpleNamespace(value="")
 
     @property
@@ -72,6 +72,7 @@ class Gui:
             first = 0 if name in ("add_text", "add_vector3") else 3 if name == "add_slider" else 1
             widget = Widget(label, options.get("initial_value", rest[first] if len(rest) > first else None))
             widget.options = rest[0] if name in ("add_dropdown", "add_button_group") else ()
+            widget.range = rest if name == "add_slider" else ()
             widget.content, widget.visible = label, options.get("visible", True)
             self.made.append(widget)
             return widget
@@ -199,6 +200,22 @@ def ray(run: Run, gaussian: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """That of a click on a Gaussian, from above."""
     place = run.records.units.to_browser(run.space.means[gaussian].numpy())
     return tuple(place + np.array([0, 0, 5.0])), (0.0, 0.0, -1.0)
+
+
+def test_a_page_begins_at_the_first_photograph_with_the_defaults_even_if_it_never_says_its_token(
+    crowd, run, monkeypatch
+):
+    monkeypatch.setattr(person, "_PATIENCE", 0.01)
+    crowd.come(page := FakePage(0))  # type: ignore[arg-type]
+    page.draws(4 * BLOCK)
+    assert {w.label: w.range for w in page.gui.made if w.range} == {
+        "Threshold": (-0.2, 1.0, 0.005, 0.5), "Reliability": (0.0, 1.0, 0.01, 0.0), "Grow": (-10, 10, 1, 0),
+    }  # fmt: skip
+    np.testing.assert_allclose(run.records.units.to_scene(page.camera.position), [0, 0, 0], atol=1e-6)
+    ahead = run.records.units.to_scene(page.camera.look_at)
+    assert ahead[2] > 0 and ahead[:2] == pytest.approx([0, 0], abs=1e-6)
+    assert page.camera.fov == pytest.approx(max(0.3, 2 * np.arctan(12 / 2 / 50)))
+    np.testing.assert_array_equal(page.camera.up_direction, [0, -1, 0])
 
 
 def test_everything_by_buttons(crowd):
@@ -334,6 +351,10 @@ def test_clicks_are_armed_cancelled_and_asked_again(crowd, run):
     page.selects(BLOCK)
     page.press("Save prompts in run")
     page.says("one prompt")
+    page.press("Link")
+    page.until(lambda: page.link != "")
+    link = read_link(page.link)
+    assert link is not None and link.clicks == {"like click 1": BLOCK + 7}  # the uppermost
     again = opened(crowd, 1, "another")
     again.until(lambda: again.gui["Prompts"].value == "like click 1")
     again.press("Ask")
@@ -365,17 +386,17 @@ def test_objects_and_nearest_matches_have_buttons(crowd, run):
     page.press("Selection", "Unhide")
     page.draws(4 * BLOCK)
 
-    person, place = crowd._here[0], (1.0, 2.0, 3.0)
-    person._panel.judge("", [SimpleNamespace(text="zebra", nearest=place), SimpleNamespace(text="red", nearest=None)])
+    panel, place = crowd._here[0]._panel, (1.0, 2.0, 3.0)
+    panel.judge("", [SimpleNamespace(text="zebra", nearest=place), SimpleNamespace(text="red", nearest=None)])
     before = page.camera.position
     page.press("Go to nearest: zebra")
     page.until(lambda: page.camera.position is not before)
     np.testing.assert_allclose(run.records.units.to_scene(page.camera.look_at), place, atol=1e-6)
-    person._panel.judge("", [])
+    panel.judge("", [])
     assert not any(w.label.startswith("Go to") and not w.removed for w in page.gui.made)
 
 
-def test_every_page_has_its_own_question_and_gets_it_back(crowd):
+def test_every_page_has_its_own_question_and_gets_it_back(crowd, monkeypatch):
     one, two = opened(crowd), opened(crowd, 1, "two")
     one.asks("red", 2 * BLOCK)
     two.asks("blue", BLOCK)
@@ -399,6 +420,11 @@ def test_every_page_has_its_own_question_and_gets_it_back(crowd):
     gone.gone = True
     crowd.come(gone)  # type: ignore[arg-type]
     assert sorted(crowd._here) == [1, 2, 3]
+    monkeypatch.setattr("normlift_ns.viewer.people.MOST_KEPT", 1)
+    for number in (3, 1):
+        crowd.go(number)
+    opened(crowd, 5, "another")
+    assert copy.token in crowd._memories and "two" not in crowd._memories  # who came last is remembered
 
 
 def test_a_link_carries_question_and_camera(crowd):
@@ -430,12 +456,12 @@ def test_a_slow_page_gets_the_last_picture_and_not_all_of_them(crowd):
     page = opened(crowd)
     page.asks("red", 2 * BLOCK)
     page.draws(4 * BLOCK)
-    drawn, draw, person = [], page.draw, crowd._here[0]
+    drawn, draw, state = [], page.draw, lambda: crowd._here[0].state
     page.draw = lambda buffer: drawn.append(len(buffer)) or draw(buffer)  # type: ignore[method-assign]
     page.slow = True
     for deed in ("Hide", "Unhide", "Only"):
         page.press("Selection", deed)
-    page.until(lambda: int(person.state.drawn.sum()) == 2 * BLOCK and "Only" in person.state.did)
+    page.until(lambda: int(state().drawn.sum()) == 2 * BLOCK and "Only" in state().did)
     looks = page.looks
     page.until(lambda: page.looks > looks + 2)
     assert drawn == []
@@ -490,7 +516,6 @@ def test_a_readonly_page_writes_nothing(crowd, run, monkeypatch):
 
 def test_a_late_answer_is_dropped_and_what_fails_is_told(crowd, run):
     page = opened(crowd)
-    person = crowd._here[0]
     for button in ("Save prompts in run", "Download selection"):
         page.press(button)
         page.says("there is nothing to ")
@@ -504,7 +529,8 @@ def test_a_late_answer_is_dropped_and_what_fails_is_told(crowd, run):
     page.asks("red", 2 * BLOCK)
     page.ask("blue")
     page.until(lambda: not page.gui["Ask"].disabled)
-    assert person.state.question is not None and person.state.question.texts == ("red",)
+    question = crowd._here[0].state.question
+    assert question is not None and question.texts == ("red",)
 
     def gone(_):
         raise FileNotFoundError("the weights are gone")

@@ -6,12 +6,13 @@ from scipy.spatial.transform import Rotation
 
 from normlift_ns import GaussianScene
 from normlift_ns.session import actions
+from normlift_ns.session.colours import prompt_colours
 from normlift_ns.session.prompts import pose, read_prompts
 from normlift_ns.session.state import State
 from normlift_ns.viewer.adapter import _unpacked
 from normlift_ns.viewer.paint import legend, opacities, painted
 from normlift_ns.viewer.records import BYTES, Units, cholesky, make_records
-from tests.session.worlds import BLOCK, read, world
+from tests.session.worlds import BLOCK, read, rows, world
 from tests.viewer.scenes import camera, scene_of, spheres
 
 
@@ -90,13 +91,16 @@ def test_colours_show_what_is_selected_and_hidden():
     state = actions.look(actions.ask(State(space), prompts, question), "prompts")
     colours, drawn = painted(records, state)
     assert drawn.all()
-    assert colours[0, 0] > 150 > colours[0, 2]
-    assert colours[BLOCK, 2] > 150 > colours[BLOCK, 0]
-    assert np.ptp(colours[3 * BLOCK].astype(int)) == 0
+    grey = int(records.colours[0, 0] * 0.8)
+    for number, colour in ((0, prompt_colours(["red"])[0]), (BLOCK, prompt_colours(["blue"])[0])):
+        np.testing.assert_allclose(colours[number], 0.15 * grey + 0.85 * 255 * np.array(colour), atol=1)
+    assert colours[3 * BLOCK].tolist() == 3 * [grey]
     state = actions.look(actions.hide(actions.show(state, 0)), "overlay")
     colours, drawn = painted(records, state)
     assert drawn.reshape(4, -1).all(axis=1).tolist() == [False, True, False, True]
-    assert np.ptp(colours[BLOCK].astype(int)) == 0
+    assert colours[BLOCK].tolist() == 3 * [grey]
+    assert colours[0].tolist() == [253, 231, 37]  # the best match: all of the last colour of the map
+    assert painted(records, actions.add(State(space, look="overlay"), rows(1)))[0][BLOCK].tolist() == [255, 191, 26]
     assert "0.80 relevancy 1.00" in legend(state)
     colours, _ = painted(records, actions.look(state, "reliability"))
     assert len(np.unique(colours, axis=0)) >= 2
