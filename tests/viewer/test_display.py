@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import html
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,6 +10,7 @@ import torch
 
 from normlift_ns.asking import Answer
 from normlift_ns.colors import colors_of, prompt_colors
+from normlift_ns.errors import visible
 from normlift_ns.question import Question
 from normlift_ns.viewer.display import color_scale, draw, make_display, overlay, reliability_picture, segmentation
 from normlift_ns.viewer.legend import clipped
@@ -104,6 +107,18 @@ def test_the_report_counts_and_escapes() -> None:
     assert "a&#124;b | 2 | 0.90 |" in lines[-2]
     assert f"{'x' * 39}&#8230; | 2 | 0.70 |" in lines[-1]
     assert report(answer, 1).startswith("**2** of 3")
-    assert report(None, None) == "No query yet."
+    assert not any(letter.isdigit() for letter in report(None, None))
     assert as_text("1 < 2 {}\n") == "1 &#60; 2 &#123;&#125;&#10;"
     assert clipped("a\n  b", 9) == "a b"
+
+
+def test_markup_is_text_and_choices_of_a_dropdown_can_be_sent_and_shown() -> None:
+    for text in (
+        "<script>x</script>", "{1+1}", "| a | b |", "**b**", "a\n# b", "`x`", "\x1b[31m", "\u202ex", "\udc80", "\0",
+        "&lt;",
+    ):  # fmt: skip
+        shown = as_text(text)
+        assert re.fullmatch(r"(?:\w| |&#\d+;)*", shown), text
+        assert html.unescape(shown) == visible(text, keep="\n")
+        assert clipped(text, 40).isprintable(), text
+        clipped(text, 40).encode("utf8")
