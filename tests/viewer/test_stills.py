@@ -94,7 +94,7 @@ def test_pictures_follow_camera_and_state_and_get_fine_at_rest(run, page):
             assert time.monotonic() < deadline, (len(page.pictures), told)
             time.sleep(0.01)
 
-    (drawing,) = set(threading.enumerate()) - before
+    (drawing,) = [one for one in threading.enumerate() if one not in before and "_draw_on" in one.name]
     stills.change()
     until(lambda: len(page.pictures) == 2)
     coarse, fine = page.pictures
