@@ -14,9 +14,6 @@ from tests.browser.server import OWN, Server
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-ARMED = "Click on"
-"""What the panel says while it waits for a click."""
-
 
 @contextmanager
 def own_viewer(config: Path, log: Path, *flags: str, python: Path | str = sys.executable) -> Iterator[str]:
@@ -44,8 +41,3 @@ class Own(Person):
         """Waits until the page has the prompts that the run stores, or those that it had before."""
         self.button("Ask").wait_for()
         self.until(lambda: self.typed("Prompts"), "greeted")
-
-    def arm(self, button: str) -> None:
-        """Presses a button after which a click does something."""
-        self.press(button)
-        self.says(ARMED)

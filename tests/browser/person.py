@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 CHROMIUM = shutil.which("chromium")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium")
+ARMED = "Click on"
+"""What a panel says while it waits for a click."""
 PANEL = 320
 """Width of viser's control panel in pixels."""
 COARSE = 0.4
@@ -180,6 +182,11 @@ class Person:
         self.type("Prompts", prompts)
         self.field("Prompts").press("Enter") if key else self.press("Ask")
 
+    def arm(self, button: str) -> None:
+        """Presses a button after which a click does something."""
+        self.press(button)
+        self.says(ARMED)
+
     def save(self, button: str, folder: Path) -> Path:
         """The file that a button downloads."""
         with self.page.expect_download() as waiting:
@@ -282,6 +289,11 @@ def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
 def coloured(picture: np.ndarray) -> np.ndarray:
     """Pixels that are not grey; without the axes."""
     return without_axes(np.ptp(picture.astype(int), axis=2) > 50)
+
+
+def covers(seen: np.ndarray, things: np.ndarray) -> bool:
+    """Whether colours lie on these things, and hardly elsewhere."""
+    return bool(coloured(seen)[things].mean() > 0.8 and coloured(seen)[~things].mean() < 0.03)
 
 
 def without_axes(mask: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ import pytest
 from plyfile import PlyData
 
 from normlift_ns.runs.question import load_question
-from tests.browser.own_viewer import ARMED, Own
-from tests.browser.person import RED, YELLOW, changed, coloured, hue_mask, iou, middle, needs_chromium
+from tests.browser.own_viewer import Own
+from tests.browser.person import ARMED, RED, YELLOW, changed, coloured, covers, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
 
 if TYPE_CHECKING:
@@ -24,11 +24,6 @@ def red_and_yellow(page: Own) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The picture once the room is drawn, and where two of its things are."""
     photo = page.sees(lambda seen: min(hue_mask(seen, *rule).sum() for rule in (RED, YELLOW)) > 1000, "the room")
     return photo, hue_mask(photo, *RED), hue_mask(photo, *YELLOW)
-
-
-def covers(seen: np.ndarray, things: np.ndarray) -> bool:
-    """Whether colours lie on these things, and hardly elsewhere."""
-    return coloured(seen)[things].mean() > 0.8 and coloured(seen)[~things].mean() < 0.05
 
 
 def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictures: Path, tmp_path: Path) -> None:

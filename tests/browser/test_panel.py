@@ -10,9 +10,9 @@ import pytest
 from plyfile import PlyData
 
 from normlift_ns.runs.question import load_question
-from tests.browser.person import BLUE, RED, YELLOW, changed, hue_mask, iou, middle, needs_chromium
+from tests.browser.person import ARMED, BLUE, RED, YELLOW, changed, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
-from tests.browser.viewer import ARMED, HIDDEN, Tab, overlaid
+from tests.browser.viewer import HIDDEN, Tab, overlaid
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

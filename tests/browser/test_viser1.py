@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.own_viewer import ARMED, Own, own_viewer
-from tests.browser.person import RED, YELLOW, coloured, hue_mask, iou, middle, needs_chromium
+from tests.browser.own_viewer import Own, own_viewer
+from tests.browser.person import ARMED, RED, YELLOW, covers, hue_mask, middle, needs_chromium
 from tests.browser.server import copied
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def test_a_person_before_viser_1(python: Path, lifted: Path, browser: Browser, p
         own.arm("Select")
         own.click(middle(yellow))
         box = own.selects(lambda count: 0 < count < both, "the connected object")
-        own.sees(lambda seen: iou(coloured(seen), yellow) > 0.6, "it is drawn")
+        own.sees(lambda seen: covers(seen, yellow), "it is drawn")
         own.press("Hide")
         own.sees(lambda seen: hue_mask(seen, *YELLOW).sum() < 50, "hidden")
         own.page.reload()

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 TITLE = 52
 """Height of the title bar in pixels."""
-ARMED, HIDDEN = "Click on something", "Gaussians are hidden"
-"""What the panel says while it waits for a click, and while something is hidden."""
+HIDDEN = "Gaussians are hidden"
+"""What the panel says while something is."""
 
 
 @contextmanager
@@ -82,11 +82,6 @@ class Tab(Person):
         """Asks, and waits for as many answers."""
         self.ask(prompts, key=key)
         self.until(lambda: self.answered() == answered, f"asked {prompts[:20]!r}")
-
-    def arm(self, button: str) -> None:
-        """Presses a button after which a click does something."""
-        self.press(button)
-        self.says(ARMED)
 
 
 def overlaid(picture: np.ndarray) -> np.ndarray:
