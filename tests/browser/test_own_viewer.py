@@ -225,6 +225,7 @@ def test_held_keys_add_and_take_away(page: Own, pictures: Path) -> None:
     for keys, count in (("Control+z", both), ("Control+Shift+z", both - ball)):
         page.page.keyboard.press(keys)
         page.selects(lambda found, count=count: found == count, keys)
+    page.until(lambda: '"held":""' in page.page.evaluate(SESSION), "Shift is released")
     page.field("Prompts").press_sequentially("RED", delay=50)
     page.page.keyboard.down("Shift")  # within a text it holds nothing
     assert '"held":""' in page.page.evaluate(SESSION)
