@@ -63,11 +63,11 @@ test-all: lint
 
 # The viewer with viser 1.x, in an environment of its own
 test-viser1: .venv/installed
-	$(BIN)/pytest -m slow tests/browser/test_viser1.py
+	$(BIN)/pytest -m extra tests/browser/test_viser1.py
 
 # A monkey before both viewers: make soak MINUTES=30 SEED=1
 soak: .venv/installed
-	NORMLIFT_SOAK=$(or $(MINUTES),30) NORMLIFT_SEED=$(or $(SEED),$$(date +%s)) $(BIN)/pytest -s -m slow tests/browser/test_monkey.py
+	NORMLIFT_SOAK=$(or $(MINUTES),30) NORMLIFT_SEED=$(or $(SEED),$$(date +%s)) $(BIN)/pytest -s -m extra tests/browser/test_monkey.py
 
 torture: .venv/installed
 	NORMLIFT_TORTURE=40 $(BIN)/pytest tests/torture

@@ -14,8 +14,9 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from benchmarks.plots import DOCS
-from tests.browser.own_viewer import PANEL, Own, own_viewer
-from tests.browser.viewer import TITLE, Tab, chromium, ns_viewer
+from tests.browser.own_viewer import Own, own_viewer
+from tests.browser.person import PANEL, chromium, coloured
+from tests.browser.viewer import TITLE, Tab, ns_viewer
 
 CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
 OWN, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"
@@ -38,30 +39,27 @@ def own(browser: Browser, address: str) -> None:
     """ns-normlift-view with an answer."""
     page = Own(browser, address, size=(1200, 640), sharpness=1)
     page.ask(OWN)
-    page.until(lambda: page.selected() > 0, "an answer")
-    page.picture()
+    page.selects(lambda count: count > 0, "an answer")
+    page.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
     shot(page.page, "viewer_own")
 
 
 def stock(browser: Browser, address: str) -> None:
     """ns-viewer with an answer, and with one thing alone."""
     tab = Tab(browser, address, size=(1300, 947), sharpness=1)
-    tab.press("Hide Train Cams")
-    tab.type("Prompts", STOCK)
-    tab.press("Ask")
-    tab.until(lambda: tab.answered() == 2, "an answer")
+    tab.fresh()
+    tab.asks(STOCK, answered=2)
     tab.show("overlay")
-    tab.settle()
+    tab.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
     shot(tab.page, "viewer_overlay")
     tab.press("Clear")
     tab.show("rgb")
-    tab.press("More like this")
-    tab.says("Click on something in the scene")
-    tab.click((1300 - PANEL) * CLICKED[0], (947 - TITLE) * CLICKED[1])
-    tab.until(lambda: tab.selected() > 0, "clicked")
+    tab.arm("More like this")
+    tab.click(((1300 - PANEL) * CLICKED[0], (947 - TITLE) * CLICKED[1]))
+    tab.selects(lambda count: count > 0, "clicked")
     tab.press("Only")
     tab.show("rgb")
-    tab.settle()
+    tab.sees(lambda seen: (seen.std(axis=2) < 20).mean() > 0.7, "one thing before the background")
     shot(tab.page, "viewer_isolated")
 
 

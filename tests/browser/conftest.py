@@ -1,20 +1,22 @@
-"""Lifted runs to look at, and where the pictures go that the tests take."""
+"""One browser, a server for each viewer, and where the pictures go that the tests take."""
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from benchmarks.captures import SHARED
-from benchmarks.plain_room import plain_room
-from normlift_ns.demo import write_capture, write_splatfacto_run
-from normlift_ns.options import LiftOptions, SourceOptions
-from normlift_ns.scripts.lift import NormLift
+from tests.browser.own_viewer import Own
+from tests.browser.person import chromium
+from tests.browser.server import OWN, STOCK, Server, copied, faults
+from tests.browser.viewer import Tab
 
-TEXTS = ("red", "yellow", "sky blue", "dark green")
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 
 @pytest.fixture(scope="session")
@@ -27,30 +29,65 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def demo_run(lifted_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of a lifted demo room, a copy for each file of tests: what one saves, no other finds."""
-    copy = tmp_path_factory.mktemp("copied") / "outputs"
-    shutil.copytree(lifted_room / "outputs", copy)
-    return next(copy.glob("*/normlift/*/config.yml"))
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A browser for all tests; each opens tabs of its own."""
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="session")
-def lifted_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo room, lifted with four queries into its folder outputs, as `make demo` leaves it but smaller."""
-    folder = tmp_path_factory.mktemp("demo")
-    room = plain_room(12_000)
-    write_capture(room, folder / "room", views=12, width=320, height=240)
-    config = write_splatfacto_run(room, folder / "room", folder / "outputs")
-    NormLift(config, source=SourceOptions(encoder="colour"), queries=TEXTS, timestamp="demo").main()
-    return folder
+def stock_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    yield from served(STOCK, lifted, tmp_path_factory.mktemp("stock"))
 
 
 @pytest.fixture(scope="session")
-def fox_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of the fox capture, lifted from some of its views at half their size."""
-    source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    options, folder = LiftOptions(max_views=12, lift_downscale=2), tmp_path_factory.mktemp("fox")
-    colour = SourceOptions(encoder="colour")
-    lifted = NormLift(source, source=colour, lift=options, output_dir=folder, timestamp="seen").main()
-    return lifted.config
+def own_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    yield from served(OWN, lifted, tmp_path_factory.mktemp("own"))
+
+
+def served(program: str, config: Path, folder: Path) -> Iterator[Server]:
+    """A server of a copy of a run, which has printed no traceback in the end."""
+    server = Server(program, copied(config, folder), folder / "viewer.log", cwd=folder)
+    yield server
+    server.stop()
+    assert faults(server.said()) == []
+
+
+@pytest.fixture
+def stock(stock_server: Server) -> Iterator[Server]:
+    """nerfstudio's viewer before a lifted room that stores the queries red and yellow."""
+    yield from as_stored(stock_server)
+
+
+@pytest.fixture
+def own(own_server: Server) -> Iterator[Server]:
+    """Our own viewer before the same room."""
+    yield from as_stored(own_server)
+
+
+def as_stored(server: Server) -> Iterator[Server]:
+    """Starts a server unless it runs, and takes back afterwards what a test has stored in the run."""
+    stored, kept = server.config.parent / "normlift", server.config.parent.parent / "kept"
+    shutil.copytree(stored, kept)
+    server.start()
+    yield server
+    shutil.rmtree(stored)
+    kept.rename(stored)
+
+
+@pytest.fixture
+def tab(stock: Server, browser: Browser) -> Iterator[Tab]:
+    """A fresh tab before nerfstudio's viewer."""
+    tab = Tab(browser, stock.address)
+    tab.fresh()
+    yield tab
+    tab.leave()
+
+
+@pytest.fixture
+def page(own: Server, browser: Browser) -> Iterator[Own]:
+    """A fresh tab before our own viewer."""
+    page = Own(browser, own.address)
+    yield page
+    page.leave()

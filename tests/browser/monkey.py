@@ -6,21 +6,16 @@ Chance is made of the seed and the number of the deed, so that a run can be repe
 
 from __future__ import annotations
 
-import os
 import random
 import re
 import signal
-import subprocess
-import sys
 import time
-import urllib.request
-from collections.abc import Sequence
 from pathlib import Path
 
 from playwright.sync_api import Browser, ConsoleMessage, Page, TimeoutError
 
-from tests.browser.own_viewer import COARSE, draw_in_software
-from tests.browser.viewer import faults, is_ours
+from tests.browser.person import COARSE, draw_in_software
+from tests.browser.server import Server, faults
 
 PROMPTS = (
     "red", "purple", "red, yellow", "dark green; sky blue", "teal", "zebra", "red, zebra; purple", "", " ", ",;,", "-5",
@@ -80,56 +75,19 @@ _LATE = "Tried to update non-existent component"
 """Of viser: what was still in a page's queue when the connection was lost."""
 
 
-class Serving:
-    """A viewer in a process of its own, always at the same port."""
+class Serving(Server):
+    """A viewer that says what its threads do when it is asked, and how much memory it uses."""
 
-    def __init__(self, words: Sequence[str], address: str, log: Path, cwd: Path) -> None:
-        self._words, self.address, self._log, self._cwd = words, address, log, cwd
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        """Returns when it answers; what it prints goes to the end of the log."""
-        root = str(Path(__file__).parents[2])
-        with self._log.open("a") as file:
-            self._process = subprocess.Popen(
-                [sys.executable, "-W", "ignore", *self._words], stdout=file, stderr=file, cwd=self._cwd,
-                env={**os.environ, "PYTHONPATH": root, "MALLOC_ARENA_MAX": "1"},  # as `megabytes` needs it
-            )  # fmt: skip
-        deadline = time.monotonic() + 300
-        while True:
-            try:
-                return urllib.request.urlopen(self.address, timeout=5).close()
-            except OSError:
-                if self._process.poll() is not None or time.monotonic() > deadline:
-                    raise AssertionError(f"it does not answer: {(self.said() + self.threads())[-9000:]}") from None
-                time.sleep(0.3)
-
-    def kill(self) -> None:
-        assert self._process is not None
-        self._process.kill()
-        self._process.wait()
-
-    def stop(self) -> None:
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(timeout=30)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-
-    def alive(self) -> bool:
-        return self._process is not None and self._process.poll() is None
-
-    def said(self) -> str:
-        return self._log.read_text(errors="replace")
+    def start(self, *flags: str, **environment: str) -> None:
+        super().start(*flags, MALLOC_ARENA_MAX="1", **environment)  # as `megabytes` needs it
 
     def threads(self) -> str:
         """What every thread of the server does."""
         if not self.alive():
             return ""
-        assert self._process is not None
+        assert self.process is not None
         before = len(self.said())
-        self._process.send_signal(signal.SIGUSR1)
+        self.process.send_signal(signal.SIGUSR1)
         time.sleep(2)
         return self.said()[before:]
 
@@ -138,11 +96,16 @@ class Serving:
 
         With an arena for each of nerfstudio's threads it keeps up to 250 MB, whatever it is asked to give back.
         """
-        assert self._process is not None
-        self._process.send_signal(signal.SIGUSR2)
+        assert self.process is not None
+        self.process.send_signal(signal.SIGUSR2)
         time.sleep(0.3)
-        status = Path(f"/proc/{self._process.pid}/status").read_text()
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(re.findall(r"VmRSS:\s+(\d+) kB", status)[0]) / 1024
+
+
+def is_ours(fault: str) -> bool:
+    """Whether a traceback has led through this package, but for what stands around all that viser reads."""
+    return re.search(r'normlift_ns/(?!viewer/adapter\.py", line \d+, in read\n)', fault) is not None
 
 
 class Monkey:
@@ -230,27 +193,37 @@ class Monkey:
 
     def use_everything(self) -> None:
         """Presses what loads something when it is first pressed, so that later only what leaks makes memory grow."""
+        self._ask_in_a_fresh_page(
+            "purple object 1", ("Why?", "These weigh most:"), ("Select likely floaters", "press Hide")
+        )
+        self.check()
+
+    def still_works(self) -> None:
+        """A fresh page asks, and is answered; those before are closed."""
+        for old in self._pages:
+            old.context.close()
+        self._ask_in_a_fresh_page("Gaussians selected")
+        self.check()
+
+    def _ask_in_a_fresh_page(self, answer: str, *more: tuple[str, str]) -> None:
+        """Asks, and presses more buttons, each until it is answered."""
         page = self._opened(SIZES[0])
         page.set_default_timeout(180_000)
-        page.get_by_role("button", name="Ask", exact=True).wait_for()
-        page.wait_for_timeout(3000)
-        page.get_by_role("button", name="Clear", exact=True).click()  # a threshold that was saved would be kept
-        page.wait_for_timeout(2000)
-        assert page.evaluate(_PROMPTS)
-        page.keyboard.insert_text("red, purple")
-        page.wait_for_timeout(2000)
-        for name, answer in (
-            ("Ask", "purple object 1"), ("Why?", "These weigh most:"), ("Select likely floaters", "then press Hide"),
-        ):  # fmt: skip
-            page.get_by_role("button", name=name, exact=True).click()
-            try:
-                page.get_by_text(answer).first.wait_for()
-            except TimeoutError as error:
-                raise AssertionError(f"no {answer!r} after {name}, but: {page.evaluate(_SHOWN)}") from error
-        page.get_by_role("button", name="Clear", exact=True).click()
-        page.wait_for_timeout(1000)
+        try:
+            page.get_by_role("button", name="Ask", exact=True).wait_for()
+            page.wait_for_timeout(3000)
+            page.get_by_role("button", name="Clear", exact=True).click()  # a threshold that was saved would be kept
+            page.wait_for_timeout(2000)
+            assert page.evaluate(_PROMPTS)
+            page.keyboard.insert_text("red, purple")
+            page.wait_for_timeout(2000)
+            for name, said in (("Ask", answer), *more):
+                page.get_by_role("button", name=name, exact=True).click()
+                page.get_by_text(said).first.wait_for()
+        except TimeoutError as error:
+            shown = f"no answer, but: {page.evaluate(_SHOWN)}\nthe server's threads:\n{self._server.threads()}"
+            raise AssertionError(shown) from error
         page.context.close()
-        self.check()
 
     def check(self) -> None:
         said = self._server.said()
@@ -262,32 +235,6 @@ class Monkey:
         if self.problems:
             last = "\n".join([f"{i}: {deed}" for i, deed in enumerate(self.deeds)][-30:])
             raise AssertionError(f"seed {self.seed}, after\n{last}\n" + "\n".join(self.problems[:5]))
-
-    def still_works(self) -> None:
-        """A fresh page asks, and is answered; those before are closed."""
-        for old in self._pages:
-            old.context.close()
-        page = self._opened(SIZES[0])
-        page.set_default_timeout(180_000)
-        try:
-            page.get_by_role("button", name="Ask", exact=True).wait_for()
-        except TimeoutError as error:
-            raise AssertionError(f"no panel; the server's threads:\n{self._server.threads()}") from error
-        page.wait_for_timeout(3000)
-        page.get_by_role("button", name="Clear", exact=True).click()  # a threshold that was saved would be kept
-        page.wait_for_timeout(2000)
-        assert page.evaluate(_PROMPTS)
-        page.keyboard.insert_text("red, purple")
-        page.wait_for_timeout(2000)
-        page.get_by_role("button", name="Ask", exact=True).click()
-        try:
-            page.get_by_text("Gaussians selected").first.wait_for()
-            page.get_by_text("purple", exact=False).first.wait_for()
-        except TimeoutError as error:
-            shown = f"no answer, but: {page.evaluate(_SHOWN)}\nthe server's threads:\n{self._server.threads()}"
-            raise AssertionError(shown) from error
-        page.context.close()
-        self.check()
 
     def _find(self, who: int, what: str, chance: random.Random) -> list | None:
         return self._pages[who].evaluate(_FIND, [what, _NOT_PRESSED, chance.random()])

@@ -7,21 +7,21 @@ seed of its own.
 from __future__ import annotations
 
 import os
-import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.monkey import Monkey, Serving
-from tests.browser.own_viewer import free_port
-from tests.browser.viewer import CHROMIUM, chromium, faults, is_ours
+from tests.browser.person import needs_chromium
+from tests.browser.server import OWN, STOCK, copied, faults
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium"),
-]
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+    from tests.browser.monkey import Monkey, Serving
+
+pytestmark = [pytest.mark.extra, needs_chromium]
 MINUTES = float(os.environ.get("NORMLIFT_SOAK", "0.5"))
 SEED = os.environ.get("NORMLIFT_SEED", "1")
 MOST_GROWTH = 50.0
@@ -37,34 +37,18 @@ ASKED = (
     "signal.signal(signal.SIGUSR2, lambda *_: (gc.collect(), ctypes.CDLL(None).malloc_trim(0))); "
 )
 """A program that tells what its threads do when it is asked, and gives back memory that it has freed."""
-OWN = ASKED + "from normlift_ns.scripts.view import main; main()"
-STOCK = ASKED + "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
-
-
-@pytest.fixture
-def run(demo_run: Path, tmp_path: Path) -> Iterator[Path]:
-    """The demo room; what the monkey stores in it is taken out again."""
-    stored = demo_run.parent / "normlift"
-    shutil.copytree(stored, tmp_path / "kept")
-    yield demo_run
-    shutil.rmtree(stored)
-    shutil.copytree(tmp_path / "kept", stored)
 
 
 @pytest.mark.parametrize("viewer", ["own", "stock"])
-def test_nothing_breaks_and_nothing_grows(viewer: str, run: Path, tmp_path: Path) -> None:
-    port = free_port()
-    flags = {
-        "own": [OWN, "--port", str(port)],
-        "stock": [STOCK, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(port)],
-    }[viewer]
-    words = ["-c", flags[0], "--load-config", str(run), *flags[1:]]
-    server = Serving(words, f"http://127.0.0.1:{port}", tmp_path / "log", run.parents[4])
+def test_nothing_breaks_and_nothing_grows(viewer: str, lifted: Path, browser: Browser, tmp_path: Path) -> None:
+    from tests.browser.monkey import Monkey, Serving, is_ours  # noqa: PLC0415 (imports playwright)
+
+    config = copied(lifted, tmp_path)
+    server = Serving(ASKED + {"own": OWN, "stock": STOCK}[viewer], config, tmp_path / "log", cwd=tmp_path)
     print(f"\n{viewer} viewer: seed {SEED}, {MINUTES:g} minutes")
     try:
         server.start()
-        with chromium() as browser:
-            soak(Monkey(browser, server, f"{SEED}:{viewer}", forgives=viewer == "stock"), server)
+        soak(Monkey(browser, server, f"{SEED}:{viewer}", forgives=viewer == "stock"), server)
     finally:
         server.stop()
     found = faults(server.said())

@@ -12,16 +12,19 @@ import sys
 import sysconfig
 import venv
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from tests.browser.own_viewer import Own, own_viewer
-from tests.browser.viewer import CHROMIUM, chromium, hue_mask, iou, middle
+from tests.browser.person import ARMED, RED, YELLOW, covers, hue_mask, middle, needs_chromium
+from tests.browser.server import copied
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.slow
-PURPLE = (0.79, 0.6)
+pytestmark = pytest.mark.extra
 
 
 @pytest.fixture(scope="module")
@@ -55,39 +58,33 @@ def test_the_adapter_knows_viser_1(python: Path) -> None:
     assert "failed" not in done.stdout
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: install Debian's package chromium")
-def test_a_person_before_viser_1(python: Path, demo_run: Path, pictures: Path, tmp_path: Path) -> None:
+@needs_chromium
+def test_a_person_before_viser_1(python: Path, lifted: Path, browser: Browser, pictures: Path, tmp_path: Path) -> None:
     assert Path(sys.executable) != python
-    with own_viewer(demo_run, tmp_path / "view.log", python=python) as address, chromium() as browser:
+    with own_viewer(copied(lifted, tmp_path), tmp_path / "view.log", python=python) as address:
         own = Own(browser, address)
-        own.says("The run stores these prompts")
         own.page.locator(".mantine-Notification-closeButton").first.click()  # that it draws in software
-        photo = own.picture()
-        purple = hue_mask(photo, *PURPLE)
-        own.ask("red, zebra; purple", key=True)
-        own.until(lambda: own.selected() > 0, "an answer")
-        assert "contains no colour name" in own.text()
+        photo = own.sees(lambda seen: hue_mask(seen, *YELLOW).sum() > 1000, "the room")
+        yellow = hue_mask(photo, *YELLOW)
+        own.ask("red, zebra; yellow", key=True)
+        both = own.selects(lambda count: count > 0, "an answer")
+        own.says(r"⚠\s+zebra")
         own.page.screenshot(path=pictures / "viser1_asked.png")
-        both = own.selected()
-        own.press("Select")
-        own.says("Click on an object.")
-        own.page.mouse.click(*middle(purple))
-        own.until(lambda: 0 < own.selected() < both, "the connected object")
-        own.until(lambda: iou(np.ptp(own.picture().astype(int), axis=2) > 60, purple) > 0.6, "it is drawn")
-        box = own.selected()
+        own.arm("Select")
+        own.click(middle(yellow))
+        box = own.selects(lambda count: 0 < count < both, "the connected object")
+        own.sees(lambda seen: covers(seen, yellow), "it is drawn")
         own.press("Hide")
-        own.until(lambda: hue_mask(own.picture(), *PURPLE).sum() < 50, "hidden")
-        own.page.screenshot(path=pictures / "viser1_hidden.png")
+        own.sees(lambda seen: hue_mask(seen, *YELLOW).sum() < 50, "hidden")
         own.page.reload()
         own.ready()
-        own.until(lambda: own.selected() == box, "a reload keeps the selection")
+        own.selects(lambda count: count == box, "a reload keeps the selection")
         own.press("Undo")
         own.press("Undo")
-        own.until(lambda: own.selected() == both, "and the history")
+        own.selects(lambda count: count == both, "and the history")
         own.page.keyboard.down("Shift")
-        own.says("Click on objects.")
-        own.page.mouse.click(*middle(hue_mask(photo, 0.0, 0.9)))
+        own.says(ARMED)
+        own.click(middle(hue_mask(photo, *RED)))
         own.page.keyboard.up("Shift")
-        own.until(lambda: "Click on" not in own.text(), "released")
-        own.page.screenshot(path=pictures / "viser1_shift.png")
-        assert own.problems == []
+        own.until(lambda: ARMED not in own.text(), "released")
+        own.leave()

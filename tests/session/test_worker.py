@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 import time
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.session.worker import Worker
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.lists(st.sampled_from(["", "a", "b"]), max_size=30))
 def test_work_is_done_in_order_and_of_a_key_the_last_in_a_row(keys):
     worker, gate, done, ended = Worker(), threading.Event(), [], threading.Event()
@@ -25,14 +24,20 @@ def test_work_is_done_in_order_and_of_a_key_the_last_in_a_row(keys):
 
 
 def test_what_waits_is_forgotten_and_nothing_is_taken_in_the_end():
-    worker, gate, done = Worker(), threading.Event(), []
-    worker.put(lambda: done.append(1) if gate.wait(30) else None)
-    time.sleep(0.05)
-    worker.put(lambda: done.append(2))
-    worker.drop()
-    worker.put(lambda: done.append(3))
-    worker.end()
-    worker.put(lambda: done.append(4))
-    gate.set()
-    time.sleep(0.1)
-    assert done == [1]
+    for forget, expected in (("drop", [1, 3]), ("end", [1])):
+        worker, begun, gate, done = Worker(), threading.Event(), threading.Event(), []
+
+        def first(begun: threading.Event = begun, gate: threading.Event = gate, done: list[int] = done) -> None:
+            begun.set()
+            assert gate.wait(30)
+            done.append(1)
+
+        worker.put(first)
+        assert begun.wait(30)
+        worker.put(lambda done=done: done.append(2))
+        getattr(worker, forget)()
+        worker.put(lambda done=done: done.append(3))
+        gate.set()
+        while worker._works:
+            time.sleep(0.001)
+        assert done == expected, forget

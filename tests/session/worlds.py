@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -16,17 +18,23 @@ BLOCK = SIDE**3
 WORDS = {"red": (1.0, 0.0, 0.0), "blue": (0.0, 1.0, 0.0), "green": (0.0, 0.0, 1.0)}
 
 
-def cubes() -> Space:
+def cubes(side: int = SIDE) -> Space:
     """Four cubes of Gaussians in a row, 100 apart: red, blue, red, and one without a direction."""
-    axis = torch.arange(SIDE).float()
+    axis, block = torch.arange(side).float(), side**3
     cube = torch.cartesian_prod(axis, axis, axis)
     means = torch.cat([cube + torch.tensor([100.0 * i, 0, 0]) for i in range(4)])
-    column = torch.tensor([1, 2, 1]).repeat_interleave(BLOCK)
-    seen = Entries(torch.arange(3 * BLOCK), column, torch.ones(3 * BLOCK), (3,))
-    again = Entries(torch.arange(BLOCK), torch.ones(BLOCK, dtype=torch.long), torch.ones(BLOCK), (3,))
+    column = torch.tensor([1, 2, 1]).repeat_interleave(block)
+    seen = Entries(torch.arange(3 * block), column, torch.ones(3 * block), (3,))
+    again = Entries(torch.arange(block), torch.ones(block, dtype=torch.long), torch.ones(block), (3,))
     features = torch.cat([torch.eye(3), torch.eye(3)])
-    evidence = Evidence.from_entries([seen, again], 4 * BLOCK)
+    evidence = Evidence.from_entries([seen, again], 4 * block)
     return Space(SemanticField.build(lift(evidence, features), means), means)
+
+
+@cache
+def world() -> Space:
+    """The same for all tests that do nothing but ask."""
+    return cubes()
 
 
 def read(texts) -> np.ndarray:

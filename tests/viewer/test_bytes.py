@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import socket
-from types import SimpleNamespace
-from typing import Any
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
-import torch
 from websockets.sync.client import connect
 
-from benchmarks.view import Client
-from normlift_ns import Camera, GaussianScene
-from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.viewer.people import People
-from normlift_ns.viewer.records import BYTES, make_records
+from normlift_ns.viewer.records import BYTES
 from normlift_ns.viewer.serving.door import Door
-from normlift_ns.viewer.shared import Run
-from tests.session import worlds
+from tests.session.worlds import cubes
+from tests.viewer.scenes import run_of
 
-pytest.importorskip("viser")
 MOST_REST = 8_000
 """Bytes of widgets and headers, however large the scene is: less than one per Gaussian of the larger one here."""
 CAMERA = {
@@ -28,54 +23,36 @@ CAMERA = {
 }  # fmt: skip
 
 
-def served(side: int, tmp_path, monkeypatch) -> Door:
-    monkeypatch.setattr(worlds, "SIDE", side)
-    monkeypatch.setattr(worlds, "BLOCK", side**3)
-    space = worlds.cubes()
-    n = len(space)
-    camera = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
-    gaussians = GaussianScene(space.means, torch.eye(4)[:1].expand(n, 4), torch.ones(n, 3), torch.full((n,), 0.9))
-    scene: Any = SimpleNamespace(
-        gaussians=gaussians, parameters={"features_dc": torch.zeros(n, 3)}, has_harmonics=True,
-        rasterize_mode="classic", train=SimpleNamespace(cameras=[camera]),
-    )  # fmt: skip
-    (tmp_path / FIELD_FOLDER).mkdir(exist_ok=True)
-    run = Run(tmp_path, scene, space, make_records(scene), lambda: SimpleNamespace(rows=worlds.read))
+def served(side: int, folder: Path) -> Door:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    door, people = Door("127.0.0.1", port), People(run)
+    door, people = Door("127.0.0.1", port), People(run_of(folder, cubes(side)))
     door.open("", people.come, people.go)
     return door
 
 
-def spent(client: Client, label: str, value: Any) -> tuple[int, int]:
-    """Gaussians that are drawn after a widget is set, and bytes until nothing comes any more."""
-    client.rest()
-    client.bytes = 0
-    client.set(label, value)
-    count = client.splats()
-    client.rest()
-    return count, client.bytes
-
-
 @pytest.mark.slow
-def test_an_answer_costs_32_bytes_per_drawn_gaussian(tmp_path, monkeypatch):
+@pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
+def test_an_answer_costs_32_bytes_per_drawn_gaussian(tmp_path):
+    from benchmarks.view import Client  # noqa: PLC0415
+
     rests = []
     for side in (4, 14):
-        door = served(side, tmp_path, monkeypatch)
+        door = served(side, tmp_path)
         try:
             with connect(f"ws://127.0.0.1:{door.server.port}", max_size=None) as line:
                 client, block = Client(line), side**3
                 assert client.drawn == 4 * block
-                for prompt in ("red", "blue", "red, blue", "red"):
-                    client.set("Prompts", prompt)
-                    count, total = spent(client, "Ask", True)
-                    assert count == 4 * block
-                    rests.append(total - BYTES * count)
-                count, total = spent(client, "Selection", "Hide")
-                assert count == 2 * block
-                rests.append(total - BYTES * count)
+                for prompt, drawn in (("red", 4), ("blue", 4), ("red, blue", 4), ("red", 4), ("", 2)):
+                    if prompt:
+                        client.set("Prompts", prompt)
+                    client.rest()
+                    client.bytes = 0
+                    client.set(*(("Ask", True) if prompt else ("Selection", "Hide")))
+                    assert client.splats() == drawn * block
+                    client.rest()
+                    rests.append(client.bytes - BYTES * drawn * block)
                 client.rest(quiet=3)  # what a person did before is done
                 client.bytes = 0
                 client.tell(CAMERA)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import html
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,26 +10,31 @@ import torch
 
 from normlift_ns.asking import Answer
 from normlift_ns.colors import colors_of, prompt_colors
+from normlift_ns.errors import visible
 from normlift_ns.question import Question
 from normlift_ns.viewer.display import color_scale, draw, make_display, overlay, reliability_picture, segmentation
 from normlift_ns.viewer.legend import clipped
 from normlift_ns.viewer.status import as_text, report
 
-RGB = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
-GREY = RGB.mean(dim=2, keepdim=True).expand_as(RGB)
+
+def pictured() -> tuple[torch.Tensor, torch.Tensor]:
+    """A picture, in colours and grey."""
+    rgb = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
+    return rgb, rgb.mean(dim=2, keepdim=True).expand_as(rgb)
 
 
 def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
+    rgb, grey = pictured()
     colors = colors_of("viridis")
     relevancy, share = torch.zeros(4, 5), torch.zeros(4, 5, 1)
     relevancy[0] = torch.tensor([-1.0, 0.5, 0.75, 1.0, 7.0])
     share[0] = 1
     share[1, 0], relevancy[1, 0] = 0.5, 1.0
-    found = overlay(RGB, relevancy, share, colors, (0.5, 1.0))
+    found = overlay(rgb, relevancy, share, colors, (0.5, 1.0))
     for x, (row, opacity) in enumerate(((0, 0.35), (0, 0.35), (128, 0.625), (255, 0.9), (255, 0.9))):
-        torch.testing.assert_close(found[0, x], (1 - opacity) * GREY[0, x] + opacity * colors[row])
-    torch.testing.assert_close(found[1, 0], 0.55 * GREY[1, 0] + 0.45 * colors[255])
-    torch.testing.assert_close(found[2:], GREY[2:])
+        torch.testing.assert_close(found[0, x], (1 - opacity) * grey[0, x] + opacity * colors[row])
+    torch.testing.assert_close(found[1, 0], 0.55 * grey[1, 0] + 0.45 * colors[255])
+    torch.testing.assert_close(found[2:], grey[2:])
 
 
 def test_nothing_found_is_not_stretched_to_a_find() -> None:
@@ -36,20 +43,18 @@ def test_nothing_found_is_not_stretched_to_a_find() -> None:
     assert color_scale(torch.tensor([0.1, 0.9]), 0.5) == (0.5, float(torch.tensor(0.9)))
 
 
-def test_the_segmentation_has_the_colour_of_the_label() -> None:
+def test_segmentation_and_reliability_have_colours_of_their_own() -> None:
+    rgb, grey = pictured()
     colors = prompt_colors(["a", "b", "c"])
     labels = torch.arange(20).reshape(4, 5) % 3
-    found = segmentation(RGB, labels, torch.ones(4, 5, 1), colors)
-    torch.testing.assert_close(found, 0.2 * GREY + 0.8 * colors[labels])
-    torch.testing.assert_close(segmentation(RGB, labels, torch.zeros(4, 5, 1), colors), GREY)
-
-
-def test_reliability_has_the_colours_of_a_fixed_scale() -> None:
+    found = segmentation(rgb, labels, torch.ones(4, 5, 1), colors)
+    torch.testing.assert_close(found, 0.2 * grey + 0.8 * colors[labels])
+    torch.testing.assert_close(segmentation(rgb, labels, torch.zeros(4, 5, 1), colors), grey)
     colors, alpha = colors_of("cividis"), torch.full((4, 5), 0.5)
     reliability = torch.full((4, 5, 1), 0.25)  # composited: R is 0.5
-    found = reliability_picture(RGB, reliability, alpha)
-    torch.testing.assert_close(found, 0.55 * GREY + 0.45 * colors[128].expand(4, 5, 3))
-    assert torch.equal(reliability_picture(RGB, 0 * reliability, 0 * alpha), GREY)
+    found = reliability_picture(rgb, reliability, alpha)
+    torch.testing.assert_close(found, 0.55 * grey + 0.45 * colors[128].expand(4, 5, 3))
+    assert torch.equal(reliability_picture(rgb, 0 * reliability, 0 * alpha), grey)
 
 
 def shown(texts: tuple[str, ...], relevancy: torch.Tensor) -> Answer:
@@ -102,6 +107,18 @@ def test_the_report_counts_and_escapes() -> None:
     assert "a&#124;b | 2 | 0.90 |" in lines[-2]
     assert f"{'x' * 39}&#8230; | 2 | 0.70 |" in lines[-1]
     assert report(answer, 1).startswith("**2** of 3")
-    assert report(None, None) == "No query yet."
+    assert not any(letter.isdigit() for letter in report(None, None))
     assert as_text("1 < 2 {}\n") == "1 &#60; 2 &#123;&#125;&#10;"
     assert clipped("a\n  b", 9) == "a b"
+
+
+def test_markup_is_text_and_choices_of_a_dropdown_can_be_sent_and_shown() -> None:
+    for text in (
+        "<script>x</script>", "{1+1}", "| a | b |", "**b**", "a\n# b", "`x`", "\x1b[31m", "\u202ex", "\udc80", "\0",
+        "&lt;",
+    ):  # fmt: skip
+        shown = as_text(text)
+        assert re.fullmatch(r"(?:\w| |&#\d+;)*", shown), text
+        assert html.unescape(shown) == visible(text, keep="\n")
+        assert clipped(text, 40).isprintable(), text
+        clipped(text, 40).encode("utf8")

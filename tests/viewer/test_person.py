@@ -15,15 +15,15 @@ import pytest
 import torch
 from msgspec import structs
 
-from normlift_ns import Camera, GaussianScene
 from normlift_ns.insight.floaters import find_floaters
 from normlift_ns.runs.files import FIELD_FOLDER
 from normlift_ns.runs.question import load_question
+from normlift_ns.viewer import painter, person
 from normlift_ns.viewer.links import View, read_link, write_link
 from normlift_ns.viewer.people import People
-from normlift_ns.viewer.records import make_records
 from normlift_ns.viewer.shared import Run
 from tests.session.worlds import BLOCK, cubes, read, rows
+from tests.viewer.scenes import run_of
 from tests.viewer.test_reasons import FakeVotes
 
 
@@ -32,7 +32,7 @@ class Widget:
 
     def __init__(self, label: str, value: Any) -> None:
         self.label, self._value, self.disabled, self.visible, self.content = label, value, False, True, ""
-        self.options, self.removed, self._told, self.order = (), False, [], 0.0
+        self.options, self.range, self.removed, self._told, self.order = (), (), False, [], 0.0
         self._impl = SimpleNamespace(value="")
 
     @property
@@ -72,6 +72,7 @@ class Gui:
             first = 0 if name in ("add_text", "add_vector3") else 3 if name == "add_slider" else 1
             widget = Widget(label, options.get("initial_value", rest[first] if len(rest) > first else None))
             widget.options = rest[0] if name in ("add_dropdown", "add_button_group") else ()
+            widget.range = rest if name == "add_slider" else ()
             widget.content, widget.visible = label, options.get("visible", True)
             self.made.append(widget)
             return widget
@@ -101,7 +102,12 @@ class FakePage:
         self.files: dict[str, bytes] = {}
         self.token = self.link = ""
         self.box: np.ndarray | None = None
-        self.gone = self.behind = False
+        self.gone, self.slow, self.looks = False, False, 0
+
+    @property
+    def behind(self) -> bool:
+        self.looks += 1
+        return self.slow
 
     def together(self) -> Any:
         return contextlib.nullcontext()
@@ -145,10 +151,24 @@ class FakePage:
         deadline = time.monotonic() + 60
         while not true():
             assert time.monotonic() < deadline, self.gui.says()
-            time.sleep(0.01)
+            time.sleep(0.002)
 
     def says(self, text: str) -> None:
         self.until(lambda: text in self.gui.says())
+
+    def selects(self, count: int) -> None:
+        self.says(f"**{count}** of {4 * BLOCK} ")
+
+    def asks(self, line: str, count: int) -> None:
+        """Asks, and waits for an answer with so many selected."""
+        self.ask(line)
+        self.selects(count)
+
+    def press(self, label: str, value: Any = True) -> None:
+        self.gui[label].press(value)
+
+    def drawings(self, kind: str) -> int:
+        return self.gui.says().count(f"data:image/{kind}")
 
     def draws(self, count: int) -> None:
         self.until(lambda: self.drawn is not None and len(self.drawn) == count)
@@ -156,34 +176,19 @@ class FakePage:
 
 @pytest.fixture
 def run(tmp_path) -> Run:
-    space = cubes()
-    n = len(space)
-    camera = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
-    gaussians = GaussianScene(
-        space.means, torch.eye(4)[:1].expand(n, 4), torch.full((n, 3), 0.3), torch.full((n,), 0.9)
-    )
-    parameters = {
-        "means": space.means, "quats": gaussians.quats, "scales": gaussians.scales.log(),
-        "opacities": gaussians.opacities.logit()[:, None], "features_dc": torch.zeros(n, 3),
-        "features_rest": torch.zeros(n, 0, 3),
-    }  # fmt: skip
-    scene: Any = SimpleNamespace(
-        gaussians=gaussians, parameters=parameters, has_harmonics=True, rasterize_mode="classic",
-        train=SimpleNamespace(cameras=[camera]),
-    )  # fmt: skip
-    (tmp_path / FIELD_FOLDER).mkdir()
-    return Run(tmp_path, scene, space, make_records(scene), lambda: SimpleNamespace(rows=read))
+    return run_of(tmp_path, cubes())
 
 
 @pytest.fixture
-def crowd(run) -> Iterator[People]:
+def crowd(run, monkeypatch) -> Iterator[People]:
+    monkeypatch.setattr(painter, "_FRAME", 0.01)
     people = People(run)
     yield people
     for number in list(people._here):
         people.go(number)
 
 
-def opened(crowd: People, number: int, token: str, link: str = "") -> FakePage:
+def opened(crowd: People, number: int = 0, token: str = "one", link: str = "") -> FakePage:
     page = FakePage(number)
     crowd.come(page)  # type: ignore[arg-type]
     page.hello(token, link)
@@ -191,178 +196,181 @@ def opened(crowd: People, number: int, token: str, link: str = "") -> FakePage:
     return page
 
 
-def test_everything_by_buttons(crowd, run):
-    page = opened(crowd, 0, "one")
+def ray(run: Run, gaussian: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """That of a click on a Gaussian, from above."""
+    place = run.records.units.to_browser(run.space.means[gaussian].numpy())
+    return tuple(place + np.array([0, 0, 5.0])), (0.0, 0.0, -1.0)
+
+
+def test_a_page_begins_at_the_first_photograph_with_the_defaults_even_if_it_never_says_its_token(
+    crowd, run, monkeypatch
+):
+    monkeypatch.setattr(person, "_PATIENCE", 0.01)
+    crowd.come(page := FakePage(0))  # type: ignore[arg-type]
     page.draws(4 * BLOCK)
-    page.ask("red, zebra; blue")
-    page.says(f"**{3 * BLOCK}** of {4 * BLOCK} Gaussians selected")
+    assert {w.label: w.range for w in page.gui.made if w.range} == {
+        "Threshold": (-0.2, 1.0, 0.005, 0.5), "Reliability": (0.0, 1.0, 0.01, 0.0), "Grow": (-10, 10, 1, 0),
+    }  # fmt: skip
+    np.testing.assert_allclose(run.records.units.to_scene(page.camera.position), [0, 0, 0], atol=1e-6)
+    ahead = run.records.units.to_scene(page.camera.look_at)
+    assert ahead[2] > 0 and ahead[:2] == pytest.approx([0, 0], abs=1e-6)
+    assert page.camera.fov == pytest.approx(max(0.3, 2 * np.arctan(12 / 2 / 50)))
+    np.testing.assert_array_equal(page.camera.up_direction, [0, -1, 0])
+
+
+def test_everything_by_buttons(crowd):
+    page = opened(crowd)
+    page.draws(4 * BLOCK)
+    page.asks("red, zebra; blue", 3 * BLOCK)
     assert "unknown" in page.gui.says()
-    page.until(lambda: page.gui["Draw"].value == "overlay")
-    page.until(lambda: not page.gui["Ask"].disabled)
-    page.gui["Prompt"].press("1: red")
-    page.says(f"**{2 * BLOCK}** of")
-    page.gui["Selection"].press("Hide")
+    page.until(lambda: page.gui["Draw"].value == "overlay" and not page.gui["Ask"].disabled)
+    page.press("Prompt", "1: red")
+    page.selects(2 * BLOCK)
+    page.press("Selection", "Hide")
     page.draws(2 * BLOCK)
-    page.ask("blue")
-    page.says(f"**{BLOCK}** of")
-    page.gui["Selection"].press("Hide")
-    page.draws(BLOCK)
-    page.gui["Selection"].press("Only")
-    page.draws(BLOCK)
+    page.asks("blue", BLOCK)
+    for deed in ("Hide", "Only"):
+        page.press("Selection", deed)
+        page.draws(BLOCK)
     for count in (BLOCK, 2 * BLOCK, 2 * BLOCK, 4 * BLOCK):
-        page.gui["History"].press("Undo")
+        page.press("History", "Undo")
         page.draws(count)
-    page.gui["Threshold"].press(0.9999)
+    page.press("Threshold", 0.9999)
+    page.press("History", "Undo")
+    page.press("History", "Redo")
     page.until(lambda: page.gui["Threshold"].value == 0.9999)
-    page.gui["History"].press("Redo")
-    page.ask("green")
-    page.says("**0** of")
-    page.gui["Selection"].press("Only")
-    page.says("The screen would be blank")
-    assert page.drawn is not None
-    page.ask("zebra")
-    page.says("zebra")
-    page.ask(" ; ")
-    page.says("Type what to look for")
-
-
-def test_the_histogram_and_the_suggested_threshold(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.ask("red, blue")
-    page.says(f"**{3 * BLOCK}** of")
-    page.until(lambda: page.gui.says().count("data:image/svg+xml") == 2)
-    page.gui["Prompt"].press("2: blue")
-    page.until(lambda: page.gui.says().count("data:image/svg+xml") == 1)
-    page.gui["Threshold"].press(0.9)
-    page.gui["Suggested"].press()
-    page.until(lambda: page.gui["Threshold"].value == pytest.approx(0.6, abs=1e-6))
-    page.gui["History"].press("Undo")
-    page.until(lambda: page.gui["Threshold"].value == 0.9)
-    page.gui["History"].press("Clear")
-    page.until(lambda: "data:image/svg+xml" not in page.gui.says())
-    page.gui["Suggested"].press()
-    page.says("no threshold to suggest")
-
-
-def test_clear_leaves_no_minimum_reliability_behind(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.gui["Reliability"].press(1.0)  # before the first question, which takes it over
-    page.ask("blue")
-    page.says("**0** of")
-    page.gui["History"].press("Clear")
+    page.asks("green", 0)
+    page.press("Selection", "Only")
+    page.says("Nothing is selected")
+    assert len(page.drawn) == 4 * BLOCK
+    page.press("Reliability", 1.0)
+    page.press("History", "Clear")  # leaves no minimum behind
     page.until(lambda: page.gui["Reliability"].value == 0.0)
-    page.ask("blue")
-    page.says(f"**{BLOCK}** of")
+    page.press("Reliability", 1.0)  # before a question, which takes it over
+    page.asks("blue", 0)
+    page.press("Reliability", 0.0)
+    page.selects(BLOCK)
+    for line, message in (("zebra", "zebra"), (" ; ", "Ask")):
+        page.ask(line)
+        page.says(message)
 
 
-def test_floaters_are_selected_hidden_and_brought_back(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.ask("blue")
-    page.says(f"**{BLOCK}** of")
+def test_histograms_floaters_and_reasons_belong_to_what_is_selected(crowd, run):
+    page = opened(crowd)
+    page.asks("red, blue", 3 * BLOCK)
+    page.until(lambda: page.drawings("svg") == 2)
+    page.press("Prompt", "2: blue")
+    page.until(lambda: page.drawings("svg") == 1)
+    page.press("Threshold", 0.9)
+    page.press("Suggested")
+    page.until(lambda: page.gui["Threshold"].value == pytest.approx(0.6, abs=1e-6))
+    page.press("History", "Undo")
+    page.until(lambda: page.gui["Threshold"].value == 0.9)
+    page.press("History", "Clear")
+    page.until(lambda: page.drawings("svg") == 0)
+    page.press("Suggested")
+    page.says("no threshold")
+
+    page.asks("blue", BLOCK)
+    page.press("Why?")
+    page.says("without the photographs")
+    object.__setattr__(run, "votes", FakeVotes)
+    page.press("Why?")
+    page.until(lambda: page.drawings("jpeg") == 3 and not page.gui["Why?"].disabled)
+    page.press("Selection", "Hide")
+    page.draws(3 * BLOCK)
+    assert page.drawings("jpeg") == 3
+    page.press("Selection", "Unhide")
     vars(run)["floaters"] = rows(0, 3)
-    page.gui["Select likely floaters"].press()
-    page.says("then press Hide")
-    page.says(f"**{2 * BLOCK}** of")
-    page.gui["Selection"].press("Hide")
+    page.press("Select likely floaters")
+    page.selects(2 * BLOCK)
+    page.until(lambda: page.drawings("jpeg") == 0)
+    page.press("Selection", "Hide")
     page.draws(2 * BLOCK)
-    page.gui["History"].press("Undo")
+    for _ in range(2):
+        page.press("History", "Undo")
     page.draws(4 * BLOCK)
-    page.gui["History"].press("Undo")
-    page.says(f"**{BLOCK}** of")
+    page.selects(BLOCK)
     vars(run)["floaters"] = rows()
-    page.gui["Select likely floaters"].press()
-    page.says("There are no likely floaters")
+    page.press("Select likely floaters")
+    page.says("no likely floaters")
     page.until(lambda: not page.gui["Ask"].disabled)
+    page.asks("green", 0)
+    page.press("Why?")
+    page.says("nothing is selected")
     del vars(run)["floaters"]
     assert torch.equal(run.floaters, find_floaters(run.scene.gaussians, run.space.field.scalars).mask)
 
 
-def test_why_is_told_and_belongs_to_the_selection(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.ask("blue")
-    page.says(f"**{BLOCK}** of")
-    page.gui["Why?"].press()
-    page.says("opened without the photographs")
-    object.__setattr__(run, "votes", FakeVotes)
-    page.gui["Why?"].press()
-    page.says("These weigh most")
-    assert page.gui.says().count("data:image/jpeg") == 3
-    page.until(lambda: not page.gui["Why?"].disabled)
-    page.gui["Selection"].press("Hide")
-    page.draws(3 * BLOCK)
-    assert "These weigh most" in page.gui.says()
-    page.ask("red")
-    page.until(lambda: "These weigh most" not in page.gui.says())
-    page.ask("green")
-    page.says("**0** of")
-    page.gui["Why?"].press()
-    page.says("nothing is selected")
-
-
 def test_a_box_cuts_and_is_drawn(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.ask("red")
-    page.says(f"**{2 * BLOCK}** of")
-    page.gui["Select"].press()
-    place = run.records.units.to_browser(run.space.means[5].numpy())
-    page.click(tuple(place + np.array([0, 0, 5.0])), (0.0, 0.0, -1.0))
-    page.says(f"**{BLOCK}** of")
-    page.gui["Place"].press("Around")
+    page = opened(crowd)
+    page.press("Place", "Around")
+    page.says("Nothing is selected")
+    page.asks("red", 2 * BLOCK)
+    page.press("Select")
+    page.click(*ray(run, 5))
+    page.selects(BLOCK)
+    page.press("Place", "Around")
     page.until(lambda: page.box is not None)
-    page.says(f"**{BLOCK}** of")
+    page.selects(BLOCK)
     page.until(lambda: page.gui["Size"].value == pytest.approx((3, 3, 3), rel=2e-3))
+    assert page.gui["Centre"].value == pytest.approx((1.5, 1.5, 1.5))
+    corners = run.records.units.to_scene(page.box)
+    np.testing.assert_allclose(
+        (corners.min(axis=0), corners.max(axis=0)), np.repeat([[0.0], [3]], 3, axis=1), atol=0.01
+    )
     page.gui["Size"].value = (3.01, 3.01, 1.5)
-    page.gui["Keep"].press("Inside")
-    page.says(f"**{BLOCK // 2}** of")
-    page.gui["Place"].press("None")
-    page.until(lambda: page.box is None)
-    page.says(f"**{BLOCK}** of")
-    page.gui["History"].press("Clear")
-    page.says("Type what to look for")
+    for side, count in (("Inside", BLOCK // 2), ("Outside", BLOCK // 2), ("None", BLOCK)):
+        page.press("Place" if side == "None" else "Keep", side)
+        page.until(lambda side=side: (page.box is None) == (side == "None"))
+        page.selects(count)
+    page.press("History", "Clear")
+    page.says("Ask or Enter")
 
 
 def test_clicks_are_armed_cancelled_and_asked_again(crowd, run):
-    page = opened(crowd, 0, "one")
-    place = run.records.units.to_browser(run.space.means[BLOCK + 5].numpy())
-    ray = (tuple(place + np.array([0, 0, 5.0])), (0.0, 0.0, -1.0))
-    page.gui["Select"].press()
-    page.says("Click on an object")
-    page.gui["Cancel"].press()
+    page = opened(crowd)
+    place = ray(run, BLOCK + 5)
+    page.press("Select")
+    page.says("Click on")
+    page.press("Cancel")
     page.until(lambda: page.clicked is None)
-    page.gui["Select"].press()
-    page.click(*ray)
-    page.says(f"**{BLOCK}** of")
+    page.press("Select")
+    page.click(*place)
+    page.selects(BLOCK)
     assert page.clicked is None
-    page.says("selected by hand** object 1")
-    page.gui["Take away"].press()
-    page.click(*ray)
-    page.says("Click on more objects")
-    page.gui["Cancel"].press()
-    page.gui["More like this"].press()
-    page.click(*ray)
+    page.says("object 1")
+    page.press("Take away")
+    page.click(*place)
+    page.says("Click on more")
+    assert page.clicked is not None
+    page.press("Cancel")
+    page.press("More like this")
+    page.click(*place)
     page.says("like click 1")
-    page.says(f"**{BLOCK}** of")
-    page.gui["Save prompts in run"].press()
-    page.says("stores one prompt")
+    page.selects(BLOCK)
+    page.press("Save prompts in run")
+    page.says("one prompt")
+    page.press("Link")
+    page.until(lambda: page.link != "")
+    link = read_link(page.link)
+    assert link is not None and link.clicks == {"like click 1": BLOCK + 7}  # the uppermost
     again = opened(crowd, 1, "another")
     again.until(lambda: again.gui["Prompts"].value == "like click 1")
-    again.gui["Ask"].press()
-    again.says(f"**{BLOCK}** of")
-    again.ask("red")
-    again.says(f"**{2 * BLOCK}** of")
-    again.gui["Save prompts in run"].press()
-    again.says("stores 2 prompts")
+    again.press("Ask")
+    again.selects(BLOCK)
+    again.asks("red", 2 * BLOCK)
+    again.press("Save prompts in run")
+    again.says("2 prompts")
     stored = load_question(run.folder / FIELD_FOLDER)
-    assert stored is not None
-    assert stored.texts == ("like click 1", "red")
+    assert stored is not None and stored.texts == ("like click 1", "red")
 
 
-def test_objects_have_buttons(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.ask("red")
+def test_objects_and_nearest_matches_have_buttons(crowd, run):
+    page = opened(crowd)
+    page.asks("red", 2 * BLOCK)
     page.until(lambda: len(page.gui.rows()) == 2)
-    first = page.gui.rows()[0]
-    before = page.camera.position
+    first, before = page.gui.rows()[0], page.camera.position
     first.press("go to")
     page.until(lambda: page.camera.position is not before)
     np.testing.assert_allclose(run.records.units.to_scene(page.camera.look_at), [1.5, 1.5, 1.5], atol=1e-6)
@@ -372,88 +380,98 @@ def test_objects_have_buttons(crowd, run):
     page.until(lambda: len(page.gui.rows()) == 1)  # the other one moved up
     first.press("export")
     page.until(lambda: "red_1.ply" in page.files)
-    assert page.files["red_1.ply"].startswith(b"ply")
+    assert page.files["red_1.ply"].startswith(b"ply") and b"vertex 64\n" in page.files["red_1.ply"]
     first.press("only")
     page.draws(BLOCK)
-    page.gui["Selection"].press("Unhide")
+    page.press("Selection", "Unhide")
     page.draws(4 * BLOCK)
 
+    panel, place = crowd._here[0]._panel, (1.0, 2.0, 3.0)
+    panel.judge("", [SimpleNamespace(text="zebra", nearest=place), SimpleNamespace(text="red", nearest=None)])
+    before = page.camera.position
+    page.press("Go to nearest: zebra")
+    page.until(lambda: page.camera.position is not before)
+    np.testing.assert_allclose(run.records.units.to_scene(page.camera.look_at), place, atol=1e-6)
+    panel.judge("", [])
+    assert not any(w.label.startswith("Go to") and not w.removed for w in page.gui.made)
 
-def test_every_page_has_its_own_question_and_gets_it_back(crowd):
-    one, two = opened(crowd, 0, "one"), opened(crowd, 1, "two")
-    one.ask("red")
-    two.ask("blue")
-    one.says(f"**{2 * BLOCK}** of")
-    two.says(f"**{BLOCK}** of")
-    one.gui["Selection"].press("Hide")
+
+def test_every_page_has_its_own_question_and_gets_it_back(crowd, monkeypatch):
+    one, two = opened(crowd), opened(crowd, 1, "two")
+    one.asks("red", 2 * BLOCK)
+    two.asks("blue", BLOCK)
+    one.selects(2 * BLOCK)
+    one.press("Selection", "Hide")
     one.draws(2 * BLOCK)
     one.camera.position = np.array([1.0, 2, 3])
     crowd.go(0)
-    back = opened(crowd, 2, "one")
+    back = opened(crowd, 2)
     back.draws(2 * BLOCK)
-    back.says(f"**{2 * BLOCK}** of")
+    back.selects(2 * BLOCK)
     assert back.gui["Prompts"].value == "red"
     np.testing.assert_allclose(back.camera.position, [1, 2, 3])
-    back.gui["History"].press("Undo")
+    back.press("History", "Undo")
     back.draws(4 * BLOCK)
-    copy = opened(crowd, 3, "one")  # the tab was duplicated
+    copy = opened(crowd, 3)  # the tab was duplicated
     assert copy.token not in ("", "one")
-    copy.ask("blue")
-    copy.says(f"**{BLOCK}** of")
-    assert f"**{2 * BLOCK}** of" in back.gui.says()
+    copy.asks("blue", BLOCK)
+    back.selects(2 * BLOCK)
+    gone = FakePage(4)  # before its panel is made
+    gone.gone = True
+    crowd.come(gone)  # type: ignore[arg-type]
+    assert sorted(crowd._here) == [1, 2, 3]
+    monkeypatch.setattr("normlift_ns.viewer.people.MOST_KEPT", 1)
+    for number in (3, 1):
+        crowd.go(number)
+    opened(crowd, 5, "another")
+    assert copy.token in crowd._memories and "two" not in crowd._memories  # who came last is remembered
 
 
-def test_a_link_carries_question_and_camera(crowd, run):
-    page = opened(crowd, 0, "one")
-    page.ask("red, blue")
-    page.says(f"**{3 * BLOCK}** of")
-    page.gui["Threshold"].press(0.25)
+def test_a_link_carries_question_and_camera(crowd):
+    page = opened(crowd)
+    page.asks("red, blue", 3 * BLOCK)
+    page.press("Threshold", 0.25)
     page.until(lambda: page.gui["Threshold"].value == 0.25)
     page.camera.position = np.array([1.0, 2, 3])
-    page.gui["Link"].press()
+    page.press("Link")
     page.until(lambda: page.link != "")
     link = read_link(page.link)
     assert link is not None
-    assert (link.prompts, link.threshold) == ("red, blue", 0.25)
+    assert (link.prompts, link.threshold, link.look) == ("red, blue", 0.25, "overlay")
     other = opened(crowd, 1, "two", page.link)
-    other.says(f"**{3 * BLOCK}** of")
+    other.selects(3 * BLOCK)
     np.testing.assert_allclose(other.camera.position, [1, 2, 3])
     other.until(lambda: other.gui["Threshold"].value == 0.25)
     broken = opened(crowd, 2, "three", page.link[:-7])
     broken.says("copy it again")
     nowhere = View((1, 2, 3), (1, 2, 3), (0, 0, 1), 1.0)
     blind = opened(crowd, 3, "four", write_link(structs.replace(link, view=nowhere)))
-    blind.says(f"**{3 * BLOCK}** of")
+    blind.selects(3 * BLOCK)
     assert not np.array_equal(blind.camera.position, blind.camera.look_at)  # it stays where a page begins
-
-
-def test_a_page_that_is_gone_before_its_panel_is_made_leaves_nothing(crowd):
-    page = FakePage(0)
-    page.gone = True
-    crowd.come(page)
-    assert crowd._here == {}
+    other_scene = opened(crowd, 4, "five", write_link(structs.replace(link, clicks={"like click 1": 4 * BLOCK})))
+    other_scene.says(f"no Gaussian {4 * BLOCK}")
 
 
 def test_a_slow_page_gets_the_last_picture_and_not_all_of_them(crowd):
-    page = opened(crowd, 0, "one")
-    page.ask("red")
-    page.says(f"**{2 * BLOCK}** of")
+    page = opened(crowd)
+    page.asks("red", 2 * BLOCK)
     page.draws(4 * BLOCK)
-    drawn, draw = [], page.draw
+    drawn, draw, state = [], page.draw, lambda: crowd._here[0].state
     page.draw = lambda buffer: drawn.append(len(buffer)) or draw(buffer)  # type: ignore[method-assign]
-    page.behind = True
-    page.gui["Selection"].press("Hide")
-    page.gui["Selection"].press("Unhide")
-    page.gui["Selection"].press("Only")
-    time.sleep(0.3)
+    page.slow = True
+    for deed in ("Hide", "Unhide", "Only"):
+        page.press("Selection", deed)
+    page.until(lambda: int(state().drawn.sum()) == 2 * BLOCK and "Only" in state().did)
+    looks = page.looks
+    page.until(lambda: page.looks > looks + 2)
     assert drawn == []
-    page.behind = False
+    page.slow = False
     page.draws(2 * BLOCK)
     assert len(drawn) <= 2
 
 
 def test_a_held_key_goes_back_to_what_was_before_and_stops_no_question(crowd, run):
-    page = opened(crowd, 0, "one")
+    page = opened(crowd)
     reading, go = threading.Event(), threading.Event()
 
     def slow(texts):
@@ -462,7 +480,7 @@ def test_a_held_key_goes_back_to_what_was_before_and_stops_no_question(crowd, ru
         return read(texts)
 
     def held(what: str) -> None:
-        page.gui["Session"].press(json.dumps({"token": "one", "held": what}))
+        page.press("Session", json.dumps({"token": "one", "held": what}))
 
     object.__setattr__(run, "texts", lambda: SimpleNamespace(rows=slow))
     page.ask("red")
@@ -473,58 +491,46 @@ def test_a_held_key_goes_back_to_what_was_before_and_stops_no_question(crowd, ru
     page.until(lambda: page.clicked is None and "Click on" not in page.gui.says())
     assert page.gui["Ask"].disabled
     go.set()
-    page.says(f"**{2 * BLOCK}** of")
-    page.gui["Select"].press()
-    page.says("Click on an object&#46;")
+    page.selects(2 * BLOCK)
+    page.press("Select")
+    page.says("Click on an object")
     held("Take away")
     page.says("Click on objects")
     held("")
-    page.says("Click on an object&#46;")
+    page.says("Click on an object")
     assert page.clicked is not None
-
-
-def test_the_nearest_match_of_what_is_not_there_is_gone_to(crowd, run):
-    page = opened(crowd, 0, "one")
-    person, place = crowd._here[0], (1.0, 2.0, 3.0)
-    person._panel.judge("", [SimpleNamespace(text="zebra", nearest=place), SimpleNamespace(text="red", nearest=None)])
-    before = page.camera.position
-    page.gui["Go to nearest: zebra"].press()
-    page.until(lambda: page.camera.position is not before)
-    np.testing.assert_allclose(run.records.units.to_scene(page.camera.look_at), place, atol=1e-6)
-    person._panel.judge("", [])
-    assert not any(w.label.startswith("Go to") and not w.removed for w in page.gui.made)
 
 
 def test_a_readonly_page_writes_nothing(crowd, run, monkeypatch):
     monkeypatch.setattr(crowd, "_run", Run(**{**vars(run), "readonly": True}))
-    page = opened(crowd, 0, "one")
+    page = opened(crowd)
     assert not any(w.label == "Save prompts in run" for w in page.gui.made)
-    page.ask("red")
-    page.says(f"**{2 * BLOCK}** of")
+    page.asks("red", 2 * BLOCK)
     crowd._here[0]._act("Save prompts in run", None)
     page.says("may only look")
     assert load_question(run.folder / FIELD_FOLDER) is None
-    page.gui["Download selection"].press()
+    page.press("Download selection")
     page.until(lambda: "red.ply" in page.files)
     assert list((run.folder / FIELD_FOLDER).iterdir()) == []
 
 
-def test_a_late_answer_is_dropped_and_what_fails_is_told(crowd, run, monkeypatch):
-    page = opened(crowd, 0, "one")
-    person = crowd._here[0]
+def test_a_late_answer_is_dropped_and_what_fails_is_told(crowd, run):
+    page = opened(crowd)
+    for button in ("Save prompts in run", "Download selection"):
+        page.press(button)
+        page.says("there is nothing to ")
 
     def slow(texts):
         if "blue" in texts:
-            page.gui["Cancel"].press()
+            page.press("Cancel")
         return read(texts)
 
     object.__setattr__(run, "texts", lambda: SimpleNamespace(rows=slow))
-    page.ask("red")
-    page.says(f"**{2 * BLOCK}** of")
+    page.asks("red", 2 * BLOCK)
     page.ask("blue")
     page.until(lambda: not page.gui["Ask"].disabled)
-    assert person.state.question is not None
-    assert person.state.question.texts == ("red",)
+    question = crowd._here[0].state.question
+    assert question is not None and question.texts == ("red",)
 
     def gone(_):
         raise FileNotFoundError("the weights are gone")
@@ -533,5 +539,5 @@ def test_a_late_answer_is_dropped_and_what_fails_is_told(crowd, run, monkeypatch
     page.ask("green")
     page.says("the weights are gone")
     page.until(lambda: not page.gui["Ask"].disabled)
-    page.gui["Session"].press("no greeting")
+    page.press("Session", "no greeting")
     page.says("no greeting")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,18 +25,19 @@ def test_pictures_that_would_replace_each_other_are_refused(tmp_path: Path) -> N
         (("contact_sheet.png", "b.png"), ("x",), "contact_sheet_0_x"),
     ):
         made, answer = scene(*names), SimpleNamespace(texts=texts)
-        with pytest.raises(InputError, match=rf"two pictures would be called .*{twice}\.png"):
+        with pytest.raises(InputError, match=rf"{twice}\.png"):
             save_overlays(made, answer, training_cameras(made), tmp_path)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("text", [r"$\frac{$", "$", "a\nb", "[/red]", "\ud800", "x\0y", "", "x" * 3000, "מים"])
-@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 300), (300, 1)])
-def test_a_text_is_drawn_as_it_is(text: str, size: tuple[int, int]) -> None:
-    image, selected = torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(size, dtype=torch.bool)
-    found = Found(text, "x" * 300)
-    assert picture_of(SHEET, found, text, image, image, selected).size[0] > 500
-    assert contact_sheet(SHEET, found, [(text, image, selected)] * 5).size[0] > 500
+def test_a_text_is_drawn_as_it_is() -> None:
+    sizes = ((HEIGHT, WIDTH), (1, 300), (300, 1))
+    for i, text in enumerate((r"$\frac{$", "$", "a\nb", "[/red]", "\ud800", "x\0y", "", "x" * 3000, "מים")):
+        size = sizes[i % 3]
+        image, selected = torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(size, dtype=torch.bool)
+        found = Found(text, "x" * 300)
+        assert picture_of(SHEET, found, text, image, image, selected).size[0] > 500, text
+        assert contact_sheet(SHEET, found, [(text, image, selected)] * 5).size[0] > 500, text
 
 
 def test_the_outline_goes_around_what_is_selected_and_the_photograph_stands_beside_it() -> None:
@@ -66,16 +68,13 @@ def test_the_title_says_how_much_and_on_what_evidence() -> None:
         text="x", answer=answer, mask=torch.tensor([True, False, True, False]), fraction=0.5, mean_reliability=0.5,
         peak=0.9, stands_out=True,
     )  # fmt: skip
-    assert Found.of(finding).title == "x"
-    assert Found.of(finding).summary == (
-        "50.0 % of the Gaussians; evidence: R 0.50, 3.0 views, 100 % of it poor (R < 0.6)"
-    )
+    for facts in ("50.0 %", "R 0.50", "3.0 views", "100 %", "R < 0.6"):
+        assert facts in Found.of(finding).summary
     finding.mask = torch.zeros(4, dtype=torch.bool)
-    assert Found.of(finding).summary == "nothing is above 0.5; the best match reaches 0.90"
-    finding.stands_out = False
-    assert Found.of(finding).title == "x   ·   probably not in this scene"
-    finding.stands_out = None  # nobody can tell
-    assert Found.of(finding).title == "x"
+    assert re.fullmatch(r"[^\d]* 0\.5; [^\d]* 0\.90", Found.of(finding).summary)  # threshold and peak
+    for stands_out, alone in ((True, True), (False, False), (None, True)):  # None: nobody can tell
+        finding.stands_out = stands_out
+        assert (Found.of(finding).title == "x") is alone
 
 
 def test_three_views_stand_in_one_row_and_more_in_a_square() -> None:

@@ -17,9 +17,8 @@ from normlift_ns.runs.votes import Picture
 from normlift_ns.session import actions
 from normlift_ns.session.state import State
 from normlift_ns.viewer.reasons import Reasons, reasons_mdx
-from tests.session.worlds import BLOCK, cubes, rows
+from tests.session.worlds import BLOCK, rows, world
 
-SPACE = cubes()
 NAMES = ("a/[x](y).png", "b.png", "c.png", "d.png", "e.png")
 
 
@@ -52,48 +51,31 @@ def told(votes: Any, *cubes_: int) -> str:
 
 
 def test_three_that_weigh_most_and_those_that_disagree():
-    text = html.unescape(told(FakeVotes(), 0))
-    assert text.startswith("The photographs agree")
-    most, different = text.split("**These disagree most:**")
-    assert "**These weigh most:**" in most
+    lines = told(FakeVotes(), 0)
+    named = [line for line in lines.splitlines() if line.startswith("a&#47;")]
+    assert len(named) == 2  # it weighs most, and disagrees a little
+    assert not any(set("[]()/") & set(line) for line in named)
+    most, different = html.unescape(lines).split("disagree most:")
+    assert "weigh most:" in most and "C_inter" in most
     assert "a/[x](y).png: 33% of the weight (320 pixels, 1 region), cosine 1.00" in most
     assert [name in most for name in NAMES] == [True, True, True, False, False]
-    assert "e.png: 7% of the weight" in different
-    assert "of the disagreement" in different
-    assert text.count("data:image/jpeg") == 4  # e.png, and three that weigh most, each once
+    assert "e.png: 7% of the weight" in different and "of the disagreement" in different
     alike = told(FakeVotes(), 1)
     assert "disagree most" not in alike
-    assert alike.count("data:image/jpeg") == 3
-
-
-def test_names_are_text():
-    lines = told(FakeVotes(), 0).splitlines()
-    found = [line for line in lines if line.startswith("a&#47;")]
-    assert len(found) == 2  # it weighs most, and disagrees a little
-    assert not any(set("[]()/") & set(line) for line in found)
-
-
-@pytest.mark.parametrize("problem", [InputError("they were given from Python"), FileNotFoundError("b.png is missing")])
-def test_pictures_that_cannot_be_had_are_no_reason_to_say_nothing(problem):
-    text = html.unescape(told(FakeVotes(problem), 0))
-    assert f"The photographs cannot be shown: {problem}" in text
-    assert "33% of the weight" in text
-    assert "data:image" not in text
-
-
-def test_a_selection_of_nothing_is_an_error():
-    reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
-    state = State(SPACE)
-    with pytest.raises(InputError, match="nothing is selected"):
-        reasons.find(reasons.start(state), state)
-    assert (reasons.content, reasons.busy) == ("", "")
+    assert [text.count("data:image/jpeg") for text in (lines, alike)] == [4, 3]  # e.png too, and each once
+    for problem in (InputError("they were given from Python"), FileNotFoundError("b.png is missing")):
+        text = html.unescape(told(FakeVotes(problem), 0))
+        assert f": {problem}" in text and "33% of the weight" in text and "data:image" not in text
 
 
 def test_reasons_belong_to_their_selection():
     reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
-    state = actions.select(State(SPACE), rows(0))
+    with pytest.raises(InputError, match="nothing is selected"):
+        reasons.find(reasons.start(State(world())), State(world()))
+    assert (reasons.content, reasons.busy) == ("", "")
+    state = actions.select(State(world()), rows(0))
     reasons.find(reasons.start(state), state)
-    assert "These weigh most" in reasons.content
+    assert "weigh most" in reasons.content
     reasons.follow(actions.hide(state))  # the selection is the same
     assert reasons.content != ""
     reasons.follow(actions.select(state, rows(1)))
@@ -113,7 +95,7 @@ def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
             return super().explain(selected, refined=refined)
 
     reasons = Reasons(Slow)  # type: ignore[arg-type]
-    state, raised = actions.select(State(SPACE), rows(0)), []
+    state, raised = actions.select(State(world()), rows(0)), []
 
     def find() -> None:
         try:
@@ -124,7 +106,7 @@ def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
     thread = Thread(target=find)
     thread.start()
     assert begun.wait(20)
-    assert reasons.busy.startswith("Looking")
+    assert reasons.busy
     reasons.follow(actions.select(state, rows(1)))
     go_on.set()
     thread.join(20)

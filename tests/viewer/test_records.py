@@ -1,28 +1,19 @@
 """What the browser gets: records of 32 bytes, right to float16, also of Gaussians that are flat."""
 
-from types import SimpleNamespace
-
 import numpy as np
-import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from normlift_ns import Camera, GaussianScene
+from normlift_ns import GaussianScene
 from normlift_ns.session import actions
+from normlift_ns.session.colours import prompt_colours
 from normlift_ns.session.prompts import pose, read_prompts
 from normlift_ns.session.state import State
 from normlift_ns.viewer.adapter import _unpacked
 from normlift_ns.viewer.paint import legend, opacities, painted
 from normlift_ns.viewer.records import BYTES, Units, cholesky, make_records
-from tests.session.worlds import BLOCK, cubes, read
-
-
-def scene(gaussians: GaussianScene, rgb: torch.Tensor | None = None, cameras=()):
-    """What `make_records` needs of a scene."""
-    colours = torch.full((len(gaussians), 3), 0.5) if rgb is None else rgb
-    parameters = {"features_dc": (colours - 0.5) / 0.28209479177387814}
-    train = SimpleNamespace(cameras=cameras)
-    return SimpleNamespace(gaussians=gaussians, parameters=parameters, has_harmonics=True, train=train)
+from tests.session.worlds import BLOCK, read, rows, world
+from tests.viewer.scenes import camera, scene_of, spheres
 
 
 def gaussians(count: int, seed: int = 0, thinnest: float = -3.0) -> GaussianScene:
@@ -47,16 +38,13 @@ def assembled(factors: np.ndarray) -> np.ndarray:
     return lower @ lower.swapaxes(1, 2)
 
 
-@pytest.mark.parametrize("thinnest", [-3.0, -9.0])
-def test_factors_are_those_of_the_covariance(thinnest):
-    found = gaussians(500, thinnest=thinnest)
-    factors, expected = cholesky(found, torch.arange(500)), covariances(found, 1e-4)
-    size = np.abs(expected).max(axis=(1, 2), keepdims=True)
-    assert (np.abs(assembled(factors) - expected) / size).max() < 1e-13
-    assert (factors[:, [0, 3, 5]] > 0).all()
-
-
-def test_flat_and_point_like_gaussians_have_factors():
+def test_factors_are_those_of_the_covariance_also_of_flat_and_point_like_gaussians():
+    for thinnest in (-3.0, -9.0):
+        found = gaussians(500, thinnest=thinnest)
+        factors, expected = cholesky(found, torch.arange(500)), covariances(found, 1e-4)
+        size = np.abs(expected).max(axis=(1, 2), keepdims=True)
+        assert (np.abs(assembled(factors) - expected) / size).max() < 1e-13
+        assert (factors[:, [0, 3, 5]] > 0).all()
     scales = torch.tensor([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1e8, 1e-20, 1e-20]])
     quats = torch.tensor([[1.0, 0, 0, 0], [0.3, -0.5, 0.1, 0.8], [1, 1, 1, 1], [0, 0, 1, 0]])
     flat = GaussianScene(torch.zeros(4, 3), quats, scales, torch.ones(4))
@@ -67,8 +55,7 @@ def test_flat_and_point_like_gaussians_have_factors():
 
 def test_records_hold_the_scene_in_units_of_the_browser():
     found, rgb = gaussians(300), torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
-    camera = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
-    records = make_records(scene(found, rgb, [camera]))  # pyright: ignore[reportArgumentType]
+    records = make_records(scene_of(found, rgb, (camera(),)))
     expected = (found.opacities >= 1 / 255).nonzero().squeeze(1).numpy()
     np.testing.assert_array_equal(records.rows, expected)
     buffer = records.buffer(records.colours, np.ones(len(expected), bool))
@@ -83,41 +70,37 @@ def test_records_hold_the_scene_in_units_of_the_browser():
     np.testing.assert_array_equal(records.buffer(records.colours, some), buffer[some])
 
 
-def test_of_too_many_the_most_opaque_and_largest_are_drawn():
+def test_what_cannot_be_drawn_and_the_faintest_and_smallest_of_too_many_are_left_out():
     found = gaussians(200)
-    records = make_records(scene(found), 50)  # pyright: ignore[reportArgumentType]
+    records = make_records(scene_of(found), 50)
     area = found.opacities * found.scales.topk(2, dim=1).values.prod(dim=1)
     assert set(records.rows.tolist()) == set(area.topk(50).indices.tolist())
     assert records.left_out == int((found.opacities >= 1 / 255).sum()) - 50
-
-
-def test_what_is_not_finite_is_not_drawn():
-    found = gaussians(20)
-    means = found.means.clone()
-    means[3], means[4, 0] = torch.nan, torch.inf
-    broken = GaussianScene(means, found.quats, found.scales, torch.ones(20))
-    records = make_records(scene(broken))  # pyright: ignore[reportArgumentType]
-    assert {3, 4} & set(records.rows.tolist()) == set()
+    assert f"{records.left_out:,}" in records.facts and make_records(scene_of(found)).left_out == 0
+    broken = gaussians(200)
+    broken.means[3], broken.means[4, 0] = torch.nan, torch.inf
+    assert {3, 4} & set(make_records(scene_of(broken)).rows.tolist()) == set()
     assert Units.of([], np.zeros((0, 3))) == Units((0.0, 0.0, 0.0), 1.0)
     assert Units.of([], np.ones((5, 3))).factor == 1.0
 
 
 def test_colours_show_what_is_selected_and_hidden():
-    space = cubes()
-    n = len(space)
-    found = GaussianScene(space.means, torch.eye(4)[:1].expand(n, 4), torch.ones(n, 3), torch.ones(n))
-    records = make_records(scene(found))  # pyright: ignore[reportArgumentType]
+    space = world()
+    records = make_records(scene_of(spheres(space.means)))
     prompts, question = pose(space.field, read_prompts("red, blue", read), read, negatives=())
     state = actions.look(actions.ask(State(space), prompts, question), "prompts")
     colours, drawn = painted(records, state)
     assert drawn.all()
-    assert colours[0, 0] > 150 > colours[0, 2]
-    assert colours[BLOCK, 2] > 150 > colours[BLOCK, 0]
-    assert np.ptp(colours[3 * BLOCK].astype(int)) == 0
+    grey = int(records.colours[0, 0] * 0.8)
+    for number, colour in ((0, prompt_colours(["red"])[0]), (BLOCK, prompt_colours(["blue"])[0])):
+        np.testing.assert_allclose(colours[number], 0.15 * grey + 0.85 * 255 * np.array(colour), atol=1)
+    assert colours[3 * BLOCK].tolist() == 3 * [grey]
     state = actions.look(actions.hide(actions.show(state, 0)), "overlay")
     colours, drawn = painted(records, state)
     assert drawn.reshape(4, -1).all(axis=1).tolist() == [False, True, False, True]
-    assert np.ptp(colours[BLOCK].astype(int)) == 0
+    assert colours[BLOCK].tolist() == 3 * [grey]
+    assert colours[0].tolist() == [253, 231, 37]  # the best match: all of the last colour of the map
+    assert painted(records, actions.add(State(space, look="overlay"), rows(1)))[0][BLOCK].tolist() == [255, 191, 26]
     assert "0.80 relevancy 1.00" in legend(state)
     colours, _ = painted(records, actions.look(state, "reliability"))
     assert len(np.unique(colours, axis=0)) >= 2
@@ -126,16 +109,9 @@ def test_colours_show_what_is_selected_and_hidden():
 
 
 def test_a_faint_selection_can_be_seen():
-    space = cubes()
-    n = len(space)
-    faint = torch.arange(n) < BLOCK
-    opacity = torch.where(faint, 0.02, 0.9)
-    gaussians = GaussianScene(space.means, torch.eye(4)[:1].expand(n, 4), torch.full((n, 3), 0.1), opacity)
-    scene = SimpleNamespace(
-        gaussians=gaussians, parameters={"features_dc": torch.zeros(n, 3)}, has_harmonics=True,
-        train=SimpleNamespace(cameras=[]),
-    )  # fmt: skip
-    records = make_records(scene)  # type: ignore[arg-type]
+    space = world()
+    faint = torch.arange(len(space)) < BLOCK
+    records = make_records(scene_of(spheres(space.means, 0.1, torch.where(faint, 0.02, 0.9))))
     plain = State(space)
     chosen = actions.look(actions.select(plain, faint), "overlay")
     shown = opacities(records, chosen)
@@ -143,11 +119,7 @@ def test_a_faint_selection_can_be_seen():
     np.testing.assert_array_equal(shown[BLOCK:], records.alpha[BLOCK:])
     buffer = records.buffer(*painted(records, chosen), shown)
     np.testing.assert_array_equal(buffer[:, 7] >> 24, shown)
-    assert legend(chosen) == ""
+    for by_hand in (chosen, actions.look(actions.add(plain, faint), "overlay")):
+        assert legend(by_hand) == ""
     for state in (plain, actions.look(chosen, "colours"), actions.look(actions.select(plain, ~faint), "overlay")):
         np.testing.assert_array_equal(opacities(records, state), records.alpha)
-
-
-def test_what_is_added_by_hand_has_no_scale():
-    space = cubes()
-    assert legend(actions.look(actions.add(State(space), torch.arange(len(space)) < 3), "overlay")) == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import threading
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -13,14 +14,13 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from normlift_ns import Camera, GaussianScene
 from normlift_ns.session.state import State
 from normlift_ns.viewer.blind.page import SCRIPT, picture_script, with_script
 from normlift_ns.viewer.blind.stills import Stills, still
 from normlift_ns.viewer.eye import Eye
-from normlift_ns.viewer.records import make_records
 from normlift_ns.viewer.shared import Run
-from tests.session.worlds import cubes
+from tests.session.worlds import world
+from tests.viewer.scenes import camera, run_of, scene_of, spheres
 
 AXES = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 """Right, down and forward of a camera, as columns."""
@@ -44,19 +44,12 @@ class FakePage:
 @pytest.fixture
 def run(tmp_path) -> Run:
     """Three Gaussians: a red one ahead, a green one to the right, a blue one above; the others are far behind."""
-    space = cubes()
-    n = len(space)
+    n = len(world())
     means = torch.from_numpy(PLACE - 1000 * AXES[:, 2]).float().repeat(n, 1)
     means[:3] = torch.from_numpy(np.stack([AHEAD, RIGHT, UP])).float()
-    gaussians = GaussianScene(means, torch.eye(4)[:1].expand(n, 4), torch.full((n, 3), 0.05), torch.full((n,), 0.99))
-    colours = torch.zeros(n, 3)
-    colours[:3] = torch.eye(3) * 4 - 2
-    camera = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
-    scene: Any = SimpleNamespace(
-        gaussians=gaussians, parameters={"features_dc": colours}, has_harmonics=True, rasterize_mode="classic",
-        train=SimpleNamespace(cameras=[camera]),
-    )  # fmt: skip
-    return Run(tmp_path, scene, space, make_records(scene), lambda: None)
+    rgb = torch.full((n, 3), 0.5)
+    rgb[:3] += (torch.eye(3) * 4 - 2) * 0.28209479177387814
+    return run_of(tmp_path, world(), scene_of(spheres(means, 0.05, 0.99), rgb, (camera(),)))
 
 
 @pytest.fixture
@@ -92,6 +85,7 @@ def test_a_picture_shows_what_the_camera_of_the_page_sees(run, page):
 
 def test_pictures_follow_camera_and_state_and_get_fine_at_rest(run, page):
     state, told = State(run.space), []
+    before = set(threading.enumerate())
     stills = Stills(run, page, Eye(page, run.records), lambda: state, told.append)  # type: ignore[arg-type]
 
     def until(true: Any) -> None:
@@ -100,6 +94,7 @@ def test_pictures_follow_camera_and_state_and_get_fine_at_rest(run, page):
             assert time.monotonic() < deadline, (len(page.pictures), told)
             time.sleep(0.01)
 
+    (drawing,) = [one for one in threading.enumerate() if one not in before and "_draw_on" in one.name]
     stills.change()
     until(lambda: len(page.pictures) == 2)
     coarse, fine = page.pictures
@@ -114,7 +109,8 @@ def test_pictures_follow_camera_and_state_and_get_fine_at_rest(run, page):
     until(lambda: told != [])
     stills.stop()
     page.moved()
-    time.sleep(0.3)
+    drawing.join(60)
+    assert not drawing.is_alive()
     assert len(page.pictures) == 4
 
 

@@ -1,0 +1,47 @@
+"""Small scenes for the tests of viewers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+from normlift_ns import Camera, GaussianScene
+from normlift_ns.runs.files import FIELD_FOLDER
+from normlift_ns.session.space import Space
+from normlift_ns.viewer.records import make_records
+from normlift_ns.viewer.shared import Run
+from tests.session.worlds import read
+
+
+def camera() -> Camera:
+    return Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
+
+
+def spheres(means: torch.Tensor, scale: float = 1.0, opacity: float | torch.Tensor = 0.9) -> GaussianScene:
+    n = len(means)
+    return GaussianScene(means, torch.eye(4)[:1].expand(n, 4), torch.full((n, 3), scale), torch.ones(n) * opacity)
+
+
+def scene_of(gaussians: GaussianScene, rgb: torch.Tensor | None = None, cameras: tuple[Camera, ...] = ()) -> Any:
+    """What viewers need of a scene."""
+    n = len(gaussians)
+    colours = torch.full((n, 3), 0.5) if rgb is None else rgb
+    parameters = {
+        "means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales.log(),
+        "opacities": gaussians.opacities.logit()[:, None], "features_dc": (colours - 0.5) / 0.28209479177387814,
+        "features_rest": torch.zeros(n, 0, 3),
+    }  # fmt: skip
+    return SimpleNamespace(
+        gaussians=gaussians, parameters=parameters, has_harmonics=True, rasterize_mode="classic",
+        train=SimpleNamespace(cameras=cameras),
+    )  # fmt: skip
+
+
+def run_of(folder: Path, space: Space, scene: Any = None) -> Run:
+    """A run whose encoder knows three words."""
+    scene = scene_of(spheres(space.means, 0.3), cameras=(camera(),)) if scene is None else scene
+    (folder / FIELD_FOLDER).mkdir(exist_ok=True)
+    return Run(folder, scene, space, make_records(scene), lambda: SimpleNamespace(rows=read))
