@@ -144,18 +144,6 @@ def test_archives_that_would_grow_are_refused(tmp_path: Path) -> None:
             read_checkpoint(tmp_path / name)
 
 
-def test_what_is_not_a_file_is_refused(tmp_path: Path) -> None:
-    for read in (read_checkpoint, read_gsplat, read_ply, read_world_transform, read_dataparser_transforms):
-        for kind in no_files(tmp_path / "some"):
-            try:
-                read(tmp_path / "some")
-            except (FileNotFoundError, InputError) as error:
-                assert "some" in str(error), (read, kind)
-            else:
-                pytest.fail(f"{read.__name__} reads {kind}")
-        (tmp_path / "some").unlink()
-
-
 def test_ply_rows_that_a_small_file_cannot_hold_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.ply"
     for header in (
@@ -273,6 +261,7 @@ LOADERS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], Any]]] 
     "WEBP": ("a.png", lambda path: noise().convert("RGB").save(path, "WEBP"), looked_at),
     "mask": ("mask.png", lambda path: (image_frame(path.parent, PLAIN), noise().save(path)), looked_at),
     "world": ("world.json", lambda path: path.write_text(json.dumps(np.eye(4).tolist())), read_world_transform),
+    "world.txt": ("world.txt", lambda path: np.savetxt(path, np.eye(4)), read_world_transform),
     "parser": (
         "world.json",
         lambda path: path.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.5})),
@@ -311,6 +300,12 @@ def test_damage_is_a_message(tmp_path: Path) -> None:
         path = tmp_path / kind / name
         path.parent.mkdir()
         write(path)
+        path.rename(tmp_path / "whole")
+        for what in no_files(path):
+            with pytest.raises((FileNotFoundError, InputError)) as caught:
+                read(path)
+            assert path.stem in str(caught.value), (kind, what)
+        (tmp_path / "whole").replace(path)
 
         def load(read: Callable[[Path], Any] = read, path: Path = path) -> None:
             try:
