@@ -317,8 +317,7 @@ def test_poses_and_pictures_are_written(one_side, tmp_path, monkeypatch):
         assert entry["aspect"] == pytest.approx(camera.width / camera.height)
     document = json.loads(written[0].read_text())
     assert document["regions"][0]["size"] == found.regions[0].size
-    assert "pictures" not in document
-    assert len(document["poses"]) == len(cameras)
+    assert "pictures" not in document and len(document["poses"]) == len(cameras)
     with pytest.raises(FileExistsError):
         found.save(tmp_path / "next.json")
     for name in ("", ".", ".."):

@@ -114,10 +114,8 @@ def test_a_ply_file_with_a_colmap_project(native, splat, frames, given, tmp_path
     matrix = np.diag([3.0, 3, 3, 1]) @ [[0, 0, 1, 2.0], [1, 0, 0, -1], [0, 1, 0, 0.5], [0, 0, 0, 1]]
     (tmp_path / "world.json").write_text(json.dumps(matrix.tolist()))
     path = write_ply(tmp_path / "s.ply", ply_columns(splat))
-    for binary, turned, world in (
-        (True, frames, None),
-        (False, in_file_world(frames, matrix), tmp_path / "world.json"),
-    ):
+    there = in_file_world(frames, matrix)
+    for binary, turned, world in ((True, frames, None), (False, there, tmp_path / "world.json")):
         project = write_colmap(tmp_path / f"p{binary}", turned, "PINHOLE", binary=binary)
         scene = open_splat(path, replace(given, colmap=project, world_transform=world))
         assert scene.train.names == native.train.names
@@ -281,11 +279,10 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     images = native.location.folder / "images"
     write_colmap(tmp_path / "p", frames, "PINHOLE")
     write_colmap(tmp_path / "empty", [], "PINHOLE", binary=False)
-    for folder, names, size in (("half", frames[:1], None), ("flat", frames, (160, 60)), ("all", frames, None)):
+    for folder, names, size in (("half", frames[:1], (160, 120)), ("flat", frames, (160, 60))):
         (tmp_path / folder).mkdir()
         for frame in names:
-            image = Image.open(frame.file)
-            (image if size is None else image.resize(size)).save(tmp_path / folder / frame.file.name)
+            Image.open(frame.file).resize(size).save(tmp_path / folder / frame.file.name)
     (tmp_path / "masks").mkdir()
     transforms = json.loads((images.parent / "transforms.json").read_text())
     for frame in transforms["frames"]:
@@ -293,7 +290,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     transforms = {name: value for name, value in transforms.items() if not name.endswith("_filenames")}
     (tmp_path / "t.json").write_text(json.dumps(transforms))
     path = write_gsplat(tmp_path / "ckpt_1_rank0.pt", rows_of(splat, slice(0, 50)))
-    every = {"colmap": "p", "images": "all"}
+    every = {"colmap": "p", "images": str(images)}
     for options, message in (
         ({}, "cameras, got none"),
         ({"images": "."}, "cameras, got none"),
