@@ -19,9 +19,8 @@ def lightness(colors: torch.Tensor) -> torch.Tensor:
 
 
 def test_colours_are_those_of_matplotlib() -> None:
-    torch.testing.assert_close(
-        colors_of("viridis")[[0, 255]], torch.tensor([[0.267, 0.005, 0.329], [0.993, 0.906, 0.144]]), atol=1e-3, rtol=0
-    )
+    ends = torch.tensor([[0.267, 0.005, 0.329], [0.993, 0.906, 0.144]])
+    torch.testing.assert_close(colors_of("viridis")[[0, 255]], ends, atol=1e-3, rtol=0)
 
 
 def test_the_default_maps_become_lighter_evenly_for_every_eye() -> None:

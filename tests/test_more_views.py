@@ -4,7 +4,7 @@ and that of the same views, rules and backend."""
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +32,19 @@ def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     counts = dict.fromkeys(("cut", "encoded", "rasterized"), 0)
     cut, encode, rasterize = Superpixels.labels, ColourEncoder.encode_each, observing.rasterize_evidence
 
-    def counting_cut(self: Any, image: Any, name: str) -> Any:
-        counts["cut"] += 1
-        return cut(self, image, name)
+    def count(what: str, number: int, given: Any) -> Any:
+        counts[what] += number
+        return given
 
-    def counting_encode(self: Any, views: Any) -> Iterator[Any]:
-        def each() -> Iterator[Any]:
-            for view in views:
-                counts["encoded"] += 1
-                yield view
+    def rasterizing(gaussians: Any, cameras: Any, *more: Any, **options: Any) -> Any:
+        return rasterize(gaussians, count("rasterized", len(cameras), cameras), *more, **options)
 
-        return encode(self, each())
+    def encoding(self: ColourEncoder, views: Any) -> Any:
+        return encode(self, (count("encoded", 1, view) for view in views))
 
-    def counting_rasterize(gaussians: Any, cameras: Any, *arguments: Any, **options: Any) -> Any:
-        counts["rasterized"] += len(cameras)
-        return rasterize(gaussians, cameras, *arguments, **options)
-
-    monkeypatch.setattr(Superpixels, "labels", counting_cut)
-    monkeypatch.setattr(ColourEncoder, "encode_each", counting_encode)
-    monkeypatch.setattr(observing, "rasterize_evidence", counting_rasterize)
+    monkeypatch.setattr(Superpixels, "labels", lambda self, image, name: cut(self, count("cut", 1, image), name))
+    monkeypatch.setattr(ColourEncoder, "encode_each", encoding)
+    monkeypatch.setattr(observing, "rasterize_evidence", rasterizing)
     monkeypatch.setattr(observing, "_LARGEST_CHUNK", 4)
     return counts
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from normlift_ns import Camera, InputError, LiftOptions, RasterSettings, SourceOptions, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
@@ -53,12 +54,8 @@ def observations(lifted: EvaluatedRun) -> list[tuple[Camera, Tensor, Tensor]]:
     return found
 
 
-def of_sums(total: Tensor) -> Tensor:
-    return torch.nn.functional.normalize(total, dim=1)
-
-
 def sfs(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
-    return of_sums(sum(weights**2 @ features for _, weights, features in seen))
+    return normalize(sum(weights**2 @ features for _, weights, features in seen))
 
 
 def occam(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
@@ -70,7 +67,7 @@ def occam(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
             x, y, z = (camera.K.double() @ (pose[:3, :3] @ mean + pose[:3, 3])).tolist()
             if z > 0 and 0 <= x / z < WIDTH and 0 <= y / z < HEIGHT:
                 total[j] += weight[j] * features[int(y / z) * WIDTH + int(x / z)]
-    return of_sums(total)
+    return normalize(total)
 
 
 def drsplat(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
@@ -78,7 +75,7 @@ def drsplat(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     for _, weights, features in seen:
         kept = weights * (weights >= weights.topk(TOP, dim=0).values[-1])
         total = total + kept @ features
-    return of_sums(total)
+    return normalize(total)
 
 
 def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
@@ -92,10 +89,10 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
         if len(used) == 0:
             continue
         weight, features = (torch.cat(part) for part in zip(*used))
-        u[j] = torch.nn.functional.normalize(weight @ features, dim=0)
+        u[j] = normalize(weight @ features, dim=0)
         for _ in range(10):
             far = (1 - features @ u[j]).clamp(min=1e-4)
-            u[j] = torch.nn.functional.normalize((weight / far) @ features, dim=0)
+            u[j] = normalize((weight / far) @ features, dim=0)
     return u
 
 
@@ -193,13 +190,11 @@ def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
 
 def test_lengths_of_pixels_are_those_of_composited_features(lifted):
     camera, weights, _ = observations(lifted)[1]
-    features = weights.T @ lifted.field.directions(refined=False).double()
-    (length,) = lifted.feature_lengths([camera])
-    assert torch.allclose(length.flatten(), torch.linalg.vector_norm(features, dim=1), atol=1e-3)
     norm = lifted.field.scalars.norm[:, None]
-    (scaled,) = lifted.feature_lengths([camera], norm)
-    features = weights.T @ (lifted.field.directions(refined=False) * norm).double()
-    assert torch.allclose(scaled.flatten(), torch.linalg.vector_norm(features, dim=1), atol=1e-3)
+    for more, factor in (((), 1.0), ((norm,), norm)):
+        features = weights.T @ (lifted.field.directions(refined=False) * factor).double()
+        (length,) = lifted.feature_lengths([camera], *more)
+        assert torch.allclose(length.flatten(), torch.linalg.vector_norm(features, dim=1), atol=1e-3)
 
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: gsplat cannot run")
@@ -251,13 +246,9 @@ def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
     """The loop over views and channels, with gsplat's compiled functions replaced by dense products."""
     seen = observations(lifted)[:2]
     weights = iter([weights for _, weights, _ in seen])
-    names = ("means2d", "conics", "opacities", "offsets", "members")
 
     def project_views(job: Job, cameras: list[Camera]) -> SimpleNamespace:
-        return SimpleNamespace(**{**dict.fromkeys(names), "members": next(weights)})
-
-    def forward(*drawing: Any) -> tuple[Any, Tensor, Any]:
-        return None, torch.zeros(1, HEIGHT, WIDTH, 1), None
+        return SimpleNamespace(means2d=None, conics=None, opacities=None, offsets=None, members=next(weights))
 
     def backward(*given: Any) -> tuple[Any, ...]:
         gradient = given[13]
@@ -265,7 +256,10 @@ def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
         return None, None, None, (given[10] @ gradient.flatten(0, 2))[None]
 
     monkeypatch.setattr("normlift_ns.evaluation.dense.project_views", project_views)
-    monkeypatch.setattr("normlift_ns.evaluation.dense.compiled_rasterizer", lambda: (forward, backward))
+    monkeypatch.setattr(
+        "normlift_ns.evaluation.dense.compiled_rasterizer",
+        lambda: (lambda *drawing: (None, torch.zeros(1, HEIGHT, WIDTH, 1), None), backward),
+    )
     g = generator(0)
     maps = [torch.rand(HEIGHT, WIDTH, 45, generator=g, dtype=torch.float64) for _ in seen]
     job = Job(lifted.scene.gaussians, False, RasterSettings(), torch.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
@@ -21,23 +21,9 @@ from normlift_ns.evaluation.coverage.gain import FAINT, Known, choose_views, gai
 from normlift_ns.evaluation.coverage.photographs import lifted_names
 from normlift_ns.evaluation.coverage.study import Coverage, coverage_of
 from normlift_ns.raster.settings import RasterSettings
-from tests.scenes import Photographs
+from tests.scenes import Photographs, generator, made_scene
 
-
-@dataclass
-class Wall:
-    """A thick wall across x = 0, whose two sides are different Gaussians."""
-
-    gaussians: GaussianScene
-    train: Photographs
-    held_out: Photographs
-    rasterize_mode: str = "classic"
-    name: str = "wall"
-    renderer: None = None
-    background: Tensor = field(default_factory=lambda: torch.zeros(3))
-
-    def colors(self, camera: Camera) -> Tensor:
-        return torch.full((len(self.gaussians), 3), 0.5)
+NONE = Photographs([], [])
 
 
 def looking(eye: tuple[float, float, float], target=(0.0, 0.0, 0.0), width=64, height=48) -> Camera:
@@ -56,19 +42,25 @@ SIDE = 24
 """Gaussians along an edge of the wall."""
 
 
-def wall() -> Any:
-    """Eight photographs, four of each side, and one held out of the far side."""
+def wall(**changes: Any) -> Any:
+    """A thick wall across x = 0, whose two sides are different Gaussians; eight photographs, four of each side, and one
+    held out of the far side."""
     line = torch.linspace(-1, 1, SIDE)
     y, z = (x.flatten() for x in torch.meshgrid(line, line, indexing="ij"))
     near, far = (torch.stack([torch.full_like(y, x), y, z], 1) for x in (-0.15, 0.15))
-    means = torch.cat([near, far])
-    n = len(means)
+    n = 2 * SIDE * SIDE
     scales = torch.tensor([0.002, 0.055, 0.055]).expand(n, 3).contiguous()
     quats = torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4).contiguous()
-    scene = GaussianScene(means, quats, scales, torch.full((n,), 0.99))
-    places = [(-3.0, y, 0.2) for y in (-0.9, -0.3, 0.3, 0.9)] + [(3.0, y, 0.2) for y in (-0.9, -0.3, 0.3, 0.9)]
-    train = Photographs([f"{i}.png" for i in range(8)], [looking(place) for place in places])
-    return Wall(scene, train, Photographs(["h.png"], [looking((3.0, 0.0, 0.4))]))
+    scene = GaussianScene(torch.cat([near, far]), quats, scales, torch.full((n,), 0.99))
+    cameras = [looking((x, y, 0.2)) for x in (-3.0, 3.0) for y in (-0.9, -0.3, 0.3, 0.9)]
+    facts = {
+        "train": Photographs([f"{i}.png" for i in range(8)], cameras),
+        "held_out": Photographs(["h.png"], [looking((3.0, 0.0, 0.4))]),
+        "colors": lambda camera: torch.full((n, 3), 0.5),
+        "renderer": None,
+        "background": torch.zeros(3),
+    }
+    return made_scene(scene, **{**facts, **changes})
 
 
 def lifted(scene: Any, used: list[int], *, blank: tuple[int, ...] = ()) -> SemanticField:
@@ -106,9 +98,8 @@ def test_the_far_side_is_the_region_and_its_photographs_are_chosen(one_side):
     assert region.views < 0.5
     assert found.left_out == {"max_views": 3, "no features": 1, "held out": 1}
     why = {photograph.name: photograph.why for photograph in found.photographs}
-    assert why == {"4.png": "max_views", "5.png": "no features", "6.png": "max_views", "7.png": "max_views"} | {
-        "h.png": "held out"
-    }
+    others = dict.fromkeys(("4.png", "6.png", "7.png"), "max_views")
+    assert why == {**others, "5.png": "no features", "h.png": "held out"}
     assert all(photograph.regions == [1] for photograph in found.photographs)
     first, second, *_ = (photograph.gain for photograph in found.photographs)
     # R of the far side, half of the surface, goes to 1 / 2, and with two views to 2 / 3
@@ -117,12 +108,15 @@ def test_the_far_side_is_the_region_and_its_photographs_are_chosen(one_side):
     assert found.remarks == []
 
 
-def test_photographs_of_the_other_side_come_first():
+def test_photographs_of_the_other_side_come_first(monkeypatch):
     scene = wall()
-    found = coverage_of(scene, lifted(scene, [0, 1]))
-    names = [photograph.name for photograph in found.photographs]
-    assert set(names[:2]) <= {"4.png", "5.png", "6.png", "7.png", "h.png"}
-    assert found.photographs[0].gain > 3 * found.photographs[-1].gain
+    photographs_ = coverage_of(scene, lifted(scene, [0, 1])).photographs
+    assert {photograph.name for photograph in photographs_[:2]} <= {"4.png", "5.png", "6.png", "7.png", "h.png"}
+    assert photographs_[0].gain > 3 * photographs_[-1].gain
+    monkeypatch.setattr(photographs, "MOST_VIEWS", 2)  # of more, some are looked at
+    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
+    assert {photograph.name for photograph in found.photographs} == {"4.png", "h.png"}
+    assert any("5" in remark and "2" in remark for remark in found.remarks)
 
 
 def test_scale_of_the_pictures_does_not_matter(one_side):
@@ -130,13 +124,13 @@ def test_scale_of_the_pictures_does_not_matter(one_side):
     scene = wall()
     whole = lifted(scene, [0, 1, 2, 3], blank=(5,))
     larger = replace(whole, scalars=replace(whole.scalars, weight=16 * whole.scalars.weight))
-    one, other = one_side, coverage_of(scene, larger)
-    assert [p.name for p in one.photographs] == [p.name for p in other.photographs]
-    assert [p.gain for p in one.photographs] == pytest.approx([p.gain for p in other.photographs])
+    one, other = one_side.photographs, coverage_of(scene, larger).photographs
+    assert [photograph.name for photograph in one] == [photograph.name for photograph in other]
+    assert [photograph.gain for photograph in one] == pytest.approx([photograph.gain for photograph in other])
 
 
 def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[Known, SparseRows, Tensor]:
-    g = torch.Generator().manual_seed(seed)
+    g = generator(seed)
     dense = torch.rand(n, views, generator=g, dtype=torch.float64) * (torch.rand(n, views, generator=g) < 0.6)
     before = torch.rand(n, 3, generator=g, dtype=torch.float64) * (torch.rand(n, 3, generator=g) < 0.5)
     surface = torch.cat([dense, before], 1).amax(1)
@@ -196,21 +190,19 @@ def test_weights_are_shares_of_the_picture():
     scene = wall()
     drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
     small, large = (gain.view_weights(drawn, scene.train.cameras, pixels=pixels) for pixels in (1728, 10**9))
-    assert small.row_sums().sum() == pytest.approx(
-        float(large.row_sums().sum()), rel=0.1
-    )  # the blur of a pixel is wider in the small one
-    assert 0.1 < float(large.row_sums().sum()) / 8 < 1
+    share = float(large.row_sums().sum())
+    assert small.row_sums().sum() == pytest.approx(share, rel=0.1)  # the blur of a pixel is wider in the small one
+    assert 0.1 < share / 8 < 1
 
 
 def test_everything_reliable_is_said():
-    scene = replace(wall(), held_out=Photographs([], []))
+    scene = wall(held_out=NONE)
     found = coverage_of(scene, lifted(scene, list(range(8))))
     assert (found.regions, found.photographs, found.left_out, len(found.remarks)) == ([], [], {}, 2)
 
 
 def test_one_camera():
-    scene = wall()
-    scene = replace(scene, train=Photographs(["0.png"], scene.train.cameras[:1]), held_out=Photographs([], []))
+    scene = wall(train=Photographs(["0.png"], [looking((-3.0, -0.9, 0.2))]), held_out=NONE)
     found = coverage_of(scene, lifted(scene, [0]), min_reliability=0.6)
     n_eff = 1 / (1 + FAINT**2)
     assert found.regions[0].reliability == pytest.approx(n_eff / (n_eff + 1))
@@ -242,29 +234,21 @@ def test_records_of_what_was_lifted():
 
 
 def test_cameras_that_see_nothing_and_wrong_bounds_are_refused(unchecked):
-    scene, field_ = wall(), lifted(wall(), [0, 1])
+    scene = wall()
+    found = lifted(scene, [0, 1])
     for wrong in (-0.1, 1.1, float("nan"), True):
         with pytest.raises(InputError, match="min_reliability"):
-            coverage_of(scene, field_, min_reliability=wrong)
+            coverage_of(scene, found, min_reliability=wrong)
     away = [looking((-3.0, 0.0, 0.0), (-9.0, 0.0, 0.0)) for _ in range(8)]
-    blind = replace(scene, train=Photographs(scene.train.names, away), held_out=Photographs([], []))
+    blind = wall(train=Photographs(scene.train.names, away), held_out=NONE)
     with pytest.raises(InputError, match="no photograph shows a Gaussian"):
-        coverage_of(blind, field_)
-
-
-def test_many_photographs_are_sampled(monkeypatch):
-    monkeypatch.setattr(photographs, "MOST_VIEWS", 2)
-    scene = wall()
-    found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
-    assert [photograph.name for photograph in found.photographs] in (["4.png", "h.png"], ["h.png", "4.png"])
-    assert any("5" in remark and "2" in remark for remark in found.remarks)
+        coverage_of(blind, found)
 
 
 def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
     """With the far side in no photograph but one from aslant, poses see all of it."""
-    scene = wall()
     aslant = looking((1.2, 2.6, 0.2))
-    scene = replace(scene, held_out=Photographs(["h.png"], [aslant]))
+    scene = wall(held_out=Photographs(["h.png"], [aslant]))
     scene.train.cameras[4:] = [looking((0.9, 2.8 + 0.1 * i, 0.2)) for i in range(4)]
     found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert 1 <= len(found.poses) <= 5
@@ -292,14 +276,13 @@ def test_free_places():
     assert space.depth == pytest.approx(2.85, abs=0.1)
     assert space.spacing == pytest.approx(0.6)
     places = {
-        "before the wall": ((-1.0, 0.0, 0.0), True),
-        "in the wall": ((0.0, 0.0, 0.0), False),
-        "behind it": ((1.0, 0.0, 0.0), False),
-        "beside a camera": ((-3.2, 0.3, 0.2), True),
-        "behind the cameras": ((-6.0, 0.0, 0.0), False),
+        (-1.0, 0.0, 0.0): True,  # before the wall
+        (0.0, 0.0, 0.0): False,  # in it
+        (1.0, 0.0, 0.0): False,  # behind it
+        (-3.2, 0.3, 0.2): True,  # beside a camera
+        (-6.0, 0.0, 0.0): False,  # behind the cameras
     }
-    found = space.free(torch.tensor([place for place, _ in places.values()], dtype=torch.float64))
-    assert dict(zip(places, found.tolist())) == {name: free for name, (_, free) in places.items()}
+    assert space.free(torch.tensor(list(places), dtype=torch.float64)).tolist() == list(places.values())
 
 
 @pytest.mark.slow
@@ -315,7 +298,8 @@ def test_camera_path_is_what_nerfstudio_reads(nerfstudio, one_side, tmp_path):
         assert (int(read.width[i]), int(read.height[i])) == (camera.width, camera.height)
 
 
-def test_poses_and_pictures_are_written(one_side, tmp_path):
+def test_poses_and_pictures_are_written(one_side, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     found = replace(one_side, poses=one_side.poses[:2], pictures=one_side.pictures[:2])
     written = found.save(tmp_path / "next.json")
     cameras = [pose.camera for pose in found.poses]
@@ -333,29 +317,22 @@ def test_poses_and_pictures_are_written(one_side, tmp_path):
         assert entry["aspect"] == pytest.approx(camera.width / camera.height)
     document = json.loads(written[0].read_text())
     assert document["regions"][0]["size"] == found.regions[0].size
-    assert "pictures" not in document
-    assert len(document["poses"]) == len(cameras)
+    assert "pictures" not in document and len(document["poses"]) == len(cameras)
     with pytest.raises(FileExistsError):
         found.save(tmp_path / "next.json")
+    for name in ("", ".", ".."):
+        with pytest.raises(InputError, match="name"):
+            found.save(name)
     fewer = replace(found, poses=found.poses[:1], pictures=found.pictures[:1])
     fewer.save(tmp_path / "next.json", overwrite=True)
     assert {path.name for path in tmp_path.iterdir()} == {"next.json", "next_camera_path.json", "next_pose_1.png"}
 
 
 def test_a_camera_that_looks_straight_down():
-    like = looking((1.0, 0, 0))
     up = torch.tensor([0.0, 0, 1]).double()
-    down = poses.look_at(torch.tensor([0.0, 0, 2]).double(), torch.zeros(3).double(), up, like)
+    down = poses.look_at(2 * up, torch.zeros(3).double(), up, looking((1.0, 0, 0)))
     there = down.world_to_camera @ torch.tensor([0.0, 0, 0, 1])
     assert there.tolist() == pytest.approx([0, 0, 2, 1], abs=1e-6)
-
-
-def test_a_name_is_needed(one_side, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("", ".", ".."):
-        with pytest.raises(InputError, match="name"):
-            one_side.save(name)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

@@ -15,11 +15,12 @@ from normlift_ns.evaluation.signals import SceneSignals, signals
 from normlift_ns.evaluation.studies import POOLED, signal_rows
 from normlift_ns.evaluation.votes import BETA, SWEEPS, own_vote, sweeps
 from normlift_ns.options import RefineConfig
+from tests.scenes import generator
 
 
 def scene(seed: int, n: int = 400) -> SceneSignals:
     """A third has no evidence, a fifth no truth; the vote mends some."""
-    g = torch.Generator().manual_seed(seed)
+    g = generator(seed)
     r = torch.rand(n, generator=g) * (torch.arange(n) % 3 > 0)
     zeros = torch.zeros(n)
     scalars = Scalars(r.sqrt(), zeros, zeros, zeros, r, zeros, torch.randint(1, 9, (n,), generator=g).int())

@@ -13,6 +13,8 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.scenes.frames import Frame, Intrinsics
+from normlift_ns.scenes.opening import SplatScene
+from normlift_ns.scenes.saved import checkpoint_of, save_splat
 from normlift_ns.scenes.splat import Splat
 
 NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
@@ -60,16 +62,19 @@ def write_ply(
 
 def write_gsplat(path: Path, splat: Splat, *, step: int = 29999, **more: object) -> Path:
     """As gsplat's simple_trainer saves it."""
-    splats = {
-        "means": splat.means,
-        "quats": splat.quats,
-        "scales": splat.scales,
-        "opacities": splat.opacities[:, 0],
-        "sh0": splat.features_dc[:, None],
-        "shN": splat.features_rest,
-    }
+    splats = {"means": splat.means, "quats": splat.quats, "scales": splat.scales, "opacities": splat.opacities[:, 0]}
+    splats |= {"sh0": splat.features_dc[:, None], "shN": splat.features_rest}
     torch.save({"step": step, "splats": splats, **more}, path)
     return path
+
+
+def saved_run(folder: Path, scene: SplatScene) -> Path:
+    """The files of a scene in the folder of its run."""
+    content = checkpoint_of(scene)
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    torch.save(content, folder / "nerfstudio_models" / f"step-{content['step']:09d}.ckpt")
+    save_splat(folder, scene)
+    return folder
 
 
 def rows_of(splat: Splat, rows: slice) -> Splat:

@@ -78,9 +78,7 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
 def test_moved_poses_are_read_or_refused(tmp_path: Path) -> None:
     moves = torch.randn(4, 9)
     path = write_gsplat(tmp_path / "a.pt", random_splat(), pose_adjust={"embeds.weight": moves, "identity": moves[0]})
-    found = read_gsplat(path).pose_adjust
-    assert found is not None
-    assert np.allclose(found, moves)
+    assert np.allclose(read_gsplat(path).pose_adjust, moves)
     for wrong in ({}, {"embeds.weight": torch.zeros(4, 6)}, {"embeds.weight": torch.full((4, 9), torch.nan)}):
         write_gsplat(path, random_splat(), pose_adjust=wrong)
         with pytest.raises(InputError, match=r"`pose_adjust` .*--pose_opt"):

@@ -27,17 +27,20 @@ from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, Checkpoint, read_
 from normlift_ns.scenes.formats.gsplat_checkpoint import read_gsplat
 from normlift_ns.scenes.formats.ply import read_ply
 from normlift_ns.scenes.frames import Frame, Intrinsics, check_frames, sized
+from normlift_ns.scenes.opening import SplatScene
 from normlift_ns.scenes.photographs import PhotographViews
-from normlift_ns.scenes.saved import checkpoint_of, open_saved_splat
+from normlift_ns.scenes.saved import open_saved_splat
 from normlift_ns.scenes.similarity import read_dataparser_transforms, read_world_transform
-from normlift_ns.scenes.transforms import read_transforms, write_transforms
+from normlift_ns.scenes.transforms import read_transforms
 from normlift_ns.scenes.unpickling import numbers_allowed
 from tests.hostile import damaged, fuzz, hostile_json, no_files
-from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
+from tests.scenes.made import ply_columns, random_splat, saved_run, write_gsplat, write_ply
 
 N = 20
 CAMERA = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30)
 BLACK = torch.zeros(3)
+PLAIN = Image.new("RGB", (40, 30))
+CHECKPOINT = "step-000000007.ckpt"
 
 
 def state(**changes: Any) -> dict[Any, Any]:
@@ -46,7 +49,7 @@ def state(**changes: Any) -> dict[Any, Any]:
     return {f"_model.gauss_params.{name}": changes.get(name, splat[name]) for name in GAUSSIAN_PARAMETERS}
 
 
-def saved(folder: Path, content: Any, name: str = "step-000000007.ckpt") -> Path:
+def saved(folder: Path, content: Any, name: str = CHECKPOINT) -> Path:
     torch.save(content, folder / name)
     return folder / name
 
@@ -95,33 +98,27 @@ def test_parameters_of_other_shapes_and_kinds_are_refused(tmp_path: Path) -> Non
 
 
 def test_steps_that_are_not_numbers_or_not_those_of_the_name_are_refused(tmp_path: Path) -> None:
-    splat = random_splat(N)
-    rest = {"opacities": splat.opacities[:, 0], "sh0": splat.features_dc[:, None], "shN": splat.features_rest}
-    splats = {"means": splat.means, "quats": splat.quats, "scales": splat.scales, **rest}
     for step in (None, "7", -1, 2.0, True, 10**12, [7], torch.tensor(7)):
         with pytest.raises(InputError, match="its step is"):
             read_checkpoint(saved(tmp_path, {"step": step, "pipeline": state()}))
         with pytest.raises(InputError, match="its step is"):
-            read_gsplat(saved(tmp_path, {"step": step, "splats": splats}, "ckpt_7_rank0.pt"))
+            read_gsplat(write_gsplat(tmp_path / "ckpt_7_rank0.pt", random_splat(N), step=step))
     with pytest.raises(InputError, match=r"step-000000008\.ckpt"):
         read_checkpoint(saved(tmp_path, {"step": 8, "pipeline": state()}))
 
 
-@pytest.mark.parametrize(
-    ("pipeline", "message"),
-    [
-        (lambda: {0: torch.zeros(1), **state()}, r"key 0 \(int\)"),
-        (lambda: {**state(), "module._model.gauss_params.means": torch.zeros(N, 3)}, "gauss_params.means twice"),
-        (lambda: {**state(), "_model.camera_optimizer.x": torch.zeros(1).expand(10**12)}, "number by number"),
-        (lambda: {name: value[:0] for name, value in state().items()}, "no Gaussians"),
-        (lambda: state(features_rest=torch.zeros(N, 7, 3)), r"\(20, 7, 3\) .* 0, 3, 8, 15, 24"),
-        (lambda: [1], "`step` and `pipeline`"),
-        (dict, "gauss_params.means, "),
-    ],
-)
-def test_other_states_are_refused(tmp_path: Path, pipeline: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_checkpoint(saved(tmp_path, {"step": 7, "pipeline": pipeline()}))
+def test_other_states_are_refused(tmp_path: Path) -> None:
+    for pipeline, message in (
+        ({0: torch.zeros(1), **state()}, r"key 0 \(int\)"),
+        ({**state(), "module._model.gauss_params.means": torch.zeros(N, 3)}, "gauss_params.means twice"),
+        ({**state(), "_model.camera_optimizer.x": torch.zeros(1).expand(10**12)}, "number by number"),
+        ({name: value[:0] for name, value in state().items()}, "no Gaussians"),
+        (state(features_rest=torch.zeros(N, 7, 3)), r"\(20, 7, 3\) .* 0, 3, 8, 15, 24"),
+        ([1], "`step` and `pipeline`"),
+        ({}, "gauss_params.means, "),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_checkpoint(saved(tmp_path, {"step": 7, "pipeline": pipeline}))
 
 
 class _Encoded:
@@ -145,18 +142,6 @@ def test_archives_that_would_grow_are_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(pickle.dumps({"step": 7}, protocol))
         with pytest.raises(InputError, match="truncated"):
             read_checkpoint(tmp_path / name)
-
-
-def test_what_is_not_a_file_is_refused(tmp_path: Path) -> None:
-    for read in (read_checkpoint, read_gsplat, read_ply, read_world_transform, read_dataparser_transforms):
-        for kind in no_files(tmp_path / "some"):
-            try:
-                read(tmp_path / "some")
-            except (FileNotFoundError, InputError) as error:
-                assert "some" in str(error), (read, kind)
-            else:
-                pytest.fail(f"{read.__name__} reads {kind}")
-        (tmp_path / "some").unlink()
 
 
 def test_ply_rows_that_a_small_file_cannot_hold_are_refused(tmp_path: Path) -> None:
@@ -226,19 +211,19 @@ def test_rotations_and_animations_are_remarked(tmp_path: Path) -> None:
         *((kind, two, "several") for kind in ("GIF", "PNG", "WEBP", "TIFF")),
         *((kind, {}, None) for kind in ("JPEG", "PNG", "WEBP", "TIFF")),
     ):
-        frame = image_frame(tmp_path, Image.new("RGB", (40, 30)), kind, **more)
+        frame = image_frame(tmp_path, PLAIN, kind, **more)
         remarks = PhotographViews([frame], BLACK).check_files()
         assert len(remarks) == (expected is not None), (kind, remarks)
         assert expected is None or re.search(expected, remarks[0]), (kind, remarks)
 
 
 def test_wrong_cameras_masks_and_heads_name_their_image(tmp_path: Path) -> None:
-    frame = image_frame(tmp_path, Image.new("RGB", (40, 30)))
+    frame = image_frame(tmp_path, PLAIN)
     for camera in (CAMERA._replace(fx=1e39), CAMERA._replace(cx=1e39, k1=0.1)):
         with pytest.raises(InputError, match=r"camera of .*a\.png cannot be used"):
             _ = PhotographViews([replace(frame, intrinsics=camera)], BLACK).cameras
     mask = tmp_path / "mask.png"
-    for made in (Image.new("RGB", (40, 30)), Image.new("L", (40, 31)), Image.new("LA", (40, 30))):
+    for made in (PLAIN, Image.new("L", (40, 31)), Image.new("LA", (40, 30))):
         made.save(mask)
         with pytest.raises(InputError, match=r"mask\.png .*a\.png"):
             sized(Frame(frame.file, "a", frame.pose, CAMERA, mask), tmp_path)
@@ -250,66 +235,50 @@ def test_wrong_cameras_masks_and_heads_name_their_image(tmp_path: Path) -> None:
         sized(frame, tmp_path)
 
 
-def saved_splat(folder: Path) -> Path:
-    """A run's splat.json, transforms.json and checkpoint."""
-    from normlift_ns.scenes.opening import SplatScene  # noqa: PLC0415
-
-    frames = [image_frame(folder, Image.new("RGB", (40, 30)))]
-    views, none = PhotographViews(frames, BLACK), PhotographViews([], BLACK)
-    scene = SplatScene(random_splat(N), views, none, "x", folder, 7, folder, folder, {}, "classic", "black")
-    (folder / "nerfstudio_models").mkdir()
-    saved(folder / "nerfstudio_models", checkpoint_of(scene))
-    write_transforms(folder / "transforms.json", frames, [])
-    content = {"name": "x", "rasterize_mode": "classic", "background": "black", "photographs": str(folder)}
-    (folder / "splat.json").write_text(json.dumps({**content, "identity": {}}))
-    return folder
+def looked_at(path: Path) -> None:
+    frame = Frame(path.with_name("a.png"), "a.png", np.eye(4)[:3], CAMERA, path if path.stem == "mask" else None)
+    sized(frame, path.parent)
+    _ = PhotographViews([frame], BLACK)[0]
 
 
-def make(kind: str, folder: Path) -> tuple[Path, Callable[[], Any]]:  # noqa: PLR0911
-    """A whole file of that kind, and what reads it."""
-    noise = Image.effect_noise((40, 30), 50)
-    if kind == "checkpoint":
-        path = saved(folder, {"step": 7, "pipeline": state()})
-        return path, lambda: read_checkpoint(path)
-    if kind == "gsplat":
-        path = write_gsplat(folder / "ckpt_7_rank0.pt", random_splat(N), step=7)
-        return path, lambda: read_gsplat(path)
-    if kind.endswith("ply"):
-        path = write_ply(folder / "x.ply", ply_columns(random_splat(N, 1)), text=kind == "text ply")
-        return path, lambda: read_ply(path)
-    if kind in ("PNG", "JPEG", "WEBP"):
-        frame = image_frame(folder, noise.convert("RGB"), kind)
-        return frame.file, lambda: (sized(frame, folder), PhotographViews([frame], BLACK)[0])
-    if kind == "mask":
-        noise.save(folder / "mask.png")
-        frame = replace(image_frame(folder, Image.new("RGB", (40, 30))), mask=folder / "mask.png")
-        return folder / "mask.png", lambda: (sized(frame, folder), PhotographViews([frame], BLACK)[0])
-    path = folder / "world.json"
-    if kind == "world":
-        path.write_text(json.dumps(np.eye(4).tolist()))
-        return path, lambda: read_world_transform(path)
-    if kind == "parser":
-        path.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.5}))
-        return path, lambda: (read_world_transform(path, np.eye(4)), read_dataparser_transforms(path))
-    saved_splat(folder)
-    path = folder / kind
-    if kind == "splat.json":
-        return path, lambda: open_saved_splat(folder)
-
-    def frames() -> list[Frame]:
-        found = read_transforms(path).frames
-        check_frames(found, path)
-        return found
-
-    return path, frames
+def noise() -> Image.Image:
+    return Image.effect_noise((40, 30), 50)
 
 
-def damage(path: Path, kind: str) -> st.SearchStrategy[bytes]:
+def saved_splat(path: Path) -> None:
+    views, none = PhotographViews([image_frame(path.parent, PLAIN)], BLACK), PhotographViews([], BLACK)
+    there = path.parent
+    saved_run(there, SplatScene(random_splat(N), views, none, "x", there, 7, there, there, {}, "classic", "black"))
+
+
+LOADERS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], Any]]] = {
+    "checkpoint": (CHECKPOINT, lambda path: saved(path.parent, {"step": 7, "pipeline": state()}), read_checkpoint),
+    "gsplat": ("ckpt_7_rank0.pt", lambda path: write_gsplat(path, random_splat(N), step=7), read_gsplat),
+    "ply": ("x.ply", lambda path: write_ply(path, ply_columns(random_splat(N, 1))), read_ply),
+    "text ply": ("x.ply", lambda path: write_ply(path, ply_columns(random_splat(N, 1)), text=True), read_ply),
+    "PNG": ("a.png", lambda path: noise().convert("RGB").save(path, "PNG"), looked_at),
+    "JPEG": ("a.png", lambda path: noise().convert("RGB").save(path, "JPEG"), looked_at),
+    "WEBP": ("a.png", lambda path: noise().convert("RGB").save(path, "WEBP"), looked_at),
+    "mask": ("mask.png", lambda path: (image_frame(path.parent, PLAIN), noise().save(path)), looked_at),
+    "world": ("world.json", lambda path: path.write_text(json.dumps(np.eye(4).tolist())), read_world_transform),
+    "world.txt": ("world.txt", lambda path: np.savetxt(path, np.eye(4)), read_world_transform),
+    "parser": (
+        "world.json",
+        lambda path: path.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.5})),
+        lambda path: (read_world_transform(path, np.eye(4)), read_dataparser_transforms(path)),
+    ),
+    "cameras": ("transforms.json", saved_splat, lambda path: check_frames(read_transforms(path).frames, path)),
+    "splat": ("splat.json", saved_splat, lambda path: open_saved_splat(path.parent)),
+}
+"""Names of files, what writes whole ones, and what reads them."""
+
+
+def damage(path: Path) -> st.SearchStrategy[bytes]:
     """Contents instead of those of a file: also other values in JSON, and pickles damaged under a valid checksum."""
     whole = path.read_bytes()
     if path.suffix == ".json":
         return damaged(whole) | hostile_json(json.loads(whole))
-    if kind not in ("checkpoint", "gsplat"):
+    if path.suffix not in (".ckpt", ".pt"):
         return damaged(whole)
     with zipfile.ZipFile(path) as old:
         entries = {item.filename: old.read(item) for item in old.infolist()}
@@ -325,31 +294,30 @@ def damage(path: Path, kind: str) -> st.SearchStrategy[bytes]:
     return damaged(whole) | damaged(entries[pickled]).map(repacked)
 
 
-KINDS = (
-    *("checkpoint", "gsplat", "ply", "text ply", "PNG", "JPEG", "WEBP", "mask"),
-    *("world", "parser", "transforms.json", "splat.json"),
-)
-
-
 @pytest.mark.filterwarnings("ignore")
 def test_damage_is_a_message(tmp_path: Path) -> None:
-    for kind in KINDS:
-        folder = tmp_path / kind
-        folder.mkdir()
-        path, read = make(kind, folder)
+    for kind, (name, write, read) in LOADERS.items():
+        path = tmp_path / kind / name
+        path.parent.mkdir()
+        write(path)
+        path.rename(tmp_path / "whole")
+        for what in no_files(path):
+            with pytest.raises((FileNotFoundError, InputError)) as caught:
+                read(path)
+            assert path.stem in str(caught.value), (kind, what)
+        (tmp_path / "whole").replace(path)
 
-        def load(read: Callable[[], Any] = read, folder: Path = folder) -> None:
+        def load(read: Callable[[Path], Any] = read, path: Path = path) -> None:
             try:
-                found = read()
+                found = read(path)
             except (InputError, FileNotFoundError) as error:
-                assert str(folder) in str(error)
+                assert str(path.parent) in str(error)
                 raise
-            assert found is not None
             if isinstance(found, Checkpoint):
                 assert {len(found.model[f"gauss_params.{name}"]) for name in GAUSSIAN_PARAMETERS} != {0}
 
         load()
-        fuzz(20 if kind == "transforms.json" else 10, damage(path, kind), path, load)
+        fuzz(20 if kind == "cameras" else 10, damage(path), path, load)
 
 
 class Stranger:

@@ -14,10 +14,6 @@ from normlift_ns.scenes.formats.ply import read_ply
 from tests.scenes.made import ply_columns, random_splat, write_ply
 
 
-def _equal(found, expected) -> bool:
-    return all(torch.equal(found.parameters[name], value) for name, value in expected.parameters.items())
-
-
 def test_every_kind_of_splat_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for degree in range(4):
         splat = random_splat(50, degree)

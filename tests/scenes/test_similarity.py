@@ -74,13 +74,12 @@ _CAMERA = Intrinsics(1, 1, 1, 1, 2, 2)
 
 def _ring(tilt: Rotation, size: float) -> tuple[list[Frame], np.ndarray]:
     """Cameras on a level ring that look at its middle, over a flat floor with more points below; then all turned."""
-    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    centres = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(12)])
-    back = centres
-    right = np.column_stack([-np.sin(angles), np.cos(angles), np.zeros(12)])
-    up = np.tile([0.0, 0.0, 1.0], (12, 1))
-    rotations = np.stack([right, up, back], axis=2)
-    poses = [np.column_stack([tilt.apply(r.T).T, size * tilt.apply(c)]) for r, c in zip(rotations, centres)]
+    poses = []
+    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        back, right = [np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0]
+        poses.append(
+            np.column_stack([tilt.apply(right), tilt.apply([0, 0, 1]), tilt.apply(back), size * tilt.apply(back)])
+        )
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4000, 3)) * [2.0, 1.0, 0.1]
     points[:, 2] += np.where(rng.random(4000) < 0.3, np.abs(rng.normal(size=4000)), 0)
