@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tokenize
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,7 @@ def read_world_transform(
             return similarity(np.array(values, dtype=float), str(path))
     except InputError:
         raise
-    except (TypeError, ValueError, EOFError, OverflowError, MemoryError, OSError) as error:
+    except (TypeError, ValueError, EOFError, OverflowError, MemoryError, OSError, tokenize.TokenError) as error:
         raise InputError(f"{path} holds no transform ({error}). Expected {_EXPECTED}.") from error
     found = _dataparser(values, path)
     matrix = np.eye(4)

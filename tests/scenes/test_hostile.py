@@ -261,6 +261,7 @@ LOADERS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], Any]]] 
     "WEBP": ("a.png", lambda path: noise().convert("RGB").save(path, "WEBP"), looked_at),
     "mask": ("mask.png", lambda path: (image_frame(path.parent, PLAIN), noise().save(path)), looked_at),
     "world": ("world.json", lambda path: path.write_text(json.dumps(np.eye(4).tolist())), read_world_transform),
+    "world.npy": ("world.npy", lambda path: np.save(path, np.eye(4)), read_world_transform),
     "world.txt": ("world.txt", lambda path: np.savetxt(path, np.eye(4)), read_world_transform),
     "parser": (
         "world.json",
