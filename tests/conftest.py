@@ -116,6 +116,23 @@ def _gradients() -> Iterator[None]:
         pytest.fail("gradients are disabled after this test")
 
 
+@pytest.fixture(autouse=True)
+def _closed(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fails a test that leaves one of its own files open."""
+    yield
+    folder, open_files = request.node.funcargs.get("tmp_path"), Path("/proc/self/fd")
+    if folder is not None and open_files.is_dir():
+        left = [name for fd in open_files.iterdir() if (name := _target(fd)).startswith(f"{folder}/")]
+        assert left == [], "files left open"
+
+
+def _target(link: Path) -> str:
+    try:
+        return os.readlink(link)
+    except OSError:  # closed meanwhile
+        return ""
+
+
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
     """Makes a folder by name in the first process that asks, and shares it with the others; tests must not change it.

@@ -23,8 +23,9 @@ def run(request, trained: Path, made_once) -> nl.LiftedRun:
     """A run that holds its evidence, and one that leaves it in the cache."""
 
     def make(folder: Path) -> None:
-        how = {"source": nl.SourceOptions(encoder="colour"), "lift": nl.LiftOptions(storage=request.param, max_views=6)}
-        nl.lift_run(trained, **how, output_dir=folder, timestamp="one", check=False)
+        options = nl.LiftOptions(storage=request.param, max_views=6, consensus=request.param == "float16")
+        source = nl.SourceOptions(encoder="colour")
+        nl.lift_run(trained, source=source, lift=options, output_dir=folder, timestamp="one", check=False)
 
     return nl.open_run(next(made_once(f"votes-{request.param}", make).glob("*/normlift/one/config.yml")))
 

@@ -45,6 +45,12 @@ def test_a_spot_fills_half_the_picture_from_the_side_where_the_camera_is_unless_
     assert around[1] < 0 and np.abs(around) == pytest.approx([AWAY * 0.5**0.5, AWAY * 0.5**0.5, 0])
 
 
+def test_a_large_gaussian_whose_center_is_farther_away_stands_in_the_way_too():
+    beside = torch.tensor([[0.0, 0.0, 0.0], [3.0, -1.0, 0.0]])
+    scene = GaussianScene(beside, torch.eye(4)[:1].expand(2, 4), torch.tensor([[0.05] * 3, [2.0] * 3]), torch.ones(2))
+    assert clear_viewpoint(SPOT, scene, None, FROM, UP) == pytest.approx((AWAY * 0.5**0.5, -AWAY * 0.5**0.5, 0))
+
+
 def test_in_a_corner_it_takes_the_open_side():
     around = [(np.sin(a), -np.cos(a), 0.0) for a in np.radians([0, 45, -45, 90, -90, 135, -135])]
     place = np.array(clear_viewpoint(SPOT, walls(*around), None, FROM, UP))
