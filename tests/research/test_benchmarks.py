@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from benchmarks.minutes import minutes
 from benchmarks.report import RESULTS, Report, as_text
 from tests.captures import needs_shared
 from tests.research import quick
@@ -38,14 +37,6 @@ def test_quick_front_ends_benchmark(tmp_path):
         assert metrics[key]["error"] < 1e-4, key
 
 
-def test_quick_precision_benchmark(tmp_path):
-    """Masks of a network that learned nothing, the same way through."""
-    metrics = quick("sam_precision", tmp_path, "--device", "cpu")
-    for kind in ("float16", "bfloat16", "noise"):
-        assert {f"{kind}_truth_iou", f"{kind}_miou", f"{kind}_changed_survivors"} <= set(metrics)
-        assert 0.8 < metrics[f"{kind}_mask_iou"]["value"] < 1
-
-
 def test_results_have_one_metric_per_line():
     for path in RESULTS.glob("*.json"):
         if path.name == "faults.json":  # of other form
@@ -67,10 +58,3 @@ def test_a_report_is_valid_json(tmp_path):
         {"key": "time_s", "value": 0.25, "unit": "s", "error": 1e-7},
         {"key": "of one seed_ci95", "value": None, "unit": "points", "error": None},
     ]
-
-
-def test_minutes_are_summed_by_part(tmp_path):
-    cases = (("tests.core.test_lift", 30), ("tests.core.test_query", 90), ("tests.test_grid", 6))
-    rows = "".join(f'<testcase classname="{name}" time="{time}"/>' for name, time in cases)
-    (tmp_path / "tests.xml").write_text(f"<testsuites><testsuite>{rows}</testsuite></testsuites>")
-    assert list(minutes(tmp_path / "tests.xml").items()) == [("tests/core", 2.0), ("tests/test_grid", 0.1)]
