@@ -10,7 +10,7 @@ import yaml
 
 from normlift_ns.scenes.nerfstudio.config import locate, read_config
 from tests.nerfstudio_plugin.conftest import opened, read
-from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, working_directory
+from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 
 HEADER = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: splatfacto\n"
 
@@ -98,6 +98,19 @@ def test_files_are_found_from_the_place_of_the_config(stock: StockRun, copied: P
     assert opened(copied).train.files[0] == moved / "scene" / "images" / "000.jpg"
     with working_directory(stock.workspace / "outputs"):  # outputs/scene/ is the experiment, not the dataset
         assert locate(read_config(stock.config), stock.config).data == stock.workspace / "scene"
+    shutil.copytree(copied.parent, tmp_path / "alone")  # out of its folders
+    with working_directory(moved):
+        location = opened(tmp_path / "alone" / "config.yml").location
+    assert (location.root, location.moved_data) == (None, True)
+    assert (location.data, location.output_dir) == (moved / "scene", moved / "outputs")
+
+
+def test_beside_an_absolute_output_directory_relative_data_is_found(copied: Path, stock: StockRun) -> None:
+    config = read_config(copied)
+    config.output_dir = copied.parents[3]
+    location = locate(config, copied)
+    assert (location.root, location.data) == (None, copied.parents[4] / "scene")
+    assert location.output_dir == location.portable(config.output_dir) == config.output_dir
 
 
 def test_a_moved_dataset_is_named_or_given(copied: Path, tmp_path: Path) -> None:
@@ -113,23 +126,3 @@ def test_a_moved_dataset_is_named_or_given(copied: Path, tmp_path: Path) -> None
             assert run.location.data == tmp_path / data
             assert run.train.names[0] == "images/000.jpg"
             assert run.train[0].image.shape == (35, 47, 3)
-
-
-def test_a_run_taken_out_of_its_folders_finds_its_dataset_in_the_current_directory(copied: Path, tmp_path) -> None:
-    shutil.copytree(copied.parent, tmp_path / "alone")
-    with working_directory(tmp_path / "moved"):
-        location = opened(tmp_path / "alone" / "config.yml").location
-    assert location.root is None
-    assert location.moved_data
-    assert location.data == tmp_path / "moved" / "scene"
-    assert location.output_dir == tmp_path / "moved" / "outputs"
-
-
-def test_beside_an_absolute_output_directory_relative_data_is_found(workspace: Path) -> None:
-    runs = workspace / "runs" / "all"
-    run = train_splatfacto(workspace, Path("scene"), configure=lambda config: setattr(config, "output_dir", runs))
-    location = opened(run.config).location
-    assert location.root is None
-    assert location.data == workspace / "scene"
-    assert location.output_dir == runs
-    assert location.portable(runs) == runs
