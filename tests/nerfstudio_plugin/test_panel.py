@@ -178,8 +178,7 @@ def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: An
     assert labels[:3] == ["Prompts", "Ask", "Cancel"]
     assert parse_object(pipeline, ViewerElement, "x") == []  # nothing far down in another tab
     assert [element for _, element in parse_object(pipeline, ViewerControl, "x")] == [panel.control]
-    assert panel._asker.encoder == []
-    assert (panel._widgets.prompts.value, panel._widgets.threshold.value) == ("left", 0.5)
+    assert (panel._asker.encoder, panel._widgets.prompts.value, panel._widgets.threshold.value) == ([], "left", 0.5)
     expected = answer(pipeline.model.field, pipeline.model.means, asking("left")).selected[:, 0]
     assert torch.equal(chosen(pipeline), expected)
     assert f"**{int(expected.sum())}** of 60" in said(panel)
@@ -191,10 +190,9 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     model, widgets, output = pipeline.model, panel._widgets, viewer.control_panel._output_render
     both = answer(model.field, model.means, asking("left", "right")).selected
     ask(panel, " left , right;; ")
-    assert panel.answer.texts == ("left", "right")
+    assert (panel.answer.texts, output.value) == (("left", "right"), "overlay")
     assert list(outputs(pipeline))[4:7] == ["relevancy_left", "relevancy_right", "reliability"]
     assert torch.equal(chosen(pipeline), both.any(dim=1))
-    assert output.value == "overlay"
     widgets.shown.value = "2: right"
     until(lambda: panel.state.shown == 1)
     assert torch.equal(chosen(pipeline), both[:, 1])
@@ -236,10 +234,9 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     panel.act("refined", False)
     assert not panel.answer.question.refined
     panel.act("Undo")
-    assert widgets.refined.value
     panel.act("Threshold", 0.5)
     whole = chosen(pipeline)
-    assert whole.any()
+    assert widgets.refined.value and whole.any()
     widgets.steps.value = -4
     press(widgets.steps)  # viser calls what it calls for a button
     until(lambda: panel.state.steps == -4)
@@ -248,13 +245,11 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     assert widgets.steps.value == 0
     before = outputs(pipeline)["accumulation"].sum()
     panel.act("Hide")
-    assert torch.equal(model._display.drawn, ~whole)
-    assert outputs(pipeline)["accumulation"].sum() < before
+    assert torch.equal(model._display.drawn, ~whole) and outputs(pipeline)["accumulation"].sum() < before
     assert f"{int(whole.sum())} Gaussians are hidden" in said(panel)
     panel.act("All")
     assert model._display.drawn is None
     panel.act("Only")
-    assert torch.equal(model._display.drawn, whole)
     ask(panel, "up")
     assert torch.equal(model._display.drawn, whole)  # what is hidden stays hidden
     panel.act("Undo")
@@ -286,17 +281,15 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     panel.act("More like this", client=(browser := Browser()))
     panel.act("Clear")
     assert {name: getattr(widgets, name).value for name in settings} == before
-    assert widgets.prompts.value == ""
+    assert (widgets.prompts.value, said(panel).strip()) == ("", "No query yet.")
     assert panel.answer is pipeline.model._display.drawn is browser._scene_pointer_cb is None
     assert not chosen(pipeline).any()
-    assert said(panel).strip() == "No query yet."
     panel.act("Suggested")
     assert "threshold" in said(panel)
     panel.act("Undo")
     assert panel.answer.texts == ("left",)
     ask(panel, "right")
-    assert panel.answer.question.min_reliability == 0.0
-    assert chosen(pipeline).any()
+    assert panel.answer.question.min_reliability == 0.0 and chosen(pipeline).any()
 
 
 def test_what_cannot_be_asked_says_why_and_keeps_the_answer_before(panel: Any, pipeline: Any) -> None:
@@ -476,22 +469,20 @@ def in_thread(panel: Any, prompts: str) -> Thread:
 
 
 def test_the_button_shows_that_it_works_and_the_picture_stays_live(pipeline: Any, viewer: Any, slow: Any) -> None:
-    panel, lock, (encoder, loaded) = pipeline.model.normlift, viewer.train_lock, slow
+    panel, (encoder, loaded) = pipeline.model.normlift, slow
     before = chosen(pipeline)
     asking = in_thread(panel, "right")
     assert encoder.reading.wait(60)
-    assert lock.acquire(timeout=10)  # as the viewer does to render
+    assert viewer.train_lock.acquire(timeout=10)  # as the viewer does to render
+    viewer.train_lock.release()
     assert torch.equal(chosen(pipeline), before)
-    lock.release()
     assert panel._widgets.ask.disabled and panel._widgets.cancel.visible
     panel.act("Threshold", 0.6)  # the panel can be used, and still says what it waits for
-    assert panel.answer.texts == ("left",)
-    assert "Reading the prompts" in said(panel)
+    assert panel.answer.texts == ("left",) and "Reading the prompts" in said(panel)
     assert panel._widgets.prompts.value == "right"  # what is typed is nobody else's
     encoder.go_on.set()
     asking.join(60)
-    assert panel.answer.texts == ("right",)
-    assert "Reading the prompts" not in said(panel)
+    assert panel.answer.texts == ("right",) and "Reading the prompts" not in said(panel)
     assert not panel._widgets.ask.disabled and not panel._widgets.cancel.visible
     assert loaded == [str(pipeline.model.device)]
 
@@ -535,8 +526,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     met = weights.where(field.valid(), 0.0).argmax()
     browser._scene_pointer_cb(SimpleNamespace(ray_origin=None, ray_direction=None))  # not on the scene
     browser._scene_pointer_cb(event)
-    assert browser._scene_pointer_cb is None
-    assert panel._widgets.prompts.value == "like click 1"
+    assert (browser._scene_pointer_cb, panel._widgets.prompts.value) == (None, "like click 1")
     similar = field.directions() @ field.directions(met[None])[0]
     clicked = chosen(pipeline)
     assert torch.equal(clicked, (similar > 0.9) & field.valid())
@@ -555,8 +545,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     panel.act("More like this", client=browser)
     event.ray_direction = tuple(-x for x in event.ray_direction)
     browser._scene_pointer_cb(event)
-    assert "nothing with semantics" in said(panel)
-    assert panel.answer.texts == ("like click 2",)
+    assert "nothing with semantics" in said(panel) and panel.answer.texts == ("like click 2",)
 
 
 def test_objects_are_selected_added_and_taken_away_by_clicks(panel: Any, pipeline: Any) -> None:
@@ -586,35 +575,21 @@ def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel: Any
         if cancels:
             armed(event)  # was on its way
             assert torch.equal(chosen(pipeline), before)
-    panel.forget(other)
-    assert panel._clicks.armed
-    panel.forget(browser)
-    assert not panel._clicks.armed
-    assert not panel._widgets.cancel.visible
+    for gone in (other, browser):
+        panel.forget(gone)
+        assert panel._clicks.armed == panel._widgets.cancel.visible == (gone is other)
 
 
 def test_a_browser_that_goes_while_another_one_presses_stops_nobody(panel: Any, viewer: Any) -> None:
     """viser tells that it is gone under the lock that `get_clients` takes, which every picture needs."""
-    server, browser, held = viewer.viser_server, Browser(3), Event()
+    browser = Browser(3)
     ask(panel, "left")
     panel.act("More like this", client=browser)
-    pressing = Thread(target=lambda: panel.act("Hide"), daemon=True)
-
-    def go() -> None:
-        with server._client_lock:
-            held.set()
-            while pressing.ident is None or (pressing.is_alive() and panel._lock.acquire(blocking=False)):
-                _ = pressing.ident is None or panel._lock.release()
-                time.sleep(0.001)  # until the other one has the panel's lock, and waits for this one
-            server._client_disconnect_cb[-1](browser)
-
-    going = Thread(target=go, daemon=True)
-    going.start()
-    assert held.wait(60)
-    pressing.start()
-    for thread in (going, pressing):
-        thread.join(timeout=60)
-        assert not thread.is_alive()
+    going = Thread(target=viewer.viser_server._client_disconnect_cb[-1], args=[browser], daemon=True)
+    with panel._lock:  # which the other one has, who waits for the lock of viser
+        going.start()
+        going.join(timeout=60)
+        assert not going.is_alive()
     until(lambda: not panel._clicks.armed)
 
 

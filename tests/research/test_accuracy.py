@@ -9,7 +9,6 @@ from benchmarks.accuracy import Bench
 from benchmarks.accuracy_report import METHODS, summarize
 from benchmarks.damage import LADDER, STEPS, Damage, observe
 from benchmarks.report import Report
-from benchmarks.signals import mistakes
 from benchmarks.variants import (
     VARIANTS,
     lifted_scores,
@@ -80,23 +79,13 @@ def test_scores_of_variants_are_those_of_refined_directions(world):
         assert torch.equal(few.cosine[some], found.cosine[some])
 
 
-def test_mistakes_of_the_middle_tenths():
-    reliability = torch.linspace(0.01, 1, 100)
-    truth, answer = torch.zeros(100, dtype=torch.int64), torch.zeros(100, dtype=torch.int64)
-    truth[55:60], answer[:50], truth[99] = 1, 2, -1  # five of the sixth tenth are called 0, the largest class
-    found = mistakes(reliability, truth, answer)
-    assert found == {"middle.wrong": pytest.approx(1 / 6, abs=0.01), "middle.wrong_largest": 1.0}
-
-
 def test_rows_and_their_summary(world):
-    rows = []
+    rows, damages = [], {name: (LADDER | STEPS)[name] for name in ("mild", "noise only", "arc")}
     bench = Bench(world, WORDS, None, "cpu", RefineConfig(k=9))
     for seed in range(2):
-        for name, damage in (("mild", LADDER["mild"]), ("noise only", LADDER["noise only"]), ("arc", STEPS["arc"])):
+        for name, damage in (damages | {"mild, 3 views": replace(LADDER["mild"], views=3)}).items():
             found = bench.run(damage, seed, others=name in LADDER)
             rows.append({"scene": "tiny", "damage": name, "seed": seed, **found})
-        found = bench.run(replace(LADDER["mild"], views=3), seed, others=False)
-        rows.append({"scene": "tiny", "damage": "mild, 3 views", "seed": seed, **found})
     report = Report("accuracy")
     summarize(rows, report)
     values = {metric.key: metric.value for metric in report.metrics}
@@ -110,7 +99,6 @@ def test_rows_and_their_summary(world):
         gains = [row[method]["miou"] - row["none"]["miou"] for row in ladder]
         expected = {
             f"ablation.{method}.miou": mean(ladder, method),
-            f"tiny.ablation.{method}.miou": mean(ladder, method),
             f"undamaged.{method}.miou": mean([row for row in ladder if row["damage"] == "noise only"], method),
             f"views3.ablation.{method}.miou": mean(three, method),
             f"ablation.{method}.worst": min(gains),
@@ -118,11 +106,7 @@ def test_rows_and_their_summary(world):
             f"ablation.{method}.copied": mean(ladder, method, "copied"),
         }
         assert {key: values[key] for key in expected} == pytest.approx(expected)
-    assert values["consensus.share_worse"] == values["ablation.consensus.share_worse"]
     assert values["ablation.none.copied"] == values["ablation.none.gain"] == 0 < values["ablation.paper.copied"]
-    assert values["ladder.arc.none.miou"] == pytest.approx(
-        mean([row for row in rows if row["damage"] == "arc"], "none")
-    )
     assert all(0 < values[f"baseline.{other}.miou"] <= 100 for other in ("sfs", "occam", "vala", "drsplat"))
     assert values["ablation.paper_minus_none.miou"] == pytest.approx(mean(ladder, "paper") - mean(ladder, "none"))
     assert values["preset.half.miou"] == pytest.approx(values["ablation.paper.miou"], abs=1)

@@ -1,4 +1,4 @@
-"""Parts of benchmarks.coverage: what a choice of views answers is a sum over views; the percentile of a choice."""
+"""Parts of benchmarks.coverage: what a choice of views answers is a sum over views, and its percentile."""
 
 from __future__ import annotations
 

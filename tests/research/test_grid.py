@@ -1,4 +1,4 @@
-"""The grid: what its damages, features, regions and votes are, and that a run goes on where it stopped."""
+"""The grid: what its damages, features, regions and votes are, and that a run goes on from its rows."""
 
 import subprocess
 import sys
@@ -9,13 +9,9 @@ import torch
 from benchmarks.ballots import _parts, voters_of
 from benchmarks.candidates import Candidate
 from benchmarks.damage import GROUP, LADDER, Damage, observe
-from benchmarks.features import LENGTHS, as_features, mask_features, mixture_features, orthogonal_words
-from benchmarks.grid import chunks, finished
-from benchmarks.pieces import KINDS, blurred, label_map, observe_pieces, pieces, shares_of
-from benchmarks.rows import RowsError, append, read_rows
-from benchmarks.rule import cells_of
+from benchmarks.features import LENGTHS, mask_features, orthogonal_words
+from benchmarks.pieces import KINDS, observe_pieces, pieces
 from benchmarks.second_room import second
-from benchmarks.sites import Place
 from benchmarks.worlds import World, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors
 from normlift_ns.core.ablations import variant_source
@@ -60,14 +56,6 @@ def test_statistics_have_the_geometry_that_is_documented():
     assert all(0.25 < share < 0.5 for share in mistakes.values()), mistakes
 
 
-def test_histograms_are_square_roots_of_shares():
-    sums = torch.zeros(1, 72)
-    sums[0, [0, 5, 64, 70]] = torch.tensor([3.0, 1.0, 10.0, 30.0])
-    expected = torch.zeros(72)
-    expected[[0, 5, 64, 70]] = (torch.tensor([0.75, 0.25, 0.25, 0.75]) / 2).sqrt()
-    assert torch.allclose(as_features(sums)[0], expected)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_pieces_show_what_is_in_them(room, kind):
     cut = pieces(room, kind, 64)
@@ -77,34 +65,9 @@ def test_pieces_show_what_is_in_them(room, kind):
     pure = cut.content[:, :16].max(1)
     share = (plain.features @ made_words(16).classes.T).argmax(1) == pure.indices
     assert float(share[pure.values > 0.9].float().mean()) == 1
-    lost = observe_pieces(cut, made_words(16), Damage(dropped=0.5), 0)
-    assert 0.4 < len(lost.features) / len(plain.features) < 0.6
-    assert len(lost.features) == lost.evidence.num_regions
-    few = observe_pieces(cut, made_words(16), Damage(views=3), 0)
-    assert few.evidence.num_views == 3 and len(few.views) == 3
-    expected = cut.evidence.select_views(few.views)
-    assert torch.equal(few.evidence.rows.weight, expected.rows.weight)
-    looked = observe_pieces(cut, cut.looks, Damage(wrong=0.3), 0)
-    assert looked.features.shape == (len(cut.content), 72)
-
-
-def test_patches_show_their_neighbours_too():
-    labels = label_map("patches", torch.zeros(60, 80, 3, dtype=torch.uint8), 48)  # 6 rows of 8
-    assert int(labels.max()) == 47 and labels[0, 0] == 0 and labels[-1, -1] == 47
-    classes = (torch.arange(80) >= 40).long().expand(60, 80)
-    shares = shares_of(labels, classes, 48, 2)
-    assert shares[:, 0].view(6, 8)[0].tolist() == [1, 1, 1, 1, 0, 0, 0, 0]
-    assert blurred(shares, (6, 8))[:, 0].view(6, 8)[2].tolist() == pytest.approx([1, 1, 1, 0.75, 0.25, 0, 0, 0])
-
-
-def test_mixtures_are_between_their_classes():
-    words = made_words(3)
-    half = torch.tensor([[0.5, 0.5, 0, 0], [1.0, 0, 0, 0], [0, 0, 0, 1.0]])
-    rows = mixture_features(words, half, 0.0, 0.0, LENGTHS["clip"], generator(0))
-    cosine = rows @ words.classes.T
-    assert float(cosine[0, 0]) == pytest.approx(float(cosine[0, 1]), abs=2e-2)
-    assert cosine[0, 2] < cosine[0, :2].min() and cosine[1, 0] > cosine[0, 0]
-    assert cosine[2].max() < cosine[1, 0]
+    lost = observe_pieces(cut, made_words(16), Damage(dropped=0.5, views=3), 0)
+    assert lost.evidence.num_views == len(lost.views) == 3
+    assert len(lost.features) == lost.evidence.num_regions < 0.3 * len(plain.features)
 
 
 def test_votes_are_those_of_refine(world):
@@ -121,29 +84,6 @@ def test_votes_are_those_of_refine(world):
             )
             (source,) = part.sources([Candidate(name, sigma_d=1.5, delta=delta, prior=3.0)], 0.95, 0.4)
             assert torch.equal(source, expected[voters.group[:, 0]].long()), (name, delta)
-
-
-def test_a_file_of_rows_is_gone_on_with(tmp_path):
-    path, run = tmp_path / "some" / "rows.jsonl", {"seeds": [1, 2], "voters": None}
-    assert finished(path, run) == {}
-    cells = cells_of("demo")[:2]
-    for cell in cells:
-        append(path, {"cell": list(cell), "seconds": 1.0})
-    whole = path.read_bytes()
-    path.write_bytes(whole + b'{"cell": ["demo", "masks", "cl')
-    assert list(finished(path, run)) == cells and path.read_bytes() == whole  # the damaged last line is gone
-    with pytest.raises(RowsError, match="another run"):
-        read_rows(path, run | {"voters": 5})
-    path.write_bytes(whole.replace(b'{"cell"', b"{cell", 1))
-    with pytest.raises(RowsError, match="line 2 is no JSON"):
-        read_rows(path, run)
-
-
-def test_cells_of_one_place_stay_together():
-    parts_of = list(chunks(cells_of("demo")))
-    assert sum(map(len, parts_of)) == 299 and max(map(len, parts_of)) <= 50
-    assert all(len({Place.of(cell) for cell in some}) == 1 for some in parts_of)
-    assert Place("demo", "masks", floaters=True) in {Place.of(some[0]) for some in parts_of}
 
 
 def test_quick_grid(tmp_path):
