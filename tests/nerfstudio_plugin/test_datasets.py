@@ -184,8 +184,8 @@ def test_changes_after_the_training_are_noticed(copied: Path) -> None:
         with pytest.raises(InputError, match=rf"trained with.* scale \S+, .* {scale:.6g}, .*{trained.name}"):
             opened(copied)
     path.write_text(json.dumps({**whole, "frames": frames[::-1]}))
-    assert opened(copied).train.names[0] == "images/000.jpg"  # nerfstudio sorts them
-    assert opened(copied).remarks == ()
+    run = opened(copied)
+    assert (run.train.names[0], run.remarks) == ("images/000.jpg", ())  # nerfstudio sorts them
 
 
 def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) -> None:

@@ -615,8 +615,7 @@ def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
         ask(panel, prompts, negatives)
         assert not replace.visible
         panel.act("Save prompts in run")
-    assert stored().texts == ("left", "right")
-    assert replace.visible
+    assert stored().texts == ("left", "right") and replace.visible
     press(replace)
     assert (stored().texts, stored().negatives, stored().rule) == (("up",), ("left",), "lerf")
     assert not replace.visible

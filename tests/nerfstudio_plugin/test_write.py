@@ -57,8 +57,7 @@ def test_it_is_read_and_can_be_lifted_again(
     first = write(source, field, timestamp="first")
     with working_directory(tmp_path / "moved"):  # that of the training
         _, pipeline, path, step = eval_setup((first / "config.yml").relative_to(tmp_path / "moved"))
-    assert (path.name, step) == (CHECKPOINT, 2)
-    assert type(pipeline.model).__name__ == "NormLiftModel"
+    assert (path.name, step, type(pipeline.model).__name__) == (CHECKPOINT, 2, "NormLiftModel")
     assert torch.equal(pipeline.model.field.scalars.reliability.cpu(), field.scalars.reliability)
     with working_directory(tmp_path):
         again = opened(first / "config.yml")
