@@ -18,7 +18,7 @@ def folder(small: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_images_and_masks_are_the_views(folder: Path, small: DemoRoom):
+def test_images_and_masks_are_the_views_and_labels_name_their_values(folder: Path, small: DemoRoom):
     cameras = [*demo_cameras(2, 60, 44), *held_out_cameras(2, 60, 44)]
     for kind, mode, view in (("images", "RGB", view_image), ("instance", "L", view_labels)):
         assert sorted(path.name for path in (folder / kind).iterdir()) == [f"{i:04d}.png" for i in range(4)]
@@ -26,9 +26,6 @@ def test_images_and_masks_are_the_views(folder: Path, small: DemoRoom):
             with Image.open(folder / kind / f"{i:04d}.png") as image:
                 assert (image.size, image.mode) == ((60, 44), mode)
                 assert np.array_equal(np.asarray(image), view(small, camera).numpy())
-
-
-def test_labels_name_the_mask_values(folder: Path, small: DemoRoom):
     names = {str(i): name for i, name in enumerate(small.names, 1)}
     assert json.loads((folder / "labels.json").read_text()) == {"labels": names, "background": 0}
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from inspect import signature
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,24 +8,6 @@ import torch
 
 from normlift_ns import lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras, view_image, view_labels
-
-
-@pytest.fixture(scope="module")
-def coordinates() -> Any:
-    """Turns colors into what the color encoder compares: `coordinates(rgb)`."""
-    from skimage.color import rgb2lab  # noqa: PLC0415
-
-    from normlift_ns.encoders.texts.colours import shading_coordinates  # noqa: PLC0415
-
-    return lambda rgb: shading_coordinates(rgb2lab(rgb))
-
-
-@pytest.fixture(scope="module")
-def own(room: DemoRoom, coordinates: Any) -> np.ndarray:
-    """Coordinates of the colors that the classes are named after."""
-    from matplotlib.colors import to_rgb  # noqa: PLC0415
-
-    return coordinates(np.array([to_rgb(f"xkcd:{name}") for name in room.names]))
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +41,10 @@ def test_contents(room: DemoRoom):
     assert 0.02 < never_drawn < 0.06
 
 
-def test_flat_gaussians_lie_along_the_surface(room: DemoRoom):
+def test_surfaces_are_opaque_and_flat_gaussians_lie_along_them(room: DemoRoom):
+    for camera in demo_cameras(4, 80, 60):
+        alpha = render(room.scene, camera, room.colors)[1]
+        assert alpha.median() > 0.98 and alpha.min() > 0.7
     floor = (room.labels == room.names.index("slate")) & (room.scene.opacities > 0.9) & (room.scene.means[:, 2] < 0.1)
     assert room.scene.means[floor, 2].abs().median() < 1e-4
     _, x, y, _ = room.scene.quats[floor].unbind(1)
@@ -69,25 +53,18 @@ def test_flat_gaussians_lie_along_the_surface(room: DemoRoom):
     assert (room.scene.scales[floor, 2] < 0.2 * room.scene.scales[floor, 0]).float().mean() > 0.9
 
 
-def test_surfaces_are_opaque(room: DemoRoom):
-    for camera in demo_cameras(4, 80, 60):
-        _, alpha = render(room.scene, camera, room.colors)
-        assert alpha.median() > 0.98
-        assert alpha.min() > 0.7
+def test_every_thing_has_texture_and_is_seen_in_a_color_of_its_own(room: DemoRoom, labels: list[torch.Tensor]):
+    from matplotlib.colors import to_rgb  # noqa: PLC0415
+    from skimage.color import rgb2lab  # noqa: PLC0415
 
+    from normlift_ns.encoders.texts.colours import ColourTexts, shading_coordinates  # noqa: PLC0415
 
-def test_names_are_distinct_colors_of_the_survey(room: DemoRoom, own: np.ndarray):
-    from normlift_ns.encoders.texts.colours import ColourTexts  # noqa: PLC0415
-
-    distance = np.linalg.norm(own[:, None] - own, axis=2) + np.diag(np.full(len(own), np.inf))
-    assert distance.min() > 25
-    vectors = ColourTexts().rows(room.names)  # and the encoder tells them apart
-    assert (vectors @ vectors.T - np.eye(len(vectors))).max() < 0.72
-
-
-def test_every_thing_is_seen_in_its_own_color(room: DemoRoom, labels: list[torch.Tensor], own, coordinates):
-    cameras = demo_cameras(6, 160, 120)
-    seen = coordinates(np.concatenate([view_image(room, camera).reshape(-1, 3) for camera in cameras]) / 255)
+    vectors = ColourTexts().rows(room.names)
+    assert (vectors @ vectors.T - np.eye(len(vectors))).max() < 0.72  # the encoder tells them apart
+    own = shading_coordinates(rgb2lab(np.array([to_rgb(f"xkcd:{name}") for name in room.names])))
+    cameras, lightness = demo_cameras(6, 160, 120), rgb2lab(room.colors.numpy())[:, 0]
+    pixels = np.concatenate([view_image(room, camera).reshape(-1, 3) for camera in cameras])
+    seen = shading_coordinates(rgb2lab(pixels / 255))
     truth = torch.cat([view.flatten() for view in labels]).numpy()
     nearest = np.linalg.norm(seen[:, None] - own, axis=2).argmin(axis=1)
     for index, name in enumerate(room.names):
@@ -97,15 +74,8 @@ def test_every_thing_is_seen_in_its_own_color(room: DemoRoom, labels: list[torch
         assert distance[index] < 20, name
         assert (nearest[shown] == index).mean() > 0.7, name
         assert (shown.reshape(len(cameras), -1).sum(axis=1) > 40).sum() >= 3, name
-
-
-def test_things_have_texture_and_shadow(room: DemoRoom):
-    from skimage.color import rgb2lab  # noqa: PLC0415
-
-    lightness = rgb2lab(room.colors.numpy())[:, 0]
-    for index, name in enumerate(room.names):
-        mine = lightness[(room.labels == index).numpy()]
-        assert np.quantile(mine, 0.9) - np.quantile(mine, 0.1) > 5, name
+        shades = lightness[(room.labels == index).numpy()]
+        assert np.quantile(shades, 0.9) - np.quantile(shades, 0.1) > 5, name
 
 
 def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
@@ -134,7 +104,6 @@ def test_lift_finds_the_classes_and_refinement_repairs(room: DemoRoom, labels: l
     how = {"own": scalars.own_evidence, "neighbors": nearest_neighbors(room.scene.means, 36)}
     source = refine(room.scene.means, directions, scalars.reliability, **how).long()
     before, after = mean_iou(room, directions @ classes.T), mean_iou(room, directions[source] @ classes.T)
-    print(f"mIoU {before:.3f}, refined {after:.3f}")
     assert 0.65 < before < 0.75
     assert after > before + 0.015
     known = room.labels >= 0

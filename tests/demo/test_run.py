@@ -8,21 +8,17 @@ import pytest
 import torch
 import yaml
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from normlift_ns import Camera, GaussianScene, render
 from normlift_ns.demo import DemoRoom, write_capture, write_splatfacto_run
 from normlift_ns.demo.run import to_dataparser_world
+from tests.scenes import random_scene
 
 
 def test_to_dataparser_world_moves_every_gaussian_rigidly():
     generator = torch.Generator().manual_seed(0)
-    n = 50
-    scene = GaussianScene(
-        torch.randn(n, 3, generator=generator),
-        torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=1),
-        torch.rand(n, 3, generator=generator),
-        torch.rand(n, generator=generator),
-    )
+    scene = random_scene(50, dtype=torch.float32)
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q
     rotation = rotation * torch.det(rotation)
     transform = torch.cat([rotation, torch.tensor([[0.3], [-2.0], [1.0]])], dim=1)
@@ -34,19 +30,14 @@ def test_to_dataparser_world_moves_every_gaussian_rigidly():
 
 
 def covariances(scene: GaussianScene) -> torch.Tensor:
-    w, x, y, z = scene.quats.unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    half = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1) * scene.scales[:, None]
+    turned = Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy()).as_matrix()
+    half = torch.from_numpy(turned).float() * scene.scales[:, None]
     return half @ half.transpose(1, 2)
 
 
 @pytest.fixture(scope="module")
 def run(nerfstudio: Any, small: DemoRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """config.yml of the small room's run; nerfstudio's writers of logs, of the whole process, are as before."""
+    """config.yml of the small room's run."""
     from nerfstudio.utils import writer  # noqa: PLC0415
 
     folder, writers = tmp_path_factory.mktemp("demo"), list(writer.EVENT_WRITERS)

@@ -27,15 +27,11 @@ def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
     return shapes.projected(shape, near, LOW, HIGH)
 
 
-def test_surface_points_are_on_the_surface_and_even():
+def test_surface_points_are_even_and_on_the_surface_and_normals_point_outward():
     for name, (shape, area) in solids().items():
         points = sampled(shape, 5000)
         assert np.abs(shape(points)).max() < shapes.ON_SURFACE, name
         assert len(points) == pytest.approx(5000 * area, rel=0.05), name
-
-
-def test_normals_point_outward():
-    for name, (shape, _) in solids().items():
         points = sampled(shape, 500)
         normals = shapes.normals(shape, points)
         assert np.linalg.norm(normals, axis=1) == pytest.approx(1), name

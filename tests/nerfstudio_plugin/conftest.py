@@ -59,7 +59,6 @@ def copied(stock: StockRun, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def field(stock: StockRun) -> SemanticField:
-    """A field of the stock run."""
     return lifted_field(opened(stock.config))
 
 
@@ -121,8 +120,8 @@ def lifted_field(run: NerfstudioScene) -> SemanticField:
     cameras = run.train.cameras
     labels = [(torch.arange(c.width) >= c.width // 2).int().expand(c.height, c.width) for c in cameras]
     evidence = rasterize_evidence(run.gaussians, cameras, labels, rasterize_mode=run.rasterize_mode)
-    features = torch.eye(8)[:2].repeat(len(cameras), 1)
-    return SemanticField.build(lift(evidence, features), run.gaussians.means, storage="float16", tolerance=1e-2)
+    lifted = lift(evidence, torch.eye(8)[:2].repeat(len(cameras), 1))
+    return SemanticField.build(lifted, run.gaussians.means, storage="float16", tolerance=1e-2)
 
 
 def write(

@@ -1,6 +1,5 @@
 """A splatfacto run as `ns-train splatfacto` writes it, made by nerfstudio's own Trainer on a CPU in a second.
 
-`write_dataset` writes a nerfstudio dataset of small images with lens distortion and a seed point cloud.
 `train_splatfacto` takes nerfstudio's registered configuration and runs `Trainer.setup()` and `Trainer.train()`; they
 write config.yml, dataparser_transforms.json and the checkpoint (optimizers, schedulers with numpy scalars, LPIPS).
 What splatfacto cannot do without a GPU, internet or system libraries is replaced while it trains (`splatfacto_on_cpu`):
@@ -10,8 +9,6 @@ What splatfacto cannot do without a GPU, internet or system libraries is replace
 * torchmetrics' LPIPS, which downloads AlexNet: a small network of our own;
 * open3d, which needs system libraries, for reading the seed points;
 * torch.compile: eager, as compiling takes longer than the training.
-
-To put known Gaussians into the run, set them in `prepare`, which gets the Trainer between setup and training.
 """
 
 from __future__ import annotations
@@ -45,14 +42,12 @@ WIDTH, HEIGHT, FOCAL, K1 = 48, 36, 40.0, 0.06
 
 @dataclass
 class StockRun:
-    """What is left of a training."""
+    """What is left of a training: its working directory, its config.yml, and nerfstudio's Trainer unless another
+    process may have trained."""
 
     workspace: Path
-    """Its working directory."""
     config: Path
-    """Its config.yml."""
     trainer: Any = None
-    """nerfstudio's Trainer; None if another process may have trained."""
 
     @cached_property
     def pipeline(self) -> Any:
@@ -68,10 +63,8 @@ class StockRun:
         return pipeline
 
 
-def write_dataset(
-    folder: Path, *, count: int = 10, masks: bool = False, channels: int = 3, halved: bool = False
-) -> None:
-    """Writes transforms.json, `count` images from a circle around the origin, and sparse_pc.ply.
+def write_dataset(folder: Path, *, masks: bool = False, channels: int = 3, halved: bool = False) -> None:
+    """Writes transforms.json, ten images from a circle around the origin, and sparse_pc.ply.
 
     Args:
         masks: with a mask per image that is 0 in its left quarter.
@@ -82,8 +75,9 @@ def write_dataset(
     rng = np.random.default_rng(0)
     suffix = "png" if channels == 4 else "jpg"
     frames = []
-    for i in range(count):
-        picture = _picture(rng)
+    for i in range(10):
+        coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
+        picture = np.asarray(coarse.resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC))
         if channels == 4:
             picture = np.dstack([picture, np.full((HEIGHT, WIDTH), 255, np.uint8)])
             picture[:, 3 * WIDTH // 4 :, 3] = 0
@@ -92,7 +86,7 @@ def write_dataset(
         if halved:
             (folder / "images_2").mkdir(exist_ok=True)
             image.resize((WIDTH // 2, HEIGHT // 2)).save(folder / "images_2" / f"{i:03d}.{suffix}")
-        frames.append({"file_path": f"images/{i:03d}.{suffix}", "transform_matrix": _pose(i, count).tolist()})
+        frames.append({"file_path": f"images/{i:03d}.{suffix}", "transform_matrix": pose(i).tolist()})
         if masks:
             mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
             mask[:, : WIDTH // 4] = 0
@@ -103,29 +97,20 @@ def write_dataset(
     meta = {"camera_model": "OPENCV", **intrinsics, "ply_file_path": "sparse_pc.ply", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(meta))
     points = rng.normal(scale=0.5, size=(60, 3))
-    lines = [
-        f"{x:.4f} {y:.4f} {z:.4f} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(points, rng.integers(0, 256, (60, 3)))
-    ]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(lines)}"]
-    header += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
-    (folder / "sparse_pc.ply").write_text("\n".join([*header, "end_header", *lines]) + "\n")
+    rows = np.hstack([points, rng.integers(0, 256, (60, 3))])
+    names = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    header = "\n".join(["ply", "format ascii 1.0", "element vertex 60", *names, "end_header"])
+    np.savetxt(folder / "sparse_pc.ply", rows, fmt=["%.4f"] * 3 + ["%d"] * 3, header=header, comments="")
 
 
-def _picture(rng: np.random.Generator) -> np.ndarray:
-    coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
-    return np.asarray(coarse.resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC))
-
-
-def _pose(i: int, count: int) -> np.ndarray:
+def pose(i: int) -> np.ndarray:
     """Camera-to-world, OpenGL: on a wavy circle of radius 4, looking at the origin."""
-    angle = 2 * np.pi * i / count
+    angle = 2 * np.pi * i / 10
     position = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1 + 0.5 * np.sin(3 * angle)])
     back = position / np.linalg.norm(position)
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(back, right), back, position], axis=1)
-    return pose
+    return np.vstack([np.stack([right, np.cross(back, right), back, position], axis=1), [0, 0, 0, 1]])
 
 
 def train_splatfacto(
@@ -141,7 +126,6 @@ def train_splatfacto(
     """`ns-train METHOD --data DATA` in the directory `workspace`.
 
     Args:
-        data: the dataset, relative to the workspace or absolute.
         method: its name, or its configuration.
         configure: changes the configuration, like flags of ns-train.
         prepare: changes the Trainer between setup and training.
@@ -151,8 +135,7 @@ def train_splatfacto(
 
     config: Any = deepcopy(method_configs[method] if isinstance(method, str) else method)
     config.machine.device_type = "cpu"
-    config.timestamp = timestamp
-    config.max_num_iterations = steps
+    config.timestamp, config.max_num_iterations = timestamp, steps
     config.data = config.pipeline.datamanager.data = data
     model = config.pipeline.model
     model.num_downscales = 0  # from the start at full resolution
@@ -210,36 +193,19 @@ class SmallLpips(torch.nn.Module):
         return (image - target).square().mean()
 
 
-def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    sh_degree: int | None = None,
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
-    **unused: Any,
-) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """gsplat.rasterization of one camera, differentiable, as far as splatfacto and NormLiftModel call it."""
-    settings, camera = RasterSettings(), Camera(Ks[0], viewmats[0], width, height)
-    projected = project(
-        to_world(GaussianScene(means, quats, scales, opacities), means.dtype),
-        camera,
-        settings,
-        rasterize_mode == "antialiased",
-    )
+def rasterization(**how: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """gsplat.rasterization of one camera, differentiable, as far as splatfacto calls it."""
+    means, colors, viewmat, width, height = (how[name] for name in ("means", "colors", "viewmats", "width", "height"))
+    settings, camera = RasterSettings(), Camera(how["Ks"][0], viewmat[0], width, height)
+    scene = to_world(GaussianScene(means, how["quats"], how["scales"], how["opacities"]), means.dtype)
+    projected = project(scene, camera, settings, how["rasterize_mode"] == "antialiased")
     tiles = assign_tiles(projected, width, height, settings.tile_size)
-    rgb = colors if sh_degree is None else view_colors(means, colors, camera, sh_degree)
-    depth = means @ viewmats[0, 2, :3, None] + viewmats[0, 2, 3]
+    rgb = colors if how["sh_degree"] is None else view_colors(means, colors, camera, how["sh_degree"])
+    depth = means @ viewmat[0, 2, :3, None] + viewmat[0, 2, 3]
     values = torch.cat([rgb, depth], dim=1)[projected.gaussian]
     image, alpha = reference.composite(projected, tiles, values, width, height, settings)
     alpha = alpha[..., None]
     channels = [image[..., :-1]]
-    if render_mode == "RGB+ED":
+    if how["render_mode"] == "RGB+ED":
         channels.append(image[..., -1:] / alpha.clamp(min=1e-10))
     return torch.cat(channels, dim=-1)[None], alpha[None], {"means2d": projected.means2d}

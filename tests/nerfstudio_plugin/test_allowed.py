@@ -91,10 +91,9 @@ def test_every_other_data_parser_is_refused_by_name(tmp_path: Path, config: Any)
 
 
 def test_a_target_that_is_not_its_own_is_refused(tmp_path: Path, texts: tuple[str, str]) -> None:
-    """At every level: the code of a data parser that unpickles, and one that is itself allowed elsewhere."""
     text, modules = texts[1], "nerfstudio.data.dataparsers"
     targets = [f"{modules}.minimal_dataparser.MinimalDataParser", "nerfstudio.utils.writer.TensorboardWriter"]
-    targets.append(f"{modules}.colmap_dataparser.ColmapDataParser")
+    targets.append(f"{modules}.colmap_dataparser.ColmapDataParser")  # which is allowed elsewhere
     found = list(re.finditer(r"_target: (&\w+ )?.*", text))
     assert len(found) > 15
     for number, place in enumerate(found):
@@ -190,7 +189,6 @@ def test_odd_yaml_is_refused(tmp_path: Path, texts: tuple[str, str]) -> None:
     added = {
         "timestamp: again": "twice",
         "x: " + "[" * 800 + "]" * 800: "nested too deeply",
-        "x: " + "[" * 800: "YAML",
         "<<: {data: null}": "<<",
         "x: " + "y" * 2**18: f"{2**18:,}",
         "data: *nowhere": "YAML",
@@ -204,7 +202,6 @@ def test_odd_yaml_is_refused(tmp_path: Path, texts: tuple[str, str]) -> None:
         ("prompt: null", "prompt: !!python/tuple 3"): "cannot be read",
         ("prompt: null", "prompt: &a [*a]"): "recursive",
         ("method_name: splatfacto", "method_name: ../splatfacto"): "'../splatfacto'",
-        ("method_name: splatfacto", "method_name: null"): "'null'",
         ("- scene", "- 5"): "other things than text",
         ("- Train Iter (time)", "- Nothing"): "cannot be read",
     }
@@ -247,18 +244,14 @@ def test_a_run_that_was_moved_is_lifted_below_the_current_directory(tmp_path: Pa
 
 @st.composite
 def damaged(draw: st.DrawFn, text: str) -> bytes:
-    """Lines left out, doubled, exchanged, cut or with other values."""
+    """Lines left out, doubled, replaced by others, cut or with other values."""
     lines = text.splitlines()
-    values = ["null", "3", "-1", ".nan", "1e400", "x", "[]", "{}", "[[[]]]", "*id001", "!!python/name:os.system ''"]
+    values = ["null", "3", "-1", ".nan", "1e400", "x", "[]", "{}", "[[[]]]", "*id001", "!!python/name:os.system ''", ""]
     for _ in range(draw(st.integers(1, 4))):
-        i, j = (draw(st.integers(0, len(lines) - 1)) for _ in range(2))
-        line, other = lines[i], lines[j]
-        key, colon, _ = line.partition(": ")
-        value = f"{key}: {draw(st.sampled_from([*values, '']))}" if colon else line
-        kind = draw(st.sampled_from(["gone", "twice", "cut", "exchanged", "value"]))
-        lines[i] = {"cut": line[: draw(st.integers(0, len(line)))], "exchanged": other, "value": value}.get(kind, line)
-        lines[j] = line if kind == "exchanged" else other
-        lines[i : i + 1] = {"gone": [], "twice": [line, line]}.get(kind, [lines[i]])
+        i = draw(st.integers(0, len(lines) - 1))
+        key, cut = lines[i].partition(": ")[0], lines[i][: draw(st.integers(0, len(lines[i])))]
+        new = [draw(st.sampled_from(lines)), cut, f"{key}: {draw(st.sampled_from(values))}"]
+        lines[i : i + 1] = draw(st.sampled_from([[], [lines[i]] * 2, *([line] for line in new)]))
     return "\n".join(lines).encode()
 
 

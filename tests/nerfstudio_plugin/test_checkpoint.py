@@ -28,8 +28,7 @@ def test_a_full_stock_checkpoint_is_read(stock: StockRun, full: Path) -> None:
     assert any(name.startswith("_model.lpips.") for name in stored["pipeline"])
 
     checkpoint, scene, model = read_checkpoint(full), opened(stock.config).gaussians, stock.pipeline.model
-    assert checkpoint.step == 2
-    assert not any("lpips" in name for name in checkpoint.model)
+    assert checkpoint.step == 2 and not any("lpips" in name for name in checkpoint.model)
     found = {name for name in checkpoint.model if name.startswith("gauss_params.")}
     assert found == {f"gauss_params.{name}" for name in GAUSSIAN_PARAMETERS}
     for name in GAUSSIAN_PARAMETERS:
@@ -83,17 +82,12 @@ def test_a_missing_checkpoint_is_named(copied: Path, tmp_path: Path) -> None:
     assert find_checkpoint(tmp_path).name == "step-000000001.ckpt"  # the others only look like checkpoints
 
 
-def test_a_truncated_checkpoint_is_named(full: Path, tmp_path: Path) -> None:
-    content = full.read_bytes()
-    for share in (0.0, 0.1, 0.5, 0.9, 0.999):
-        size = int(len(content) * share)
-        (tmp_path / NAME).write_bytes(content[:size])
-        with pytest.raises(ValueError, match=rf"{NAME} is truncated .* {size:,} bytes"):
-            read_checkpoint(tmp_path / NAME)
-
-
-def test_flipped_bits_are_noticed_or_change_nothing(full: Path, tmp_path: Path) -> None:
+def test_cut_files_and_flipped_bits_are_noticed_or_change_nothing(full: Path, tmp_path: Path) -> None:
     path, expected, whole = tmp_path / NAME, read_checkpoint(full).model, full.read_bytes()
+    for share in (0.0, 0.5, 0.999):
+        path.write_bytes(whole[: int(len(whole) * share)])
+        with pytest.raises(ValueError, match=rf"{NAME} is truncated .* {int(len(whole) * share):,} bytes"):
+            read_checkpoint(path)
     noticed = 0
     for bit in random.Random(0).sample(range(8 * len(whole)), 40):
         changed = bytearray(whole)
@@ -122,7 +116,6 @@ def test_other_content_is_named_and_no_code_is_run(full: Path, tmp_path: Path) -
     path, stored = tmp_path / "x.ckpt", torch.load(full, weights_only=False)
     for content, problem in (
         ({**stored, "extra": _Touch(tmp_path / "hacked")}, "Python objects"),
-        ([1, 2], "`step` and `pipeline` .* list"),
         ({"weights": 1}, r"`step` and `pipeline` .*\['weights'\]"),
     ):
         torch.save(content, path)

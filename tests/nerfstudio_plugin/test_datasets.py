@@ -19,7 +19,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Frame, Intrinsics
 from tests.hostile import fuzz, hostile_json
 from tests.nerfstudio_plugin.conftest import opened
-from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, _pose, train_splatfacto, write_dataset
+from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, train_splatfacto, write_dataset
 from tests.scenes.made import write_colmap
 
 
@@ -28,10 +28,8 @@ def write_project(folder: Path) -> Path:
     write_dataset(folder)
     (folder / "transforms.json").unlink()
     camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, k1=0.06)
-    frames = []
-    for i in range(10):
-        name = f"{i:03d}.jpg"
-        frames.append(Frame(folder / "images" / name, name, _pose(i, 10)[:3], camera))
+    names = [f"{i:03d}.jpg" for i in range(10)]
+    frames = [Frame(folder / "images" / name, name, pose(i)[:3], camera) for i, name in enumerate(names)]
     points = np.random.default_rng(0).normal(size=(60, 3)) * 0.5
     return write_colmap(folder, frames, points=points)
 
@@ -72,10 +70,9 @@ def test_colmap_and_blender_runs_are_read_as_they_were_trained(project: StockRun
     scene = tmp_path / "scene"
     write_dataset(scene, channels=4)
     angle = 2 * math.atan(0.5 * WIDTH / FOCAL)
-    frames = [{"file_path": f"./images/{i:03d}", "transform_matrix": _pose(i, 10).tolist()} for i in range(10)]
+    frames = [{"file_path": f"./images/{i:03d}", "transform_matrix": pose(i).tolist()} for i in range(10)]
     for split, part in (("train", frames[:8]), ("val", frames[8:]), ("test", frames[8:])):
-        content = {"camera_angle_x": angle, "frames": part}
-        (scene / f"transforms_{split}.json").write_text(json.dumps(content))
+        (scene / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": part}))
 
     def configure(config: Any) -> None:
         config.pipeline.datamanager.dataparser = BlenderDataParserConfig()
@@ -156,12 +153,10 @@ def test_cameras_that_no_training_had_are_named(copied: Path) -> None:
         ({"camera_model": "CUBE"}, "CUBE"),
         ({"orientation_override": "sideways"}, "cannot read the dataset"),
         ({"frames": [{**frame, "file_path": "images\0"}, *keep]}, "name of a file"),
-        ({"frames": {}}, "form"),
         ({"frames": [[[[[[[[]]]]]]]]}, "form"),
         ({"frames": []}, "has no frames"),
         ({"w": 40}, "000.jpg is 48 x 36 pixels, its camera 40 x 36"),
         ("{}", "`frames`"),
-        ("{", "JSON"),
         ("[" * 20_000, "JSON"),
     ]
     for content, message in cases:
@@ -189,8 +184,8 @@ def test_changes_after_the_training_are_noticed(copied: Path) -> None:
         with pytest.raises(InputError, match=rf"trained with.* scale \S+, .* {scale:.6g}, .*{trained.name}"):
             opened(copied)
     path.write_text(json.dumps({**whole, "frames": frames[::-1]}))
-    assert opened(copied).train.names[0] == "images/000.jpg"  # nerfstudio sorts them
-    assert opened(copied).remarks == ()
+    run = opened(copied)
+    assert (run.train.names[0], run.remarks) == ("images/000.jpg", ())  # nerfstudio sorts them
 
 
 def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) -> None:
@@ -200,9 +195,7 @@ def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) 
         ({"transform": unit, "scale": 0}, "3 rows and scale 0"),
         ({"transform": unit[:2], "scale": 1}, "2 rows and scale 1"),
         ({"transform": [[1, 2], [3]], "scale": 1}, "transform"),
-        ({"transform": None, "scale": 1}, "transform"),
         ({"scale": 1}, "`transform`"),
-        ([], "transform"),
         ({"transform": unit, "scale": True}, "`float`, got `bool`"),
         ({"transform": [[1e200] * 4] * 3, "scale": 1}, "3 rows of 4 finite numbers"),
     ]
@@ -218,14 +211,10 @@ def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) 
         opened(copied)
 
 
-def picture(mode: str) -> Image.Image:
-    return Image.new("L", (WIDTH, HEIGHT), 100).convert(mode) if mode != "I;16" else Image.new("I;16", (WIDTH, HEIGHT))
-
-
 def test_pixels_that_nerfstudio_reads_wrong_are_refused(copied: Path) -> None:
     file = scene_of(copied) / "images" / "003.jpg"
     for mode in ("1", "P", "LA", "I;16", "I", "F"):
-        picture(mode).save(file, "TIFF" if mode in "IF" else "PNG")
+        Image.new(mode, (WIDTH, HEIGHT)).save(file, "TIFF" if mode in "IF" else "PNG")
         with pytest.raises(InputError, match=rf"003\.jpg .* {mode}, "):
             opened(copied)
     for make, message in (
@@ -247,8 +236,9 @@ def test_pixels_that_people_see_otherwise_are_said_with_count_and_name(copied: P
     exif[0x0112] = 6
     for name in ("002.jpg", "004.jpg"):
         Image.open(images / name).save(images / name, exif=exif)
-    picture("CMYK").save(images / "005.jpg")
-    picture("RGB").save(images / "006.jpg", "WEBP", save_all=True, append_images=[Image.new("RGB", (WIDTH, HEIGHT))])
+    Image.new("CMYK", (WIDTH, HEIGHT)).save(images / "005.jpg")
+    grey, black = (Image.new("RGB", (WIDTH, HEIGHT), color) for color in ("grey", "black"))
+    grey.save(images / "006.jpg", "WEBP", save_all=True, append_images=[black])
     expected = (("2 of 9", "EXIF", "002.jpg"), ("1 of 9", "CMYK", "005.jpg"), ("1 of 9", "several", "006.jpg"))
     for remark, (count, what, name) in zip(opened(copied).remarks, expected, strict=True):
         assert all(part in remark for part in (count, what, f"{images}/{name}")), remark
@@ -256,15 +246,13 @@ def test_pixels_that_people_see_otherwise_are_said_with_count_and_name(copied: P
 
 def test_checkpoint_and_config_must_be_of_one_training(copied: Path) -> None:
     (path,) = (copied.parent / "nerfstudio_models").iterdir()
-    whole, text = torch.load(path, weights_only=False)["pipeline"], copied.read_text()
+    whole, text, nothing = torch.load(path, weights_only=False), copied.read_text(), torch.full((60, 3), torch.nan)
     copied.write_text(text.replace("sh_degree: 3", "sh_degree: 2"))
     with pytest.raises(InputError, match=r" 15 .* sh_degree 2, .* 8"):
         opened(copied)
     copied.write_text(text)
     for name in ("means", "scales"):
-        torch.save(
-            {"step": 2, "pipeline": {**whole, f"_model.gauss_params.{name}": torch.full((60, 3), torch.nan)}}, path
-        )
+        torch.save({"step": 2, "pipeline": {**whole["pipeline"], f"_model.gauss_params.{name}": nothing}}, path)
         with pytest.raises(InputError, match=r"none of its 60 Gaussians"):
             opened(copied)
 

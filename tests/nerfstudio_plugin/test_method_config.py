@@ -34,12 +34,10 @@ def discovered() -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def test_nerfstudio_discovers_the_method_by_its_entry_point() -> None:
-    from normlift_ns.method_configs.lerf_ovs import lerf_ovs_method  # noqa: PLC0415
-    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
-    from normlift_ns.method_configs.scannet import scannet_method  # noqa: PLC0415
+    from normlift_ns.method_configs import entry  # noqa: PLC0415
 
     methods, descriptions = discovered()
-    ours = (normlift_method, lerf_ovs_method, scannet_method)
+    ours = (entry.normlift_method, entry.lerf_ovs_method, entry.scannet_method)
     assert methods == {method.config.method_name: method.config for method in ours}
     assert descriptions == {method.config.method_name: method.description for method in ours}
     assert set(methods) == NAMES <= set(SUPPORTED_METHODS)
@@ -64,7 +62,6 @@ def test_it_trains_as_splatfacto_does_and_the_demo_is_a_run_of_splatfacto(nerfst
 
 @pytest.mark.slow
 def test_it_can_be_imported_before_nerfstudio_and_pulls_in_no_encoder() -> None:
-    """nerfstudio imports it while it is being imported itself; an error there would break every ns-* command."""
     program = (
         "import normlift_ns.method_configs.normlift, nerfstudio.configs.method_configs, sys\n"
         "print(sorted({'open_clip', 'numba', 'torchmetrics.image.lpip', 'open3d'} & set(sys.modules)))"
@@ -81,8 +78,7 @@ NOT_NEEDED += ["scipy", "torchmetrics"]
 @pytest.mark.skipif(sys.platform == "win32", reason="needs fork")
 @pytest.mark.parametrize("missing", [NOT_NEEDED, ["safetensors"], ["cv2"]], ids=["not needed", "safetensors", "cv2"])
 def test_nerfstudio_lists_its_methods_whatever_is_missing(missing: list[str], tmp_path: Path) -> None:
-    """In a child of this process, where nerfstudio is imported: all of ours is imported anew without some packages,
-    and without checks of shapes."""
+    """In a child of this process, where all of ours is imported anew without some packages and checks of shapes."""
     pid = os.fork()
     if pid == 0:
         code = 1
@@ -100,11 +96,8 @@ def test_nerfstudio_lists_its_methods_whatever_is_missing(missing: list[str], tm
             os._exit(code)
     assert os.waitpid(pid, 0)[1] == 0
     methods, told = set((tmp_path / "methods").read_text().split()), (tmp_path / "err").read_text()
-    if missing is NOT_NEEDED:
-        assert (methods, told) == (NAMES, "")
-    else:
-        assert methods == set()
-        assert told.count(missing[0]) == told.count("cannot be used") == len(NAMES)
+    assert methods == (NAMES if missing is NOT_NEEDED else set())
+    assert told == "" if missing is NOT_NEEDED else told.count(missing[0]) == len(NAMES)
 
 
 def test_an_error_of_any_kind_is_told_and_leaves_other_methods(monkeypatch, capsys) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,6 @@ LIFT = LiftOptions(vote=RefineConfig(k=6))
 
 
 @pytest.fixture
-def module() -> Any:
-    from normlift_ns.nerfstudio_plugin import pipeline  # noqa: PLC0415
-
-    return pipeline
-
-
-@pytest.fixture
 def methods() -> dict[str, Any]:
     """Configurations by the names of our methods."""
     from normlift_ns.method_configs import entry  # noqa: PLC0415
@@ -46,25 +39,15 @@ def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPa
     """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
     monkeypatch.setattr("normlift_ns.raster.gsplat.composite", None)  # splatfacto's is replaced, ours not wanted
 
-    def train(
-        timestamp: str,
-        method: str = "normlift",
-        checkpoint: Path | None = None,
-        model: Mapping[str, Any] | None = None,
-        prepare: Any = lambda trainer: None,
-        steps: int = 2,
-        **pipeline: Any,
-    ) -> StockRun:
+    def train(timestamp, method="normlift", checkpoint=None, model=None, how=None, **pipeline: Any) -> StockRun:
         def configure(config: Any) -> None:
-            vars(config.pipeline.model).update(model or {})
-            config.output_dir = Path("trained")
-            config.pipeline.model.num_random = 60
-            config.load_checkpoint = checkpoint
+            vars(config.pipeline.model).update({"num_random": 60, **(model or {})})
+            config.output_dir, config.load_checkpoint = Path("trained"), checkpoint
             source = SourceOptions(encoder="colour", region_count=12)
             vars(config.pipeline).update({"source": source, "lift": LIFT, **pipeline})
 
-        how: dict[str, Any] = {"configure": configure, "prepare": prepare, "steps": steps, "timestamp": timestamp}
-        return train_splatfacto(workspace, Path("scene"), method=methods[method], **how)
+        what: dict[str, Any] = {"configure": configure, "timestamp": timestamp, "steps": 2, **(how or {})}
+        return train_splatfacto(workspace, Path("scene"), method=methods[method], **what)
 
     serialization: Any = torch.serialization
     allowed = serialization.get_safe_globals() if hasattr(serialization, "get_safe_globals") else None
@@ -74,27 +57,21 @@ def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPa
         serialization.add_safe_globals(allowed)
 
 
-def test_the_run_is_lifted_in_place(
-    train: Callable[..., StockRun], workspace: Path, registered: None, module: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: None, capsys) -> None:
+    from normlift_ns.nerfstudio_plugin.pipeline import TrainingCallbackAttributes  # noqa: PLC0415
+
     turned, exif = workspace / "scene" / "images" / "002.jpg", Image.Exif()
     exif[0x0112] = 6
     Image.open(turned).save(turned, exif=exif)
     trained = train("whole", queries=("red", "sky blue"))
     assert "Warning: 1 of 9 photographs carry an EXIF rotation" in capsys.readouterr().out
-    run_dir = trained.config.parent
-    assert sorted(p.name for p in run_dir.iterdir() if not p.name.startswith("events")) == [
-        "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
-    ]  # fmt: skip
+    run_dir, expected_names = trained.config.parent, {"config.yml", "dataparser_transforms.json", "normlift"}
+    assert {p.name for p in run_dir.glob("[!e]*")} == expected_names | {"nerfstudio_models"}  # and events
     assert [p.name for p in (run_dir / "nerfstudio_models").iterdir()] == ["step-000000001.ckpt"]
-
     run = opened(trained.config)
-    field = field_of(run)
-    assert len(field) == 60
-    assert field.scalars.reliability.max() > 0.2
-    question = load_question(run_dir / "normlift")
-    assert question is not None
-    assert question.texts == ("red", "sky blue")
+    field, question = field_of(run), load_question(run_dir / "normlift")
+    assert len(field) == 60 and field.scalars.reliability.max() > 0.2
+    assert question is not None and question.texts == ("red", "sky blue")
     expected = answer(field, run.gaussians.means, make_question(field, encoder_of(field).rows, ["red", "sky blue"]))
 
     model = trained.pipeline.model  # the viewer of the training
@@ -103,27 +80,23 @@ def test_the_run_is_lifted_in_place(
     assert torch.equal(loaded.normlift.answer.selected.cpu(), expected.selected)
     assert torch.equal(loaded.means.cpu(), model.means.cpu())
 
-    stored = yaml.load(trained.config.read_text(), Loader=yaml.Loader)
-    assert stored.pipeline.lift == LIFT
-    assert stored.pipeline.source.encoder == "colour"
-    again: Any = run.config.pipeline
+    stored, again = yaml.load(trained.config.read_text(), Loader=yaml.Loader).pipeline, run.config.pipeline
+    assert (stored.lift, stored.source.encoder) == (LIFT, "colour")
     assert (again.lift, again.queries) == (LIFT, ("red", "sky blue"))
-
     assert not any("normlift" in name for name in trained.pipeline.state_dict())
     attributes = dict.fromkeys(("optimizers", "grad_scaler", "pipeline", "trainer"))
-    assert len(trained.pipeline.get_training_callbacks(module.TrainingCallbackAttributes(**attributes))) == 2
-    assert model.field is None  # a training that goes on changes the Gaussians
-    assert model.config.semantics is None
+    assert len(trained.pipeline.get_training_callbacks(TrainingCallbackAttributes(**attributes))) == 2
+    assert model.field is model.config.semantics is None  # a training that goes on changes the Gaussians
 
 
 @pytest.mark.parametrize("broken", ["lift_scene", "save_question"])
 def test_a_failing_lift_leaves_the_training_whole(
-    train: Callable[..., StockRun], registered: None, module, monkeypatch, capsys, tmp_path: Path, broken: str
+    train: Callable[..., StockRun], registered: None, monkeypatch, capsys, tmp_path: Path, broken: str
 ) -> None:
     def fail(*args: Any, **kwargs: Any) -> None:
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr(module, broken, fail)
+    monkeypatch.setattr(f"normlift_ns.nerfstudio_plugin.pipeline.{broken}", fail)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     trained = train(broken, queries=("red",))
     shown = capsys.readouterr()
@@ -131,8 +104,7 @@ def test_a_failing_lift_leaves_the_training_whole(
     config = trained.trainer.base_dir / "config.yml"
     for part in ("RuntimeError: out of luck", str(log), f"ns-normlift --load-config {config}"):
         assert part in shown.out
-    assert "Traceback" in log.read_text()
-    assert "Traceback" not in shown.out + shown.err
+    assert "Traceback" in log.read_text() and "Traceback" not in shown.out + shown.err
     run = opened(trained.config)
     assert torch.equal(run.gaussians.means, trained.pipeline.model.means.detach())
     assert not (trained.config.parent / "normlift").exists()
@@ -141,7 +113,7 @@ def test_a_failing_lift_leaves_the_training_whole(
         field_of(run)
 
 
-def test_mistakes_show_before_the_training(train: Any, workspace: Path, methods: Any, module: Any, monkeypatch) -> None:
+def test_mistakes_show_before_the_training(train: Any, workspace: Path, methods: Any, monkeypatch) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: PLC0415
 
     class Other(NerfstudioDataParserConfig):
@@ -162,7 +134,7 @@ def test_mistakes_show_before_the_training(train: Any, workspace: Path, methods:
         with pytest.raises(InputError, match=r"dataparser is a Other, expected NerfstudioDataParserConfig"):
             train("parser")
     with monkeypatch.context() as patched:
-        patched.setattr(module.os, "access", lambda path, mode: False)
+        patched.setattr("normlift_ns.nerfstudio_plugin.pipeline.os.access", lambda path, mode: False)
         with pytest.raises(PermissionError, match=r"trained/.* cannot be written"):
             train("locked")
     Image.new("P", (WIDTH, HEIGHT)).save(workspace / "scene" / "images" / "003.jpg", "PNG")
@@ -190,8 +162,7 @@ def test_the_features_of_lerf_ovs_lie_in_the_scene(train: Any, workspace: Path, 
         np.save(folder / f"{image.stem}_f.npy", np.eye(16, dtype=np.float32)[:2])
     given = replace(options, text_vectors=vectors)
     field = field_of(opened(train("features", source=given, queries=("thing", "wall")).config))
-    assert field.dimension == 16
-    assert field.manifest["features"]["kind"] == "langsplat"
+    assert (field.dimension, field.manifest["features"]["kind"]) == (16, "langsplat")
     (folder / f"{images[0].stem}_s.npy").unlink()
     with pytest.raises(FileNotFoundError, match=r"1 of \d+ images"):
         train("one missing", source=given)
@@ -206,14 +177,13 @@ def test_frozen_points_stay_where_they_are(train: Callable[..., StockRun], metho
     eager = {"warmup_length": 0, "refine_every": 1, "densify_grad_thresh": 0.0, "cull_alpha_thresh": 0.9}
     # the method's own; all else would split and cull at once
     eager["stop_split_at"] = methods["normlift-scannet"].pipeline.model.stop_split_at
-    trained = train("frozen", method="normlift-scannet", prepare=remember, steps=5, model=eager)
+    trained = train("frozen", "normlift-scannet", model=eager, how={"prepare": remember, "steps": 5})
     after = trained.pipeline.model.gauss_params
     assert torch.equal(before["means"], after["means"])
     assert all(not torch.equal(before[name], after[name]) for name in ("scales", "opacities", "features_dc"))
     outputs = trained.pipeline.datamanager.train_dataparser_outputs
-    assert outputs.dataparser_scale == 1
+    assert (outputs.dataparser_scale, len(outputs.image_filenames)) == (1, 10)
     assert torch.equal(outputs.dataparser_transform, torch.eye(4)[:3])
-    assert len(outputs.image_filenames) == 10
     run = opened(trained.config)
     assert (run.train.cameras[0].width, run.train.cameras[0].height) == (23, 17)  # half of 48 x 36, undistorted
     assert len(field_of(run)) == 60

@@ -15,26 +15,18 @@ from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, train_splatfacto, write_dataset
 
 
-def _stock_viewmats(run: StockRun) -> torch.Tensor:
-    """World-to-camera poses as splatfacto computes them while it trains."""
-    from nerfstudio.models import splatfacto  # noqa: PLC0415
-
-    datamanager, model = run.pipeline.datamanager, run.pipeline.model
-    poses = []
-    with torch.no_grad(), torch.compiler.set_stance("force_eager"):
-        for i in range(len(datamanager.train_dataset)):
-            camera = datamanager.train_cameras[i : i + 1]
-            camera.metadata = {"cam_idx": i}
-            poses.append(splatfacto.get_viewmat(model.camera_optimizer.apply_to_camera(camera))[0])
-    return torch.stack(poses)
-
-
 def _assert_like_the_training(run: StockRun) -> Any:
     """Compares the views of a run with those of its training; returns its scene."""
-    scene, datamanager = opened(run.config), run.pipeline.datamanager
-    assert len(scene.train) == len(datamanager.cached_train)
+    from nerfstudio.models import splatfacto  # noqa: PLC0415
+
+    scene, datamanager, optimizer = opened(run.config), run.pipeline.datamanager, run.pipeline.model.camera_optimizer
+    assert len(scene.train) == len(datamanager.cached_train) == len(datamanager.train_dataset)
     intrinsics = datamanager.train_cameras.get_intrinsics_matrices()
-    for i, (view, cached, pose) in enumerate(zip(scene.train, datamanager.cached_train, _stock_viewmats(run))):
+    for i, (view, cached) in enumerate(zip(scene.train, datamanager.cached_train)):
+        camera = datamanager.train_cameras[i : i + 1]
+        camera.metadata = {"cam_idx": i}
+        with torch.no_grad(), torch.compiler.set_stance("force_eager"):
+            pose = splatfacto.get_viewmat(optimizer.apply_to_camera(camera))[0]
         assert torch.equal(view.image, cached["image"])
         assert (view.mask is None) == ("mask" not in cached)
         assert view.mask is None or torch.equal(view.mask, cached["mask"][:, :, 0])
@@ -45,15 +37,11 @@ def _assert_like_the_training(run: StockRun) -> Any:
 
 
 def test_views_splits_and_world_are_those_of_the_training(stock: StockRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*args) -> None:
-        raise AssertionError("the seed points were read")
-
     assert "load_3D_points: true" in stock.config.read_text()
     datamanager = stock.pipeline.datamanager
-    monkeypatch.setattr("nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio._load_3D_points", fail)
+    monkeypatch.setattr("nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio._load_3D_points", pytest.fail)
     run = _assert_like_the_training(stock)
-    assert len(run.gaussians) == 60
-    assert run.rasterize_mode == "classic"
+    assert (len(run.gaussians), run.rasterize_mode) == (60, "classic")
     for views, dataset in ((run.train, datamanager.train_dataset), (run.held_out, datamanager.eval_dataset)):
         assert [file.name for file in views.files] == [file.name for file in dataset.image_filenames]
         camera = views.cameras[0]  # undistortion changes size and focal length
@@ -87,9 +75,8 @@ def test_cameras_of_aria_are_undistorted_as_in_the_training(tmp_path: Path) -> N
     run = train_splatfacto(tmp_path, Path("scene"))
     scene = _assert_like_the_training(run)
     view = scene.train[0]
-    assert view.image.shape == (30, 30, 3)
-    assert view.mask is not None and 0.5 < view.mask.float().mean() < 1
-    assert view.original == (WIDTH, HEIGHT)
+    assert (view.image.shape, view.original) == ((30, 30, 3), (WIDTH, HEIGHT))
+    assert 0.5 < view.mask.float().mean() < 1
     assert [camera.width for camera in scene.held_out.cameras] == [30]
     arias(tmp_path / "scene", masks=True, fisheye_crop_radius=15.0)
     with pytest.raises(InputError, match=r"FISHEYE624 .*masks"):
@@ -135,11 +122,8 @@ def test_masks_are_undistorted_with_their_images_and_named_with_them(tmp_path: P
     write_dataset(tmp_path / "masked", masks=True)
     run = train_splatfacto(tmp_path, Path("masked"))
     mask = _assert_like_the_training(run).train[0].mask
-    assert mask.dtype == torch.bool
-    assert mask.shape == (35, 47)
-    assert not mask[:, :11].any()
-    assert mask[:, 13:].all()
-
+    assert (mask.dtype, mask.shape) == (torch.bool, (35, 47))
+    assert mask[:, 13:].all() and not mask[:, :11].any()
     file = tmp_path / "masked" / "masks" / "004.png"
     for made, message in (
         (Image.new("RGB", (WIDTH, HEIGHT)), r"masks/004\.png .*images/004\.jpg .* RGB"),
@@ -165,8 +149,8 @@ def test_downscaled_images_are_used_as_in_training(tmp_path: Path, how: str) -> 
 
     train = _assert_like_the_training(train_splatfacto(tmp_path, Path("halved"), configure=configure)).train
     assert train.names[0] == ("images_2/000.jpg" if how == "dataparser" else "images/000.jpg")
-    assert (train.cameras[0].width, train.cameras[0].height) == (23, 17)
-    assert FOCAL / 2 < float(train.cameras[0].K[0, 0]) < FOCAL
+    camera = train.cameras[0]
+    assert (camera.width, camera.height) == (23, 17) and FOCAL / 2 < float(camera.K[0, 0]) < FOCAL
 
 
 def test_a_run_without_held_out_views_whose_images_have_alpha(tmp_path: Path) -> None:
@@ -175,25 +159,12 @@ def test_a_run_without_held_out_views_whose_images_have_alpha(tmp_path: Path) ->
 
     write_dataset(tmp_path / "cutout", channels=4)
     run = opened(train_splatfacto(tmp_path, Path("cutout"), configure=configure).config)
-    image = run.train[0].image
-    assert image.shape == (35, 47, 3)
-    assert image[:, 37:].unique(dim=0).tolist() == [[[38, 42, 55]] * 10]  # the viewer's background
-    assert (len(run.train), len(run.held_out)) == (10, 0)
-    assert list(run.held_out) == run.held_out.cameras == []
+    assert run.train[0].image.shape == (35, 47, 3)
+    assert run.train[0].image[:, 37:].unique(dim=0).tolist() == [[[38, 42, 55]] * 10]  # the viewer's background
+    assert (len(run.train), list(run.held_out), run.held_out.cameras) == (10, [], [])
 
 
-def test_missing_images_are_named_before_anything_is_lifted(copied: Path, tmp_path: Path) -> None:
-    images = tmp_path / "moved" / "scene" / "images"
-    for name in ("003.jpg", "007.jpg"):
-        (images / name).unlink()
-    with pytest.raises(FileNotFoundError, match=rf"2 of 9 .* {images}/003\.jpg.*--data"):
-        opened(copied)
-    (images / "000.jpg").unlink()  # which nerfstudio opens to guess the downscaling
-    with pytest.raises(FileNotFoundError, match=rf"{images}/000\.jpg"):
-        opened(copied)
-
-
-def test_images_that_change_later_are_named(copied: Path) -> None:
+def test_images_that_are_missing_or_change_later_are_named(copied: Path) -> None:
     run = opened(copied)
     file = run.train.files[3]
     content = file.read_bytes()
@@ -208,3 +179,9 @@ def test_images_that_change_later_are_named(copied: Path) -> None:
     assert run.train[2].name == "images/002.jpg"
     with pytest.raises(FileNotFoundError, match=r"003\.jpg"):
         run.train[3]
+    run.train.files[7].unlink()
+    with pytest.raises(FileNotFoundError, match=rf"2 of 9 .* {file}.*--data"):
+        opened(copied)
+    run.train.files[0].unlink()  # which nerfstudio opens to guess the downscaling
+    with pytest.raises(FileNotFoundError, match=r"images/000\.jpg"):
+        opened(copied)

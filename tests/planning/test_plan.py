@@ -67,7 +67,6 @@ def test_what_is_cached_costs_no_disk_and_no_network() -> None:
 
 @pytest.mark.parametrize(("first_s", "at_once", "looked_at"), [(5.0, 1, 4), (60.0, 1, 2), (60.0, 2, 3)])
 def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, at_once: int, looked_at: int) -> None:
-    """Loading took a minute on a cold disk, and a photograph half a second."""
     seen: list[int] = []
 
     def look(indices: Sequence[int]) -> _Look:

@@ -1,11 +1,8 @@
-"""The benchmarks run and report what they promise; the errors beside the times are small; results are easy to read."""
+"""The benchmarks run and report what they promise, and the errors beside the times are small."""
 
 import json
 
-import pytest
-
-from benchmarks.minutes import minutes
-from benchmarks.report import RESULTS, Report, as_text
+from benchmarks.report import RESULTS, as_text
 from tests.captures import needs_shared
 from tests.research import quick
 
@@ -30,20 +27,10 @@ def test_quick_front_ends_benchmark(tmp_path):
     assert {"clean_10_s", "share_10", "share_clean_10", "sam_network_rate", "sam_labels_clean_s"} <= set(metrics)
     assert all(metrics[f"sam_masks_{level}"]["value"] > 0 for level in ("default", "s", "m", "l"))
     assert metrics["sam_labels_s"]["value"] > 0 < metrics["sam2_labels_s"]["value"]
-    for key in ("nms_10_s", "view_s", "cold_2_s"):
-        assert metrics[key]["error"] == 0, key
-    for key in ("encode_10_s", "patches_s", "sam_encoder_s", "sam2_encoder_s"):
-        assert metrics[key]["error"] < 1e-5, key
-    for key in ("sam_decoder_s", "sam2_decoder_s"):
-        assert metrics[key]["error"] < 1e-4, key
-
-
-def test_quick_precision_benchmark(tmp_path):
-    """Masks of a network that learned nothing, the same way through."""
-    metrics = quick("sam_precision", tmp_path, "--device", "cpu")
-    for kind in ("float16", "bfloat16", "noise"):
-        assert {f"{kind}_truth_iou", f"{kind}_miou", f"{kind}_changed_survivors"} <= set(metrics)
-        assert 0.8 < metrics[f"{kind}_mask_iou"]["value"] < 1
+    bounds = dict.fromkeys(("nms_10_s", "view_s", "cold_2_s"), 0)
+    bounds |= dict.fromkeys(("encode_10_s", "patches_s", "sam_encoder_s", "sam2_encoder_s"), 1e-5)
+    for key, most in (bounds | dict.fromkeys(("sam_decoder_s", "sam2_decoder_s"), 1e-4)).items():
+        assert metrics[key]["error"] <= most, key
 
 
 def test_results_have_one_metric_per_line():
@@ -56,21 +43,3 @@ def test_results_have_one_metric_per_line():
         assert all(set(metric) == {"key", "value", "unit", "error"} for metric in document["metrics"]), path
         assert text == as_text(document), path
         assert sum(line.startswith('  {"key": ') for line in text.splitlines()) == len(document["metrics"]), path
-
-
-def test_a_report_is_valid_json(tmp_path):
-    report = Report("some")
-    report.add("time_s", 0.25, "s", 1e-7)
-    report.add("of one seed_ci95", float("nan"), "points")
-    document = json.loads(report.write(tmp_path).read_text(), parse_constant=pytest.fail)
-    assert document["metrics"] == [
-        {"key": "time_s", "value": 0.25, "unit": "s", "error": 1e-7},
-        {"key": "of one seed_ci95", "value": None, "unit": "points", "error": None},
-    ]
-
-
-def test_minutes_are_summed_by_part(tmp_path):
-    cases = (("tests.core.test_lift", 30), ("tests.core.test_query", 90), ("tests.test_grid", 6))
-    rows = "".join(f'<testcase classname="{name}" time="{time}"/>' for name, time in cases)
-    (tmp_path / "tests.xml").write_text(f"<testsuites><testsuite>{rows}</testsuite></testsuites>")
-    assert list(minutes(tmp_path / "tests.xml").items()) == [("tests/core", 2.0), ("tests/test_grid", 0.1)]

@@ -1,4 +1,4 @@
-"""Parts of benchmarks.coverage: what a choice of views answers is a sum over views; the percentile of a choice."""
+"""Parts of benchmarks.coverage: what a choice of views answers is a sum over views, and its percentile."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks.coverage import DRAWS, Outcome, Sums, outcome
+from benchmarks.coverage import Outcome, Sums
 from benchmarks.damage import Observed
 from benchmarks.variants import lifted_scores
 from normlift_ns import Evidence, lift
@@ -51,18 +51,3 @@ def test_sums_answer_as_the_lift_does(views):
 
 def test_percentile_counts_ties_half():
     assert Outcome(0.0, 3.0, [1.0, 2.0, 3.0, 4.0], 5.0).percentile == 62.5
-
-
-def test_choices_and_draws_are_of_views_left_out(monkeypatch):
-    world, words, found, seen = observed(1)
-    monkeypatch.setattr("benchmarks.coverage.observe", lambda *_: found)
-    asked: list[list[int]] = []
-    whole = Sums.miou
-    monkeypatch.setattr(Sums, "miou", lambda self, views: (asked.append(list(views)), whole(self, views))[1])
-    one = outcome(world, words, seen, torch.arange(GAUSSIANS), "noise only", 3)
-    first, *others, everything = asked
-    assert len(first) == 8
-    assert everything == list(range(VIEWS))
-    assert all(views[:8] == first and len(set(views)) == 12 for views in others)
-    assert len(others) == len(one.draws) + 1 == DRAWS + 1
-    assert 0 <= one.percentile <= 100
