@@ -72,14 +72,6 @@ def test_a_second_run_computes_nothing(counted, tmp_path):
         assert [file.suffix for file in (tmp_path / "new" / "folder" / kind).iterdir()] == [".safetensors"]
 
 
-def test_an_interrupted_run_resumes(counted, tmp_path):
-    for count in (2, 3):
-        for i in range(count):
-            cached(counted, tmp_path).view(IMAGE // (i + 1), f"{i}.jpg")
-    assert counted.regions.asked == ["0.jpg", "1.jpg", "2.jpg"]
-    assert asked(counted) == (3, 3)
-
-
 def test_everything_that_matters_is_in_the_key(tmp_path):
     def regions(image=IMAGE, name="a.jpg", count=12):
         return CachedRegions(Grid(count), tmp_path).path(image, name)

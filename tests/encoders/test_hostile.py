@@ -1,5 +1,4 @@
-"""Files of features, labels, texts and weights that are damaged, absurd or no files: only our own errors leave the
-loaders."""
+"""Files that are damaged, absurd or no files: only our own errors leave the loaders."""
 
 from __future__ import annotations
 
@@ -227,11 +226,3 @@ def test_damaged_weights(clip_weights: Path, sam_weights: Path, tmp_path: Path) 
         if source.suffix == ".json":
             fuzz(4, hostile_json(json.loads(whole)), path, load)
         path.write_bytes(whole)
-
-
-def test_sizes_that_no_network_has_are_refused_before_it_is_built(sam_weights: Path, tmp_path: Path) -> None:
-    config = copied(sam_weights / "tiny", tmp_path) / "config.json"
-    whole = json.loads(config.read_text())
-    for name, value in (("num_labels", 2**31), ("hidden_size", 10**9), ("layer_norm_eps", 1e300)):
-        config.write_text(json.dumps(whole | {"vision_config": {name: value}}))
-        refused(lambda: load_sam(str(tmp_path)), f"{name} of config.json is ")

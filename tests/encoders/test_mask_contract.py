@@ -112,8 +112,7 @@ def test_damaged_files_are_refused_by_name(folders, kind, tmp_path):
 
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_half_precision_is_within_its_error(folders, kind):
-    """bfloat16 has 8 bits: answers of a few layers differ by some hundredths, more where weights are made large so that
-    masks depend on the point."""
+    """bfloat16 has 8 bits: answers of a few layers differ by some hundredths, more where weights are large."""
     folder, points = str(folders[kind]), torch.tensor([[20.0, 30.0], [70.0, 10.0]])
     answers = []
     for precision in ("float32", "bfloat16"):
