@@ -104,8 +104,9 @@ def test_a_gpu_finds_the_same():
     assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
 
 
-@given(masks=boxes_with_noise())
-def test_later_masks_lie_on_top_and_none_is_lost(masks):
+@given(masks=boxes_with_noise(), empty=st.booleans())
+def test_later_masks_lie_on_top_and_none_is_lost_nor_any_box(masks, empty):
+    masks = np.concatenate([masks, np.zeros((1, *masks.shape[1:]), dtype=bool)]) if empty else masks
     labels = stack_masks(torch.from_numpy(masks)).numpy()
     assert labels.dtype == np.int32
     assert len(labels) == max(1, masks.sum(axis=0).max(initial=0))
@@ -114,13 +115,8 @@ def test_later_masks_lie_on_top_and_none_is_lost(masks):
         by_hand[mask] = i
         assert ((labels == i).any(axis=0) == mask).all()
         assert ((labels == i).sum(axis=0) <= 1).all()
-    assert (labels[0] == by_hand).all()
-    assert ((labels[:-1] > labels[1:]) | (labels[1:] == -1)).all()
-
-
-@given(masks=boxes_with_noise(), empty=st.booleans())
-def test_boxes(masks, empty):
-    masks = np.concatenate([masks, np.zeros((1, *masks.shape[1:]), dtype=bool)]) if empty else masks
     for mask, box in zip(masks, boxes_of(torch.from_numpy(masks)).tolist(), strict=True):
         y, x = np.nonzero(mask)
         assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
+    assert (labels[0] == by_hand).all()
+    assert ((labels[:-1] > labels[1:]) | (labels[1:] == -1)).all()

@@ -11,8 +11,6 @@ from normlift_ns.encoders.sam.weights import load_sam
 from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE
-
-
 BOUNDS = {"float32": 2e-6, "float16": 8e-3, "bfloat16": 4e-2}
 
 
@@ -51,8 +49,6 @@ def test_answers_in_each_precision(checkpoint, embedding, expected):
         found = SamNetwork.load(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
         close(found, expected, bound)
         assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
-        agree = ((found[0] > 0) == (expected[0] > 0)).float().mean()
-        assert float(agree) > 1 - bound / 4
 
 
 def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
@@ -70,7 +66,6 @@ def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
     assert sam.identity != SamMasks(str(checkpoint), precision="bfloat16").identity
     wrong: Any = "half"
     refused(lambda: SamMasks(str(checkpoint), precision=wrong), "'half'", "--sam-precision", "auto, float32")
-    # In half precision too
     rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
     labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
     assert labels.shape[0] == 4 and int(labels.max()) >= 0

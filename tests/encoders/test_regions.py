@@ -149,7 +149,6 @@ def test_wrong_label_files_say_what_is_wrong(tmp_path):
         (np.array([{}]), ["NPY"]),
         (np.arange(3), ["(3,)", "[H, W]", "[levels, H, W]"]),
         (np.zeros((0, 2, 3), int), ["(0, 2, 3)"]),
-        (b"", ["NPY"]),
         (b"\x93NUMPY\x01\x00", ["NPY"]),
     ):
         if isinstance(content, bytes):
@@ -162,7 +161,6 @@ def test_wrong_label_files_say_what_is_wrong(tmp_path):
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "3 colour channels")
     (tmp_path / "a.png").write_bytes(b"no picture")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "picture")
-    # Missing and ambiguous ones
     refused(lambda: LabelFiles(tmp_path / "nowhere"), "nowhere", "--regions-dir", error=FileNotFoundError)
     parts = ("images/b.jpg", "b.png or b.npy")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/b.jpg"), *parts, error=FileNotFoundError)

@@ -93,16 +93,3 @@ def test_chunks_and_a_gpus_components_change_nothing(monkeypatch):
     assert all(map(torch.equal, clean_masks(masks, 40), expected))
     order = torch.from_numpy(np.random.default_rng(0).permutation(3000))  # a long chain is one component
     assert bool((small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())
-
-
-@examples(20)
-@given(data=st.data(), nodes=st.integers(1, 40))
-def test_components_are_the_same_on_any_device(data, nodes):
-    """Also their numbers' order, which decides between pieces of one size."""
-    node = st.integers(0, nodes - 1)
-    pairs = data.draw(st.lists(st.tuples(node, node), max_size=60))
-    edges = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2).T
-    expected = small_regions._joined_by_scipy(nodes, edges)
-    found = small_regions._joined_by_torch(nodes, edges)
-    assert torch.equal(found.unique(return_inverse=True)[1], expected)
-    assert bool((found[found] == found).all()) and bool((found <= torch.arange(nodes)).all())
