@@ -65,6 +65,12 @@ def library_weights(made_once: Callable[..., Path]) -> Path:
     return made_once("library", make)
 
 
+@pytest.fixture
+def unsure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random weights are never sure."""
+    monkeypatch.setattr("normlift_ns.encoders.sam.text_masks.SCORE", 0.2)
+
+
 @pytest.fixture(scope="session")
 def hub_weights(made_once: Callable[..., Path]) -> Path:
     """A folder for each name of `HUB`."""

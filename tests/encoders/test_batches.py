@@ -51,15 +51,6 @@ def test_batches_are_filled_from_several_parts(counts, size):
     assert sizes == [size] * -(-sum(counts) // size)
 
 
-def test_batches_of_several_parts_shrink_too():
-    function, asked = narrow(3)
-    batches = Batches(8)
-    parts = ([torch.tensor(5)] * 4, [], [torch.tensor(6)] * 5)
-    rows = list(batches.across(lambda items: function(torch.stack(list(items))), parts))
-    assert [[int(row) for row in part] for part in rows] == [[10] * 4, [], [12] * 5]
-    assert asked == [8, 4, 2, 2, 4, 2, 2, 2] and batches.size == 2  # the last one is filled up
-
-
 def test_what_never_fits_other_errors_and_no_items():
     with pytest.raises(MemoryError, match=r"CUDA out of memory.*2 GiB.*--lift-downscale 2"):
         list(Batches(16)(narrow(0)[0], torch.arange(10)))

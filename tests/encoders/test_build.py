@@ -1,11 +1,8 @@
 """Flat options to sources, and what is refused."""
 
-import json
 from pathlib import Path
 
-import torch
-
-from normlift_ns.encoders import SourceOptions, make_encoder, make_regions, make_source
+from normlift_ns.encoders import SourceOptions, make_regions, make_source
 from normlift_ns.encoders.build import resolve_regions
 from normlift_ns.encoders.clip.encoder import OpenClipEncoder
 from normlift_ns.encoders.patches import PatchFeatures
@@ -32,21 +29,12 @@ def test_options_reach_the_regions(tmp_path):
         ({"regions": "sam", "sam_model": sam, "sam_precision": "bfloat16"}, SamMasks(sam, "l", "cpu", "bfloat16")),
     ):
         assert make_regions(SourceOptions(**options)) == expected, options
+    (tmp_path / "moved").mkdir()
+    assert LabelFiles(tmp_path).identity == LabelFiles(tmp_path / "moved").identity  # names no place
+    assert [x.identity["kind"] for x in (Superpixels(9), LabelFiles(tmp_path))] == ["superpixel", "files"]
     source = make_source(SourceOptions(encoder_model="ViT-B-32", encoder_pretrained="openai", text_template="a {}"))
     assert source == PatchFeatures(OpenClipEncoder("ViT-B-32", "openai", template="a {}"), 1024)
     assert make_source(SourceOptions(region_count=9)) == PatchFeatures(OpenClipEncoder(), 9)
-    assert torch.allclose(make_encoder(SourceOptions(encoder="colour")).text(["red"]).norm(dim=1), torch.ones(1))
-
-
-def test_identities_are_ready_for_json_and_name_no_place(tmp_path):
-    for regions in ("superpixel", "grid", "files"):
-        folder = tmp_path if regions == "files" else None
-        identity = make_source(SourceOptions(encoder="colour", regions=regions, regions_dir=folder)).identity
-        assert json.loads(json.dumps(identity)) == identity
-        assert identity["regions"]["kind"] == regions
-    (tmp_path / "moved").mkdir()
-    a, b = (make_regions(SourceOptions(regions_dir=folder)).identity for folder in (tmp_path, tmp_path / "moved"))
-    assert a == b
 
 
 def test_auto_takes_the_best_that_is_there(tmp_path, empty_hub):
@@ -73,13 +61,10 @@ def test_bad_options_say_what_to_do(tmp_path):
         ({"regions": "sam", "regions_dir": Path()}, ["--regions-dir .", '"sam"']),
         ({"regions": "superpixel", "regions_dir": tmp_path}, [f"--regions-dir {tmp_path}", "--regions files"]),
         ({"regions": "grid", "sam_model": "x/y"}, ["--sam-model x/y", "--regions sam", '"grid"']),
-        ({"regions": "patches", "sam_model": "x/y"}, ["--sam-model x/y", "--regions sam", '"patches"']),
         ({"regions": "grid", "sam_precision": "float16"}, ["--sam-precision float16", "--regions sam", '"grid"']),
-        ({"encoder": "clip"}, ["'clip'", "--encoder", "colour, metaclip2, open_clip, siglip, siglip2"]),
         ({"regions": "slic"}, ["auto, sam, sam3, patches, superpixel, grid, files", "'slic'"]),
         ({"regions": "files"}, ['"files"', "--regions-dir"]),
         ({"regions": "grid", "level": "1"}, ["--level 1", "--regions files or sam", '"grid"']),
-        ({"level": "0"}, ["--level 0", '"superpixel"']),
         ({"level": "l", "regions_dir": Path()}, ["--level", "--regions files", "'l'"]),
         ({"level": "-1", "regions_dir": Path()}, ["--level", "'-1'"]),
         ({"features": "lerf"}, ["none, langsplat", "'lerf'"]),

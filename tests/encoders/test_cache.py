@@ -72,14 +72,6 @@ def test_a_second_run_computes_nothing(counted, tmp_path):
         assert [file.suffix for file in (tmp_path / "new" / "folder" / kind).iterdir()] == [".safetensors"]
 
 
-def test_an_interrupted_run_resumes(counted, tmp_path):
-    for count in (2, 3):
-        for i in range(count):
-            cached(counted, tmp_path).view(IMAGE // (i + 1), f"{i}.jpg")
-    assert counted.regions.asked == ["0.jpg", "1.jpg", "2.jpg"]
-    assert asked(counted) == (3, 3)
-
-
 def test_everything_that_matters_is_in_the_key(tmp_path):
     def regions(image=IMAGE, name="a.jpg", count=12):
         return CachedRegions(Grid(count), tmp_path).path(image, name)
@@ -169,8 +161,7 @@ def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):
     """Six regions in each of seven views, two of which are known; batches of eight crops."""
     images = [(IMAGE + 30 * i, f"{i}.jpg") for i in range(7)]
     expected = [RegionFeatures(Grid(6), clip).view(*image) for image in images]
-    encoder, sizes = batches_of(clip, 8)
-    source = cached(RegionFeatures(Grid(6), encoder), tmp_path)
+    source, sizes = in_eights(clip, tmp_path)
     for i in (0, 3):
         source.view(*images[i])
     del sizes[:]
@@ -183,8 +174,7 @@ def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):
 
 
 def test_an_interruption_costs_the_views_of_one_batch(clip, tmp_path):
-    encoder, sizes = batches_of(clip, 8)
-    source = cached(RegionFeatures(Grid(6), encoder), tmp_path)
+    source, sizes = in_eights(clip, tmp_path)
     images = [(IMAGE + 30 * i, f"{i}.jpg") for i in range(6)]
 
     def interrupted():
@@ -201,16 +191,16 @@ def test_an_interruption_costs_the_views_of_one_batch(clip, tmp_path):
     assert sizes == [8, 8]
 
 
-def batches_of(encoder: OpenClipEncoder, size: int) -> tuple[OpenClipEncoder, list[int]]:
-    """The encoder with batches of that size, and the number of crops of every call of its network."""
+def in_eights(encoder: OpenClipEncoder, folder: Path) -> tuple[RegionFeatures, list[int]]:
+    """A source with batches of eight crops, and the number of crops of every call of its network."""
     copy, sizes = replace(encoder), []
 
     def counted(crops):
         sizes.append(len(crops))
         return OpenClipEncoder._image_rows(copy, crops)
 
-    vars(copy).update(network=encoder.network, _crops=Batches(size), _image_rows=counted)
-    return copy, sizes
+    vars(copy).update(network=encoder.network, _crops=Batches(8), _image_rows=counted)
+    return cached(RegionFeatures(Grid(6), copy), folder), sizes
 
 
 def unusable(encoder: OpenClipEncoder) -> OpenClipEncoder:
@@ -261,7 +251,7 @@ def test_patches_seen_before_need_no_network(clip, tmp_path):
         cached(PatchFeatures(unusable(clip), 30), tmp_path).view(IMAGE, "a.jpg")
 
 
-def test_swapped_entries_are_computed_again(counted, tmp_path):
+def test_swapped_entries_are_computed_again(counted, clip, tmp_path):
     """Content that is whole, under the name of another image."""
     source, images = cached(counted, tmp_path), ((IMAGE, "a.jpg"), (255 - IMAGE, "b.jpg"))
     expected = [source.view(*image) for image in images]
@@ -272,6 +262,12 @@ def test_swapped_entries_are_computed_again(counted, tmp_path):
         for image, view in zip(images, expected, strict=True):
             assert_same(source.view(*image), view)
         assert asked(counted) == (4, 4)
+    texts = kept_texts(clip, tmp_path / "texts")
+    before = [texts.text([name]) for name in ("mug", "table")]
+    swap(tmp_path / "texts")
+    for name, row in zip(("mug", "table"), before, strict=True):
+        torch.testing.assert_close(texts.text([name]), row, rtol=0, atol=1e-6)
+    assert not torch.allclose(*before)
 
 
 def swap(folder: Path) -> None:
@@ -279,12 +275,3 @@ def swap(folder: Path) -> None:
     content = first.read_bytes()
     first.write_bytes(second.read_bytes())
     second.write_bytes(content)
-
-
-def test_a_text_under_the_name_of_another_is_encoded_again(clip, tmp_path):
-    texts = kept_texts(clip, tmp_path)
-    mug, table = texts.text(["mug"]), texts.text(["table"])
-    swap(tmp_path)
-    torch.testing.assert_close(texts.text(["mug"]), mug, rtol=0, atol=1e-6)
-    torch.testing.assert_close(texts.text(["table"]), table, rtol=0, atol=1e-6)
-    assert not torch.allclose(mug, table)

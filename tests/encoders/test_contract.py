@@ -1,5 +1,4 @@
-"""What every encoder keeps to: one unit row per region and text, whatever else is in the batch; an identity that any
-weight changes; damaged files refused in words; memory that does not grow with the number of regions."""
+"""What every encoder keeps to."""
 
 from __future__ import annotations
 

@@ -90,17 +90,6 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
             assert encoder_names() == ["bad", *OURS]
 
 
-def test_help_loads_no_encoder(tmp_path: Path) -> None:
-    install(tmp_path, "plug", points(bad="plug:KIND"), "raise SystemExit(3)")
-    program = "import sys; sys.argv[1:] = ['--help']; from normlift_ns.scripts.start import lift; lift()"
-    paths = os.environ | {"PYTHONPATH": str(tmp_path)}
-    words = [sys.executable, "-X", "importtime", "-c", program]
-    done = subprocess.run(words, env=paths, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and "--encoder" in done.stdout
-    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert loaded.isdisjoint({"plug", "torch", "numpy", "transformers", "normlift_ns.encoders.clip.kind"})
-
-
 WRONG = """
 import torch
 from normlift_ns.encoders import EncoderKind

@@ -59,6 +59,9 @@ def test_every_level_has_the_same_cells_and_its_own_features(folder):
         assert torch.equal(view.region_of_cell[0, view.labels.long()], alone[0])
         assert torch.equal(view.features, ColourEncoder().encode(IMAGE, alone))
     assert views[2].features.shape[0] == 0
+    for wrong in (None, 3):
+        source = RegionFeatures(LabelFiles(folder, level=wrong), ColourEncoder())
+        refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "3 levels", "0..2", "--level")
 
 
 def test_several_levels_at_once(folder):
@@ -70,9 +73,3 @@ def test_several_levels_at_once(folder):
     assert torch.equal(view.features, torch.cat([one.features, zero.features]))
     offset = torch.where(zero.regions >= 0, zero.regions + len(one.features), -1)
     assert torch.equal(view.regions, torch.cat([one.regions, offset]))
-
-
-def test_a_level_must_be_one_of_those_in_the_file(folder):
-    for level in (None, 3):
-        source = RegionFeatures(LabelFiles(folder, level=level), ColourEncoder())
-        refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "3 levels", "0..2", "--level")

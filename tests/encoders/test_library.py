@@ -86,16 +86,13 @@ def test_old_versions_are_refused_with_what_works(library_weights: Path, transfo
 
 
 def test_folders_that_are_not_what_they_say(library_weights: Path, tmp_path: Path) -> None:
-    def change(folder: Path, part: str, **values: Any) -> None:
-        config = json.loads((folder / "config.json").read_text())
-        vision = config["vision_config"]
-        (vision if part == "" else vision[part]).update(values)
-        (folder / "config.json").write_text(json.dumps(config))
-
-    for part, values, parts in (
-        ("backbone_config", {"model_type": "bert"}, ["vision_config.backbone_config", "'bert'"]),
-        ("", {"fpn_hidden_size": 10**9}, ["fpn_hidden_size of config.json is 1000000000"]),
+    config = copied(library_weights / "sam2", tmp_path) / "config.json"
+    whole = json.loads(config.read_text())
+    for values, parts in (
+        ({"backbone_config": {"model_type": "bert"}}, ["vision_config.backbone_config", "'bert'"]),
+        ({"fpn_hidden_size": 10**9}, ["fpn_hidden_size of config.json is 1000000000"]),
+        ({"num_labels": 2**31}, ["num_labels of config.json is "]),
+        ({"layer_norm_eps": 1e300}, ["layer_norm_eps of config.json is "]),
     ):
-        folder = copied(library_weights / "sam2", tmp_path / str(len(part)))
-        change(folder, part, **values)
-        refused(lambda folder=folder: SamMasks(str(folder)).masks(photograph(30, 40)), str(folder), *parts)
+        config.write_text(json.dumps(whole | {"vision_config": whole["vision_config"] | values}))
+        refused(lambda: SamMasks(str(tmp_path)).masks(photograph(30, 40)), str(tmp_path), *parts)

@@ -22,6 +22,7 @@ from tests.encoders.test_library import LOOSE, photograph
 from tests.encoders.tiny import Largest, copied, refused
 
 EVERY = replace(LOOSE, box_iou=0.99, suppression=Suppression(iou=1.0, score=-9.0, outer=0.0, inner=2.0))
+pytestmark = pytest.mark.usefixtures("unsure")
 NETWORKS = ("sam", "sam2", "sam_hq", "sam3")
 IMAGE, NAME = photograph(40, 60), "a.png"
 
@@ -42,12 +43,6 @@ def make(kind: str, folder: Path) -> Any:
 
 
 KINDS = (*NETWORKS, "files", "superpixel", "grid")
-
-
-@pytest.fixture(autouse=True)
-def unsure(monkeypatch) -> None:
-    """Random weights are never sure."""
-    monkeypatch.setattr(text_masks, "SCORE", 0.2)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -112,8 +107,7 @@ def test_damaged_files_are_refused_by_name(folders, kind, tmp_path):
 
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_half_precision_is_within_its_error(folders, kind):
-    """bfloat16 has 8 bits: answers of a few layers differ by some hundredths, more where weights are made large so that
-    masks depend on the point."""
+    """bfloat16 has 8 bits: answers of a few layers differ by some hundredths, more where weights are large."""
     folder, points = str(folders[kind]), torch.tensor([[20.0, 30.0], [70.0, 10.0]])
     answers = []
     for precision in ("float32", "bfloat16"):

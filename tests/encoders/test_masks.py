@@ -85,16 +85,9 @@ def test_suppression_of_overlaps_as_large_as_those_of_photographs():
     assert 5 < int(found.sum()) < len(masks) // 2
 
 
-def test_suppression_by_hand():
-    """The best three stay where none is good; a small mask inside a large one goes, whatever its score."""
-    masks = torch.eye(5, dtype=torch.bool)[:, None]
-    assert mask_nms(masks, torch.tensor([0.1, 0.5, 0.3, 0.7, 0.2])).tolist() == [False, True, True, True, False]
-    assert mask_nms(masks[:2], torch.tensor([0.1, 0.5])).tolist() == [True, True]
-    masks = torch.ones(2, 10, 10, dtype=torch.bool)
-    masks[1] = False
-    masks[1, 2:5, 2:5] = True
-    for scores in ([0.8, 0.9], [0.9, 0.8]):
-        assert mask_nms(masks, torch.tensor(scores)).tolist() == [True, False]
+def test_defaults_and_the_extremes_of_masks():
+    assert Suppression() == Suppression(iou=0.8, score=0.7, outer=0.5, inner=0.85)
+    assert mask_nms(torch.eye(5, dtype=torch.bool)[:, None], torch.arange(5) / 9).tolist() == [False] * 2 + [True] * 3
     for count in (0, 3):  # no masks, and whole images
         masks = torch.ones(count, 4, 5, dtype=torch.bool)
         assert mask_nms(masks, torch.ones(count)).tolist() == [True, False, False][:count]
@@ -111,8 +104,9 @@ def test_a_gpu_finds_the_same():
     assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
 
 
-@given(masks=boxes_with_noise())
-def test_later_masks_lie_on_top_and_none_is_lost(masks):
+@given(masks=boxes_with_noise(), empty=st.booleans())
+def test_later_masks_lie_on_top_and_none_is_lost_nor_any_box(masks, empty):
+    masks = np.concatenate([masks, np.zeros((1, *masks.shape[1:]), dtype=bool)]) if empty else masks
     labels = stack_masks(torch.from_numpy(masks)).numpy()
     assert labels.dtype == np.int32
     assert len(labels) == max(1, masks.sum(axis=0).max(initial=0))
@@ -121,13 +115,8 @@ def test_later_masks_lie_on_top_and_none_is_lost(masks):
         by_hand[mask] = i
         assert ((labels == i).any(axis=0) == mask).all()
         assert ((labels == i).sum(axis=0) <= 1).all()
-    assert (labels[0] == by_hand).all()
-    assert ((labels[:-1] > labels[1:]) | (labels[1:] == -1)).all()
-
-
-@given(masks=boxes_with_noise(), empty=st.booleans())
-def test_boxes(masks, empty):
-    masks = np.concatenate([masks, np.zeros((1, *masks.shape[1:]), dtype=bool)]) if empty else masks
     for mask, box in zip(masks, boxes_of(torch.from_numpy(masks)).tolist(), strict=True):
         y, x = np.nonzero(mask)
         assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
+    assert (labels[0] == by_hand).all()
+    assert ((labels[:-1] > labels[1:]) | (labels[1:] == -1)).all()

@@ -22,7 +22,7 @@ from normlift_ns.encoders.clip.weights import import_open_clip
 from normlift_ns.encoders.texts.kept import text_identity
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import CLIP as NAME
-from tests.encoders.tiny import DEVICES, needs_cuda, noise, refused
+from tests.encoders.tiny import DEVICES, noise, refused
 
 IMAGE = noise(48, 64)
 LABELS = torch.full((48, 64), -1, dtype=torch.int32)
@@ -119,24 +119,6 @@ def test_templates_and_their_ensemble(clip, open_clip):
     assert ours != others
 
 
-def test_crops_of_several_views_fill_batches(clip, monkeypatch):
-    """Seven views of 0, 1, 3, 3, 0, 70 and 1 regions: 78 crops in ten batches, of which the last is filled up."""
-    many = (torch.arange(48 * 64).reshape(1, 48, 64) * 70 // (48 * 64)).int()
-    none, one = torch.full_like(many, -1), torch.where(MAPS == 1, 0, -1).int()
-    views = [(IMAGE + 10 * i, labels) for i, labels in enumerate((none, one, MAPS, MAPS, none, many, one))]
-    expected = [clip.encode(*view) for view in views]
-    sizes, rows = [], OpenClipEncoder._image_rows
-    monkeypatch.setattr(
-        OpenClipEncoder, "_image_rows", lambda self, crops: (sizes.append(len(crops)), rows(self, crops))[1]
-    )
-    found = list(clip.encode_each(iter(views)))
-    assert sizes == [8] * 10
-    assert [features.shape for features in found] == [features.shape for features in expected]
-    for features, alone in zip(found, expected):
-        torch.testing.assert_close(features, alone, rtol=0, atol=1e-5)
-    assert not torch.allclose(found[2], found[3], atol=1e-3)
-
-
 def test_what_changes_features_changes_the_identity(clip, tmp_path):
     """A file of weights counts by its content, of which a pickle and safetensors hold the same."""
     unread = replace(clip)
@@ -150,20 +132,8 @@ def test_what_changes_features_changes_the_identity(clip, tmp_path):
     assert white.identity != clip.identity == json.loads(json.dumps(clip.identity))
     copy = shutil.copy(clip.pretrained, tmp_path / "copy.pt")
     assert replace(clip, pretrained=str(copy)).identity == clip.identity
-    content = bytearray(copy.read_bytes())
-    content[-1] ^= 1
-    copy.write_bytes(content)
+    copy.write_bytes(copy.read_bytes() + b"x")
     assert replace(clip, pretrained=str(copy)).identity != clip.identity
-
-
-@needs_cuda
-def test_crops_on_a_gpu_are_those_on_the_cpu():
-    for size, fill in product(((32, 32), (60, 45)), ("black", "white")):
-        boxes, regions = region_boxes(MAPS), torch.arange(3)
-        crops = masked_crops(IMAGE, MAPS, regions, boxes, size, fill)
-        there = [x.cuda() for x in (IMAGE, MAPS, regions, boxes)]
-        assert torch.equal(region_boxes(there[1]).cpu(), boxes)
-        torch.testing.assert_close(masked_crops(*there, size, fill).cpu(), crops, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -14,8 +14,7 @@ IMAGE = noise(48, 80)
 
 
 def value_path(model, pixels: torch.Tensor) -> torch.Tensor:
-    """The last layer with an attention that looks nowhere else, without its residual and its MLP, by modules of
-    open_clip and torch."""
+    """The last layer with an attention that looks nowhere else, without its residual and its MLP."""
     last, before = model.visual.transformer.resblocks[-1], []
     hook = last.register_forward_pre_hook(lambda module, inputs: before.append(inputs[0]))
     model.encode_image(pixels)

@@ -8,11 +8,9 @@ import torch
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
 from normlift_ns.encoders.sam.weights import load_sam
-from tests.encoders.tiny import SIDE, needs_cuda, noise, refused, write_sam
+from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE
-
-
 BOUNDS = {"float32": 2e-6, "float16": 8e-3, "bfloat16": 4e-2}
 
 
@@ -51,21 +49,6 @@ def test_answers_in_each_precision(checkpoint, embedding, expected):
         found = SamNetwork.load(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
         close(found, expected, bound)
         assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
-        agree = ((found[0] > 0) == (expected[0] > 0)).float().mean()
-        assert float(agree) > 1 - bound / 4
-
-
-def test_errors_are_no_larger_than_those_of_transformers(tmp_path, embedding):
-    """Where weights make rounding grow a hundredfold; in half precision transformers runs under autocast."""
-    path = tmp_path / "sam.pth"
-    write_sam(path, seed=1, gain=2)
-    expected = by_transformers(str(path), embedding, torch.float64)
-    for precision in BOUNDS:
-        found = SamNetwork.load(str(path), "cpu", precision).decode(embedding, POINTS)
-        with torch.autocast("cpu", getattr(torch, precision), enabled=precision != "float32"):
-            theirs = by_transformers(str(path), embedding, torch.float32)
-        here, there = (float((x[0].double() - expected[0]).square().mean().sqrt()) for x in (found, theirs))
-        assert 0 < here < (1.5 if precision == "float32" else 0.8) * there
 
 
 def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
@@ -83,7 +66,6 @@ def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
     assert sam.identity != SamMasks(str(checkpoint), precision="bfloat16").identity
     wrong: Any = "half"
     refused(lambda: SamMasks(str(checkpoint), precision=wrong), "'half'", "--sam-precision", "auto, float32")
-    # In half precision too
     rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
     labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
     assert labels.shape[0] == 4 and int(labels.max()) >= 0
@@ -94,13 +76,3 @@ def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected):
     for precision, bound in {**BOUNDS, "float32": 1e-4}.items():
         network = SamNetwork(load_sam(str(checkpoint)), "cuda", precision)
         close(network.decode(embedding.cuda(), POINTS), expected, bound)
-
-
-@needs_cuda
-def test_a_gpu_measures_masks_as_they_are_enlarged(checkpoint, embedding):
-    network = SamNetwork.load(str(checkpoint), "cuda", "float32")
-    logits = network.decode(embedding.cuda(), POINTS)[0].flatten(0, 1)
-    found = network.measure(logits, (96, 128), 1.0)
-    large = network.enlarge(logits, (96, 128))
-    assert float((found.inner - (large > 1).flatten(1).sum(dim=1)).abs().max()) <= 2
-    assert float((found.outer - (large > -1).flatten(1).sum(dim=1)).abs().max()) <= 2

@@ -1,12 +1,10 @@
 """The values and the protocol that features come in."""
 
-import pytest
 import torch
 
-from normlift_ns.encoders import RegionFeatures, SourceOptions, ViewFeatures, make_source
+from normlift_ns.encoders import RegionFeatures, ViewFeatures
 from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
-from normlift_ns.encoders.texts.prompts import check_prompts
 from tests.encoders.tiny import refused
 
 UNIT = torch.nn.functional.normalize(torch.arange(1.0, 7.0).reshape(2, 3), dim=1)
@@ -49,19 +47,4 @@ def test_other_images_and_texts_are_refused():
     byte = torch.uint8
     for image in (torch.zeros(4, 5, 4, dtype=byte), torch.zeros(4, 5, 3), torch.zeros(0, 5, 3, dtype=byte)):
         refused(lambda image=image: source.view(image, "a/b.png"), "a/b.png", "uint8", "[H, W, 3]")
-    for prompts, part in (([], "no text"), (["red", " "], "2 of 2"), ("red", "['red']")):
-        refused(lambda prompts=prompts: check_prompts(prompts), part)
-
-
-def test_view_and_text_share_one_space():
-    image = torch.zeros(32, 48, 3, dtype=torch.uint8)
-    image[:, :24] = torch.tensor([229, 0, 0], dtype=torch.uint8)  # the survey's red
-    image[:, 24:] = torch.tensor([3, 67, 223], dtype=torch.uint8)  # and its blue
-    source = make_source(SourceOptions(encoder="colour", regions="grid", region_count=24))
-    view = source.view(image, "a.png")
-    assert view.labels.shape == (32, 48) and len(view.features) == 24
-    cosine = view.features @ source.text(["red", "blue"]).T
-    red = view.labels[:, :24].unique().tolist()
-    for region in range(24):
-        expected = (1, 0) if region in red else (0, 1)
-        assert cosine[region].tolist() == pytest.approx(expected, abs=1e-3)
+    refused(lambda: source.text(["red", " "]), "2 of 2")

@@ -20,13 +20,7 @@ def written(library_weights) -> Path:
     return library_weights / "sam3"
 
 
-@pytest.fixture
-def eager(monkeypatch) -> None:
-    """Random weights are never sure."""
-    monkeypatch.setattr(text_masks, "SCORE", 0.2)
-
-
-def test_masks_are_those_of_transformers(written, eager, transformers):
+def test_masks_are_those_of_transformers(written, unsure, transformers):
     texts, side = ["mug", "red mug"], {"height": SAM3_SIDE, "width": SAM3_SIDE}
     processor = transformers.Sam3Processor(
         transformers.Sam3ImageProcessor(size=side), transformers.CLIPTokenizer.from_pretrained(written)

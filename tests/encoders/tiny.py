@@ -34,8 +34,7 @@ _CHANNELS = 32
 
 
 def tiny_sam(seed: int = 0, gain: float = 1.0) -> Any:
-    """A SAM in Meta's own code, its weights scaled until masks have edges and scores are about 1; with more gain in the
-    decoder masks depend on the point, and errors of rounding grow."""
+    """A SAM in Meta's own code, scaled until masks have edges; with more gain they depend on the point."""
     meta, grid = import_module("segment_anything.modeling"), SIDE // 16
     shape = {"img_size": SIDE, "embed_dim": 32, "depth": 2, "num_heads": 2, "mlp_ratio": 2, "out_chans": _CHANNELS}
     windows = {"use_rel_pos": True, "window_size": 4, "global_attn_indexes": (1,)}

@@ -1,5 +1,4 @@
-"""Folders of SigLIP, SigLIP 2 and MetaCLIP 2 with few random weights, written by transformers itself, with real
-tokenizers of few tokens. Imports transformers, so that tests import it while they run."""
+"""Folders of SigLIP, SigLIP 2 and MetaCLIP 2, written by transformers; tests import this while they run."""
 
 from __future__ import annotations
 
@@ -38,8 +37,7 @@ def _ending(tokenizer: Any, end: str) -> None:
 
 
 def siglip_tokenizer() -> Any:
-    """Like the tokenizer.json of SigLIP: lower case; </s> ends texts and fills them up. (The library's own
-    SiglipTokenizer needs sentencepiece and a file of another kind.)"""
+    """Like the tokenizer.json of SigLIP, whose own class needs sentencepiece: </s> ends texts and fills them up."""
     vocabulary, _ = _pieces(["<pad>", "</s>", "<unk>"], bytes_too=False)
     scores = [(name, 0.0 if number < 3 else -20.0 + len(name)) for name, number in vocabulary.items()]
     tokenizer = Tokenizer(models.Unigram(scores, unk_id=2, byte_fallback=False))
@@ -87,8 +85,7 @@ def _write(folder: Path, model: Any, processor: Any, seed: int) -> None:
 
 
 def write_hub(folder: Path, name: str, seed: int = 0) -> None:
-    """One of the networks of `HUB`: `naflex` is SigLIP 2 for images of any shape; the joint space of
-    MetaCLIP 2 is narrower than its layers."""
+    """One of the networks of `HUB`: `naflex` is SigLIP 2 for images of any shape."""
     side = {"height": SIDE, "width": SIDE}
     vision = {**_TINY, "image_size": SIDE, "patch_size": PATCH}
     kinds = {"siglip": siglip_tokenizer, "metaclip2": metaclip_tokenizer}

@@ -51,19 +51,6 @@ def test_what_it_cannot_order_is_reported():
         assert not certain.all() and not certain[:surely_not].any()
 
 
-def test_the_tree_holds_every_point_once():
-    points = uneven(333)
-    tree = nearest.build_tree(points)
-    held = tree.index[tree.index >= 0]
-    assert torch.equal(held.sort().values, torch.arange(333))
-    assert torch.equal(tree.points[tree.index >= 0], points[held])
-    leaves = len(tree.index) // nearest.LEAF
-    assert leaves == 16
-    low, high = tree.boxes[1, :3], tree.boxes[1, 3:]
-    assert torch.equal(low, points.amin(0))
-    assert torch.equal(high, points.amax(0))
-
-
 def test_nodes_sorted_each_for_itself_are_the_same_tree(monkeypatch):
     points = uneven(333).round(decimals=1)
     points[5:9] = -0.0

@@ -97,13 +97,6 @@ def test_chunks_of_tiles_change_nothing(monkeypatch):
     assert torch.equal(whole.rows.column, parts.rows.column)
 
 
-def test_chunks_cover_all_tiles_once():
-    slots = torch.tensor([0, 0, 3, 90, 91, 91, 99, 150, 150])
-    chunks = regions._chunks(slots)
-    assert chunks == [(0, 8, 0, 150)]
-    assert regions._chunks(torch.zeros(5, dtype=torch.int64)) == []
-
-
 def test_keys_are_as_wide_as_they_must_be():
     scene, cameras = random_scene(8, seed=2, dtype=torch.float32), orbit(1, width=21, height=17)
     labels = torch.stack([random_labels(cameras[0], 4, seed=2)]).to(DEVICE)
@@ -116,10 +109,3 @@ def test_keys_are_as_wide_as_they_must_be():
     assert (found[5].key.dtype, found[2**30].key.dtype) == (torch.int32, torch.int64)
     assert torch.equal(found[5].weight, found[2**30].weight)
     assert torch.equal(found[5].key // 5, (found[2**30].key // 2**30).int())
-
-
-def test_any_shape_of_cells_sums_the_same(monkeypatch):
-    scene, cameras = random_scene(12, seed=3, dtype=torch.float32), orbit(1, width=17, height=10)
-    for cell in ((8, 8), (16, 8)):
-        monkeypatch.setattr(triton, "CELL", cell)
-        compare(scene, cameras, [random_labels(cameras[0], 3, seed=0)], [3])
