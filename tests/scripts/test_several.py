@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.captures import SHARED
+from tests.captures import SHARED, needs_shared
 
 pytestmark = pytest.mark.slow
 
@@ -87,23 +87,15 @@ def test_two_and_three_processes_write_the_files_of_one(trained, alone, tmp_path
 
 
 @pytest.mark.extra
-def test_other_options_too(trained, tmp_path):
-    for count in (1, 2):
-        flags = ("--vote", "paper", "--consensus", "False", "--storage", "float16")
+@pytest.mark.parametrize("tabletop", [False, pytest.param(True, marks=needs_shared)])
+def test_other_options_too(tabletop, trained, tmp_path):
+    flags: tuple[str, ...] = ("--vote", "paper", "--consensus", "False", "--storage", "float16")
+    if tabletop:
+        trained, flags = TABLETOP, ("--max-views", "6", "--lift-downscale", "4")
+    for count in (1, 2 + tabletop):
         done = lifted(*words(trained, tmp_path / str(count), count, *flags))
         assert done.returncode == 0, done.stderr
-    check_same([tmp_path / str(count) for count in (1, 2)])
-
-
-@pytest.mark.extra
-@pytest.mark.skipif(
-    not TABLETOP.exists(), reason="the trained captures (folder shared beside the repository) are absent"
-)
-def test_the_tabletop_is_the_same(tmp_path):
-    for count in (1, 3):
-        done = lifted(*words(TABLETOP, tmp_path / str(count), count, "--max-views", "6", "--lift-downscale", "4"))
-        assert done.returncode == 0, done.stderr
-    check_same([tmp_path / str(count) for count in (1, 3)])
+    check_same([tmp_path / str(count) for count in (1, 2 + tabletop)])
 
 
 def children(pid: int) -> list[int]:
