@@ -63,11 +63,6 @@ def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
             log.unlink()
 
 
-def test_flags_that_cannot_be_read_are_mistakes_of_the_user(ended):
-    code, out, err = ended(say, "--wrod", "a")
-    assert (code, out) == (1, "") and "--wrod" in err
-
-
 def test_what_cannot_be_encoded_is_replaced(ended, monkeypatch):
     def body(_: str) -> None:
         say("a 🎉 中 \u202e " + chr(0xDC80))

@@ -44,9 +44,7 @@ def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     sys.modules.pop("nerfstudio.scripts.exporter")
 
 
-def test_the_file_is_that_of_ns_export_and_more(
-    scene_ply: Path, lifted: Path, nerfstudio, ns_export, monkeypatch, tmp_path
-) -> None:
+def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
     from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
 
@@ -96,29 +94,23 @@ def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> Non
 
 
 def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
-    """trimesh, and the way in which the reference code of 3D Gaussian splatting picks properties by their prefix."""
+    """trimesh, open3d, and the way in which the code of 3D Gaussian splatting picks properties by their prefix."""
     import trimesh  # noqa: PLC0415
 
     count = len(np.load(scene_ply.with_name("splat_rows.npy")))
-    cloud = trimesh.load(scene_ply)
-    assert cloud.vertices.shape == (count, 3)
+    assert trimesh.load(scene_ply).vertices.shape == (count, 3)
     ply = PlyData.read(scene_ply)
     names = [p.name for p in ply.elements[0].properties]
     assert ply.header.startswith("ply\nformat binary_little_endian 1.0\n")
     for prefix, number in (("f_rest_", 45), ("f_dc_", 3), ("scale_", 3), ("rot", 4), ("opacity", 1)):
         assert len([n for n in names if n.startswith(prefix)]) == number
-
-
-def test_open3d_opens_it(scene_ply: Path) -> None:
     open3d = pytest.importorskip("open3d", reason="open3d needs system libraries here", exc_type=ImportError)
     cloud = open3d.t.io.read_point_cloud(str(scene_ply))
-    assert cloud.point.positions.shape[0] == len(np.load(scene_ply.with_name("splat_rows.npy")))
+    assert cloud.point.positions.shape[0] == count
     assert cloud.point.reliability.numpy().max() < 1
 
 
-def test_selection_and_rest_make_up_the_scene(
-    scene_ply: Path, lifted: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_selection_and_rest_make_up_the_scene(scene_ply, lifted, tmp_path, monkeypatch, capsys) -> None:
     rows = {}
     for part in ("selection", "rest"):
         flags = ("--load-config", lifted, "--output-dir", tmp_path, "--part", part, "--text", "red")
@@ -149,15 +141,12 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     assert 0.3 < ball["mean_reliability"] < 1
 
 
-def test_mistakes_have_a_message(lifted, tmp_path, monkeypatch, capsys) -> None:
+def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_path, monkeypatch, capsys) -> None:
     given = ("--load-config", lifted, "--output-dir", tmp_path / "x", "--text")
     for flags, fact in ((("red", "--threshold", "1.5", "--part", "selection"), "no Gaussian"), (("oragne",), "orange")):
         assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
         assert fact in said(capsys)
         assert not list((tmp_path / "x").glob("*"))
-
-
-def test_an_export_stays_in_its_folder(lifted: Path, tmp_path: Path, monkeypatch) -> None:
     flags = ("--load-config", lifted, "--output-dir", tmp_path / "a" / "b", "--output-filename", "../../evil.ply")
     assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.ply")] == ["a/b/evil.ply"]
@@ -186,9 +175,7 @@ def test_no_part_of_an_export_is_replaced_unasked(lifted: Path, tmp_path: Path, 
         (tmp_path / existing).unlink()
 
 
-def test_masks_arrays_and_labels_of_a_cloud(
-    scene_ply: Path, lifted: Path, room: DemoRoom, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, monkeypatch, capsys) -> None:
     run = open_run(lifted)
     answer, means = run.ask("red", "yellow"), run.scene.gaussians.means
     points = np.concatenate([run.to_capture.points(means[:50].double().numpy()), [[1e6, 0, 0]]])
@@ -200,9 +187,7 @@ def test_masks_arrays_and_labels_of_a_cloud(
     assert "98.0%" in said(capsys)
     rows, splat = np.load(scene_ply.with_name("splat_rows.npy")), PlyData.read(scene_ply)["vertex"]
     arrays = {name: np.load(tmp_path / "arrays" / f"{name}.npy") for name in ("coord", "segment", "instance")}
-    assert {name: array.dtype.str for name, array in arrays.items()} == {
-        "coord": "<f4", "segment": "<i4", "instance": "<i4",
-    }  # fmt: skip
+    assert [array.dtype.str for array in arrays.values()] == ["<f4", "<i4", "<i4"]
     assert np.array_equal(arrays["coord"], np.stack([splat[axis] for axis in "xyz"], 1))
     assert np.array_equal(arrays["segment"], splat["class_id"].astype(int) - 1)
     assert np.array_equal(arrays["instance"], splat["instance_id"].astype(int) - 1)

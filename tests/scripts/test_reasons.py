@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from normlift_ns import open_run
-from normlift_ns.insight.why import ViewVote, Why
 from normlift_ns.scripts import export, query
-from normlift_ns.scripts.answers import reasons
 from tests.scripts.conftest import run_entry, said
 
 
@@ -35,18 +31,6 @@ def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypa
     assert Image.open(pictures / names[0]).size == (160, 120)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:-2]) == 1
     assert "exists" in said(capsys)
-
-
-def test_reasons_fit_into_the_terminal_with_all_their_numbers() -> None:
-    votes = tuple(ViewVote(i, 13_320.0, 0.088, 0.994 - i, 0.21, ()) for i in range(2))
-    why, names = Why(606, 60, 1.0, 1.0, 1.0, 16.6, 0.9, votes), ["images/0012.png", "images/0017.png"]
-    for width in (60, 80, 120):
-        file = io.StringIO()
-        Console(file=file, width=width).print(reasons.table(names, ["tomato red"], [why], narrow=width < 120))
-        text = file.getvalue()
-        assert max(map(len, text.splitlines())) <= width and "…" not in text
-        assert all(number in text for number in ("8.8%", "0.994", "-0.006", "21%"))
-        assert (width < 120) == ("13,320" not in text)
 
 
 def test_what_is_not_in_the_scene_is_said(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:

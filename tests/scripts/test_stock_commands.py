@@ -72,12 +72,10 @@ def test_ns_render_camera_path_and_interpolate(lifted: Path, tmp_path: Path, mon
     path = {"camera_type": "perspective", "render_height": 40, "render_width": 60, "camera_path": [camera] * 2}
     (tmp_path / "path.json").write_text(json.dumps({**path, "seconds": 1, "fps": 2}))
     options = {"rendered_output_names": ["overlay", "relevancy_0"], "output_format": "images", "image_format": "png"}
-    RenderCameraPath(
-        lifted, camera_path_filename=tmp_path / "path.json", output_path=tmp_path / "a" / "x.mp4", **options
-    ).main()  # type: ignore[arg-type]
-    RenderInterpolated(
-        lifted, pose_source="eval", interpolation_steps=2, output_path=tmp_path / "b" / "x.mp4", **options
-    ).main()  # type: ignore[arg-type]
+    of_a: Any = {"camera_path_filename": tmp_path / "path.json", "output_path": tmp_path / "a" / "x.mp4", **options}
+    of_b: Any = {"pose_source": "eval", "interpolation_steps": 2, "output_path": tmp_path / "b" / "x.mp4", **options}
+    RenderCameraPath(lifted, **of_a).main()
+    RenderInterpolated(lifted, **of_b).main()
     for folder, size in (("a", (120, 40)), ("b", (320, 120))):
         pictures = sorted((tmp_path / folder / "x").iterdir())
         assert len(pictures) == 2
@@ -90,8 +88,7 @@ def test_ns_eval(lifted: Path, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="LPIPS"):
         ComputePSNR(lifted, output_path=tmp_path / "eval.json", render_output_path=tmp_path / "pictures").main()
     document = json.loads((tmp_path / "eval.json").read_text())
-    assert document["method_name"] == "normlift"
-    assert document["results"]["psnr"] > 25
+    assert document["method_name"] == "normlift" and document["results"]["psnr"] > 25
     assert (tmp_path / "pictures").exists()
 
 
@@ -102,8 +99,7 @@ def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypat
     rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
     stored = load_question(copy.parent / "normlift")
-    assert stored is not None
-    assert stored.texts == ("teal", "pink", "orange")
+    assert stored is not None and stored.texts == ("teal", "pink", "orange")
     assert (stored.threshold, stored.min_reliability, stored.refined) == (0.7, 0.25, False)
     before = (copy.parent / "normlift" / "queries.safetensors").read_bytes()
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "oragne") == 1

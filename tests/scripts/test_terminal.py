@@ -90,20 +90,22 @@ def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
 def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_path: Path) -> None:
     import pty  # noqa: PLC0415 (Windows has none)
 
-    master, slave = pty.openpty()
     environment = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "NO_COLOR")}
     environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
     program = "from normlift_ns.scripts.start import lift; lift()"
-    words = [sys.executable, "-c", program, "--load-config", str(tmp_path / ("long-" * 30) / "no.yml")]
-    process = subprocess.Popen(words, stdout=slave, stderr=slave, env=environment)
-    process.wait(60)
-    os.close(slave)
-    shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
-    os.close(master)
-    assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
-    lines = shown.splitlines()
-    assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
-    assert str(tmp_path) in lines[1]  # one line, at the left, however long
+    config = tmp_path / ("long-" * 30) / "no.yml"
+    for flags, fact in ((("--load-config", str(config)), str(config)), (("--k", "many"), "--k cannot be 'many'.")):
+        master, slave = pty.openpty()
+        words = [sys.executable, "-c", program, *flags]
+        subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)
+        os.close(slave)
+        shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
+        os.close(master)
+        assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
+        lines = shown.splitlines()
+        assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
+        assert fact in re.sub(r"\x1b\[[\d;]*m", "", lines[1])  # one line, at the left, however long
+        assert not set("│╭╰") & set(shown)
 
 
 def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys, tmp_path: Path) -> None:
