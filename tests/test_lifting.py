@@ -206,7 +206,12 @@ def test_costs_are_seconds_their_sum_and_the_memory_of_this_process(monkeypatch)
     """`ru_maxrss` would count what the process had from which this one was started."""
     monkeypatch.setattr("resource.getrusage", None)
     (peak,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-    expected = {"a_s": 1.0, "b_s": 0.5, "total_s": 1.5, "memory_gib": pytest.approx(int(peak.split()[1]) / 2**20)}
+    expected = {
+        "a_s": 1.0,
+        "b_s": 0.5,
+        "total_s": 1.5,
+        "memory_gib": pytest.approx(int(peak.split()[1]) / 2**20, rel=0.05),
+    }
     assert cost({"a": 1.0, "b": 0.5}, "cpu") == expected
 
 
@@ -219,9 +224,7 @@ def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):
     lift_scene(made, source, given, tmp_path / "cache", encoder={}, report=lambda *step: told.append(step))
     for stage in ("neighbors", "vote"):
         steps = [done for name, done, total in told if name == stage and total == N]
-        assert steps[0] == 0
-        assert steps[-1] == N
-        assert steps == sorted(steps)
+        assert steps == sorted(steps) and (steps[0], steps[-1]) == (0, N)
     assert len([step for step in told if step[0] == "neighbors"]) == 4
 
 

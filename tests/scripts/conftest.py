@@ -5,10 +5,11 @@ from __future__ import annotations
 import shutil
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -72,6 +73,16 @@ def ended(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(warnings, "showwarning", show)  # as without pytest
     return run
+
+
+@pytest.fixture
+def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """nerfstudio's exporter; open3d, which it imports for meshes, needs system libraries."""
+    monkeypatch.setitem(sys.modules, "open3d", MagicMock())
+    from nerfstudio.scripts import exporter  # noqa: PLC0415
+
+    yield exporter
+    sys.modules.pop("nerfstudio.scripts.exporter")
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,8 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -32,16 +29,6 @@ def scene_ply(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         assert run_entry(patch, export.entrypoint, "--load-config", lifted, "--output-dir", folder) == 0
     return folder / "splat.ply"
-
-
-@pytest.fixture
-def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """nerfstudio's exporter; open3d, which it imports for meshes, needs system libraries."""
-    monkeypatch.setitem(sys.modules, "open3d", MagicMock())
-    from nerfstudio.scripts import exporter  # noqa: PLC0415
-
-    yield exporter
-    sys.modules.pop("nerfstudio.scripts.exporter")
 
 
 def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -16,8 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData
 
-from normlift_ns import open_scene
+from normlift_ns import open_run, open_scene
 from normlift_ns.options import SourceOptions, SplatOptions
 from normlift_ns.scenes.splat import Splat
 from tests.scenes.made import ply_columns, write_ply
@@ -63,24 +65,36 @@ def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
     assert np.abs(rendered - photo).mean() < 3
 
 
+def test_ns_export_and_ns_eval(stranger, nerfstudio, ns_export, monkeypatch, tmp_path):
+    """In this process."""
+    from nerfstudio.scripts.eval import ComputePSNR  # noqa: PLC0415
+
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
+    ns_export.ExportGaussianSplat(load_config=stranger, output_dir=tmp_path).main()
+    open_run(stranger).export(tmp_path / "ours.ply")
+    theirs, ours = (PlyData.read(tmp_path / name)["vertex"] for name in ("splat.ply", "ours.ply"))
+    for name in (p.name for p in theirs.properties):
+        assert np.array_equal(theirs[name], ours[name]), name
+    ComputePSNR(stranger, output_path=tmp_path / "eval.json").main()
+    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 25
+
+
 def test_ns_viewer_answers(stranger, tmp_path):
-    assert b"<html" in viewer_page(stranger, cwd=tmp_path, log=tmp_path / "log")
-
-
-def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
-    """The page that ns-viewer serves, if it still runs two seconds later."""
+    """And still runs two seconds later."""
+    log = tmp_path / "log"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     flags = ("--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    words = [str(BIN / "ns-viewer"), "--load-config", str(config), *map(str, flags)]
+    words = [str(BIN / "ns-viewer"), "--load-config", str(stranger), *map(str, flags)]
     with log.open("w") as output:
-        viewer = subprocess.Popen(words, cwd=cwd, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
+        viewer = subprocess.Popen(words, cwd=tmp_path, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
     try:
-        page = first_page(f"http://127.0.0.1:{port}/", viewer)
+        assert b"<html" in first_page(f"http://127.0.0.1:{port}/", viewer)
         time.sleep(2)
         assert viewer.poll() is None, log.read_text()
-        return page
     finally:
         viewer.send_signal(signal.SIGINT)
         try:
