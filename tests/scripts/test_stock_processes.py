@@ -82,19 +82,23 @@ def test_ns_export_and_ns_eval(stranger, nerfstudio, ns_export, monkeypatch, tmp
 
 
 def test_ns_viewer_answers(stranger, tmp_path):
-    """And still runs two seconds later."""
-    log = tmp_path / "log"
+    assert b"<html" in viewer_page(stranger, cwd=tmp_path, log=tmp_path / "log")
+
+
+def viewer_page(config: Path, *, cwd: Path, log: Path) -> bytes:
+    """The page that ns-viewer serves, if it still runs two seconds later."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     flags = ("--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    words = [str(BIN / "ns-viewer"), "--load-config", str(stranger), *map(str, flags)]
+    words = [str(BIN / "ns-viewer"), "--load-config", str(config), *map(str, flags)]
     with log.open("w") as output:
-        viewer = subprocess.Popen(words, cwd=tmp_path, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
+        viewer = subprocess.Popen(words, cwd=cwd, env=ENVIRONMENT, stdout=output, stderr=subprocess.STDOUT)
     try:
-        assert b"<html" in first_page(f"http://127.0.0.1:{port}/", viewer)
+        page = first_page(f"http://127.0.0.1:{port}/", viewer)
         time.sleep(2)
         assert viewer.poll() is None, log.read_text()
+        return page
     finally:
         viewer.send_signal(signal.SIGINT)
         try:
