@@ -21,7 +21,6 @@ from normlift_ns.question import Question
 from normlift_ns.raster import rasterize
 from normlift_ns.raster.backend import Job
 from normlift_ns.raster.backends import choose_backend
-from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry, said
 
@@ -32,10 +31,8 @@ def run(lifted: Path) -> nl.LiftedRun:
 
 
 @pytest.fixture(scope="module")
-def scene(trained: Path) -> NerfstudioScene:
-    found = nl.open_scene(trained)
-    assert isinstance(found, NerfstudioScene)
-    return found
+def scene(trained: Path) -> nl.Scene:
+    return nl.open_scene(trained)
 
 
 def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None:
@@ -45,6 +42,10 @@ def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None
     assert torch.equal(answer["yellow"].mask, yellow.mask)
     assert torch.equal(answer.mask, red.mask | yellow.mask)
     assert (run.field.scalars.reliability[answer.mask] >= 0.3).all()
+    lead = run.ask("red", negatives=["orange", "brown"], rule="margin")
+    assert lead.question.threshold == 0.02 and (lead.relevancy[lead.selected] > 0.02).all()
+    loose, sure = (run.ask("red", threshold=0.2, min_reliability=least).mask for least in (0.0, 0.8))
+    assert 0 < int(sure.sum()) < int(loose.sum())
     assert (red.relevancy[red.mask] > 0.5).all()
 
     truth = room.labels == room.names.index("red")
@@ -53,6 +54,7 @@ def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None
     assert red.centroid == pytest.approx(((weight[:, None] * means).sum(0) / weight.sum()).tolist(), rel=1e-9)
     ball = red.objects[0]
     assert ball.size > 0.6 * int(truth.sum())
+    assert np.allclose(ball.centroid, run.scene.gaussians.means[truth].mean(0), atol=0.05)
     assert np.all(np.array(ball.box["min"]) <= ball.centroid) and np.all(np.array(ball.centroid) <= ball.box["max"])
     with pytest.raises(KeyError, match=r"'blue' .* 'red', 'yellow'"):
         answer["blue"]
@@ -116,7 +118,7 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     assert "near names: red" in said(capsys)
 
 
-def test_features_by_name_and_without_texts(trained: Path, scene: NerfstudioScene, tmp_path: Path) -> None:
+def test_features_by_name_and_without_texts(trained: Path, scene: nl.Scene, tmp_path: Path) -> None:
     half = (torch.arange(160).expand(120, 160) // 80, np.eye(2, dtype=np.float32))
     some = {name: half for name in scene.train.names[::3]}
     run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
@@ -128,7 +130,7 @@ def test_features_by_name_and_without_texts(trained: Path, scene: NerfstudioScen
         run.ask("left")
 
 
-def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: NerfstudioScene, tmp_path: Path) -> None:
+def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_path: Path) -> None:
     labels, vectors = torch.arange(160).expand(120, 160) // 80, torch.eye(2)
     half = (labels, vectors)
     wrong: list[tuple[dict[str, Any], str]] = [

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -15,6 +15,8 @@ from itertools import count, permutations
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from normlift_ns.core.disk.claims import State, claim, read_states
 from normlift_ns.core.disk.lines import read_lines
@@ -24,13 +26,15 @@ from normlift_ns.scripts import batch
 from normlift_ns.scripts.captures.listed import Capture, is_lifted, read_captures
 from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest, worst
 from normlift_ns.scripts.captures.process import run_program
+from normlift_ns.scripts.captures.shards import ALL, Shard, make_shard
 from normlift_ns.scripts.captures.work import work
 from tests.processes import FORK, killed_at
 from tests.scripts import stand_in
-from tests.scripts.conftest import SMALL, run_entry, said
+from tests.scripts.conftest import SMALL, run_entry, said, wait_for
 
 STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
 PATIENCE = 1.5
+ROOT = Path(__file__).parents[2]
 CONFIG = """experiment_name: {}
 method_name: splatfacto
 timestamp: run
@@ -107,13 +111,6 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> list[Callable[[Callable[[], b
 def alive(pid: int) -> bool:
     stat = Path(f"/proc/{pid}/stat")
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
-
-
-def wait_for(done: Callable[[], bool], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @pytest.mark.slow
@@ -385,3 +382,94 @@ def test_the_last_attempt_counts_whatever_the_clocks_say():
     for order in permutations([failed, found]):
         assert latest(order) == {"a": found}
     assert latest([broken, done, found]) == {"a": broken}
+
+
+def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str]:
+    """The variables of a task of a Slurm array."""
+    numbers = {"ID": task, "COUNT": count, "MIN": least, "MAX": least + step * (count - 1), "STEP": step}
+    return {f"SLURM_ARRAY_TASK_{name}": str(number) for name, number in numbers.items()}
+
+
+def held(parts: list[Shard], size: int) -> list[int]:
+    """How many parts hold each entry of a list; no part is larger than another by more than one."""
+    sizes = [sum(map(part.holds, range(size))) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+    return [sum(part.holds(position) for part in parts) for position in range(size)]
+
+
+@given(st.integers(1, 50), st.integers(0, 200))
+def test_shards_hold_everything_exactly_once(count, size):
+    words = held([make_shard(f"{i}/{count}", {}) for i in range(1, count + 1)], size)
+    ranks = held([make_shard("auto", {"RANK": str(i), "WORLD_SIZE": str(count)}) for i in range(count)], size)
+    assert words == ranks == [1] * size
+
+
+@given(st.integers(1, 12), st.integers(0, 5), st.integers(1, 4), st.integers(1, 4), st.integers(0, 100))
+def test_tasks_of_an_array_and_ranks_within_them_hold_everything_exactly_once(count, least, step, ranks, size):
+    parts = [
+        make_shard("auto", array(least + i * step, count, least, step) | {"RANK": str(r), "WORLD_SIZE": str(ranks)})
+        for i in range(count)
+        for r in range(ranks)
+    ]
+    assert held(parts, size) == [1] * size
+
+
+def test_what_the_environment_says():
+    assert make_shard("auto", {}) == make_shard("none", array(1, 3)) == ALL
+    assert make_shard("auto", array(5, 4, least=4)) == Shard(1, 4)
+    assert make_shard("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}) == Shard(2, 3)
+    assert make_shard("3/3", array(1, 5)) == Shard(2, 3)
+
+
+def test_shards_and_environments_that_cannot_be():
+    for word in ("", "1", "0/3", "4/3", "-1/3", "1/3/2", "a/b", "٣/٣", "1/99999999", " 1/2"):
+        with pytest.raises(InputError, match="--shard must be i/n"):
+            make_shard(word, {})
+    for environment, *facts in (
+        ({"RANK": "0"}, "RANK is set", "WORLD_SIZE is not"),
+        ({"WORLD_SIZE": "2"}, "WORLD_SIZE is set", "RANK is not"),
+        ({"RANK": "2", "WORLD_SIZE": "2"}, "RANK is 2", "WORLD_SIZE, 2"),
+        ({"RANK": "x", "WORLD_SIZE": "2"}, "RANK", "at least 0", "'x'"),
+        ({"RANK": "0", "WORLD_SIZE": "0"}, "WORLD_SIZE", "at least 1", "'0'"),
+        ({"SLURM_ARRAY_TASK_ID": "1"}, "SLURM_ARRAY_TASK_ID is set", "SLURM_ARRAY_TASK_COUNT is not"),
+        (array(7, 3, least=1), "SLURM_ARRAY_TASK_ID is 7", "3 tasks", "from 1"),
+        (array(3, 2, least=0, step=2), "without gaps"),
+        (array(0, 2, least=1), "without gaps"),
+    ):
+        with pytest.raises(InputError) as told:
+            make_shard("auto", environment)
+        assert [fact for fact in facts if fact not in str(told.value)] == [], told.value
+
+
+RAY = f"""#!{sys.executable}
+from normlift_ns.scripts.captures import work
+from normlift_ns.scripts.start import batch
+work.work.__kwdefaults__["program"] = {STAND_IN!r}
+batch()
+"""
+
+
+@pytest.mark.extra
+def test_the_recipe_for_ray(tmp_path, monkeypatch, capsys):
+    """Of docs/scale.md, with processors in place of GPUs."""
+    ray = pytest.importorskip("ray", reason="ray is not installed; it is no dependency: pip install ray")
+    made = Batch(tmp_path, ["0.05"] * 12)
+    (recipe,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "scale.md").read_text("utf8"), flags=re.DOTALL)
+    for before, after in (("num_gpus", "num_cpus"), ('"GPU"', '"CPU"'), ("os.getcwd()", repr(str(tmp_path)))):
+        assert recipe.count(before) == 1
+        recipe = recipe.replace(before, after)
+    command = tmp_path / "bin" / "ns-normlift-batch"
+    command.parent.mkdir()
+    command.write_text(RAY)
+    command.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{command.parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # it would leave a token in the home folder
+    try:
+        exec(compile(recipe, "docs/scale.md", "exec"), {"__name__": "recipe"})
+    finally:
+        ray.shutdown()
+    assert "0" in capsys.readouterr().out.splitlines()  # among what the workers say
+    options = ("--regions", "sam")
+    made.check_lifted_once(*options)
+    assert set(made.states(*options)) == {"done"} and sum(made.begun().values()) == 12

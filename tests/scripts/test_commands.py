@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 from normlift_ns import open_run, open_scene
@@ -21,10 +22,12 @@ from normlift_ns.encoders.colour import ColourEncoder
 from normlift_ns.encoders.regions import Grid
 from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
 from normlift_ns.runs.question import load_question
-from normlift_ns.scripts import export, lift, query
+from normlift_ns.scenes.splat import Splat
+from normlift_ns.scripts import evaluate, export, lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from normlift_ns.team import seen
-from tests.scripts.conftest import QUICK, run_entry, said
+from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
+from tests.scripts.conftest import QUICK, SMALL, run_entry, said
 
 if TYPE_CHECKING:
     from normlift_ns.demo import DemoRoom
@@ -282,19 +285,6 @@ def test_a_field_of_another_checkpoint_is_refused(lifted, tmp_path, monkeypatch,
     assert checkpoint.name in said(capsys)
 
 
-def test_selection_follows_threshold_and_reliability(lifted):
-    run = open_run(lifted)
-    loose, strict = (run.ask("red", threshold=t).selected for t in (0.2, 0.8))
-    assert int(loose.sum()) > int(strict.sum()) > 0
-    assert not (strict & ~loose).any()
-    sure = run.ask("red", threshold=0.2, min_reliability=0.8)["red"].mask
-    assert (run.field.scalars.reliability[sure] >= 0.8).all()
-    assert 0 < int(sure.sum()) < int(loose.sum())
-    lead = run.ask("red", negatives=["orange", "brown"], rule="margin")
-    assert lead.question.threshold == 0.02
-    assert (lead.relevancy[lead.selected] > 0.02).all()
-
-
 @pytest.mark.slow
 def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch, capsys):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
@@ -367,3 +357,57 @@ def test_double_precision_differs_from_the_default_by_rounding(little, tmp_path,
     assert 0 < float(difference.quantile(0.99)) < 1e-6
     assert float(difference.max()) < 1e-2  # where a pixel of a faint Gaussian is on the other side of alpha = 1 / 255
     assert (double.source != single.source).float().mean() < 0.01
+
+
+@pytest.fixture
+def ply(little: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return write_ply(tmp_path / "scene.ply", ply_columns(Splat(**open_scene(little).parameters)))
+
+
+def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, tmp_path, monkeypatch, capsys) -> None:
+    """The config names cameras that nerfstudio leaves as they are."""
+    room, world = little.parents[4] / "room", little.parent / "dataparser_transforms.json"
+    cameras = ("--transforms", room / "transforms.json", "--world-transform", world)
+    flags = ("--load-ply", ply, *cameras, *SMALL, "--timestamp", "a", "--queries", "red", "yellow")
+    assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
+    printed = said(capsys)
+    run_dir = tmp_path / "outputs" / "room" / "normlift" / "a"
+    assert "2 of 8 photographs" in printed and "--gsplat-rules" in printed and str(run_dir) in printed
+    found = open_run(run_dir / "config.yml").ask_stored()
+    assert found is not None and found["red"].peak > 0.8
+    asked = ("--load-config", run_dir / "config.yml")
+    assert run_entry(monkeypatch, query.entrypoint, *asked, "--text", "red") == 0
+    assert run_entry(monkeypatch, export.entrypoint, *asked, "--output-dir", tmp_path / "e") == 0
+    flags = ("--protocol", "masks", "--labels", room / "instance", "--output-path", tmp_path / "scores.json")
+    assert run_entry(monkeypatch, evaluate.entrypoint, *asked, *flags) == 0
+    assert json.loads((tmp_path / "scores.json").read_text())
+    config = yaml.unsafe_load((run_dir / "config.yml").read_text())
+    parser = config.pipeline.datamanager.dataparser
+    assert (parser.orientation_method, parser.center_method, parser.eval_mode) == ("none", "none", "all")
+    assert (parser.auto_scale_poses, parser.load_3D_points, parser.downscale_factor) == (False, False, 1)
+    assert parser.data == config.data == run_dir / "transforms.json"
+    frame = json.loads((run_dir / "transforms.json").read_text())["frames"][0]
+    assert Path(frame["file_path"]).is_absolute()
+    assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2"} < set(frame)
+
+
+def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
+    """What shows before the splat is read is in test_early.py."""
+    columns, splat = ply_columns(random_splat(5)), ply_columns(Splat(**open_scene(little).parameters))
+    write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})
+    write_gsplat(ply.parent / "other.pt", random_splat(50))
+    write_ply(ply.parent / "far.ply", {**splat, "z": splat["z"] + 1000})
+    given = ("--transforms", little.parents[4] / "room", *SMALL, "--timestamp", "a", "--max-views", "2")
+    for kind, name, *facts in (
+        ("ply", "points.ply", "no splat", "5", "f_dc_0"),
+        ("gsplat", "other.pt", "normalized"),
+        ("ply", "scene.ply", "does not show"),
+        ("ply", "far.ply", "do not look at this splat"),
+    ):
+        assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
+        text = said(capsys).replace("│", " ")
+        assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, text
+        assert not (ply.parent / "outputs").exists()
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-ply", ply, *given, "--check", "False") == 0
+    assert (ply.parent / "outputs" / "room" / "normlift" / "a" / "config.yml").is_file()
