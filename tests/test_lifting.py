@@ -67,7 +67,7 @@ def files(folder: Path, array: np.ndarray, *stems: str, **options: Any) -> Regio
 FULL = np.ones((HEIGHT, WIDTH), int)
 
 
-def test_nothing_labelled_is_refused(tmp_path: Path) -> None:
+def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
     for value in (0, -1, -5):
         for unlabeled in ("ignore", "dilute"):
             source = files(tmp_path / "maps", value * FULL)
@@ -78,9 +78,6 @@ def test_nothing_labelled_is_refused(tmp_path: Path) -> None:
     for made, why in ((hidden, "masks"), (away, "cameras")):
         with pytest.raises(InputError, match=rf"nothing was labelled: .*{why}"):
             lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
-
-
-def test_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
     made = scene(count=3000)
     made.gaussians.means[5:, 2] -= 100  # behind the camera
     with pytest.warns(UserWarning, match=r" 5 of 3,000 .*0\.17%"):

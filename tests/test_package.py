@@ -45,7 +45,7 @@ def built(tmp_path_factory) -> tuple[Path, Path]:
 
 
 @pytest.mark.slow
-def test_wheel_and_sdist_hold_one_package(built):
+def test_wheel_and_sdist_hold_one_package_and_its_readme(built):
     wheel, sdist = built
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {PurePosixPath(name).parts[0] for name in names if ".dist-info/" not in name} == {"normlift_ns"}
@@ -58,10 +58,7 @@ def test_wheel_and_sdist_hold_one_package(built):
     packed = {name for name in members if not name.startswith(("normlift_ns/", "normlift_ns.egg-info/"))}
     assert packed == beside and "normlift_ns/encoders/texts/xkcd.json" in members & names
     assert not [name for name in members | names if "__pycache__" in name or name.startswith(".")]
-
-
-@pytest.mark.slow
-def test_an_index_shows_readme_with_links_that_lead_somewhere(built):
+    # the index shows the README with links that lead somewhere
     (name,) = (name for name in zipfile.ZipFile(built[0]).namelist() if name.endswith("dist-info/METADATA"))
     shown = zipfile.ZipFile(built[0]).read(name).decode()
     files = f"{project()['urls']['Source']}/blob/main/"

@@ -50,7 +50,7 @@ def test_tables_of_the_pages_are_those_of_the_results_and_every_table_stands_on_
     assert shown == {None, *made}
 
 
-def test_a_refresh_changes_tables_alone(pages):
+def test_a_refresh_changes_tables_alone_and_refuses_wrong_markers(pages):
     assert pages.outdated(PAGE, MADE) == ["first", "second"]
     new = pages.refreshed(PAGE, MADE)
     assert new == PAGE.replace("| 7 |", "| 1 |").replace("second -->\r\n", f"second -->\r\n{MADE['second']}")
@@ -58,9 +58,6 @@ def test_a_refresh_changes_tables_alone(pages):
     by_hand = [[part.text for part in pages.split(text, MADE) if part.table is None] for text in (PAGE, new)]
     assert by_hand[0] == by_hand[1]
     assert "".join(part.text for part in pages.split(PAGE, MADE)) == PAGE
-
-
-def test_wrong_markers_are_refused(pages):
     for text, *facts in (
         ("\n<!-- table: third -->\n<!-- end -->\n", "line 2", "third", "first, second"),
         ("<!-- table: first -->\n", "first", "<!-- end -->"),

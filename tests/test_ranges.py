@@ -104,16 +104,13 @@ def test_options_are_made_or_refused(option, value):
         assert not isinstance(kept, float) or math.isfinite(kept)
 
 
-def test_a_message_names_the_flag_in_a_command_and_the_field_in_python():
+def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their_field():
     with pytest.raises(InputError, match=r"^sigma_d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
     with named_as_flags(), pytest.raises(InputError, match=r"^--sigma-d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
     with pytest.raises(InputError, match=r"^sigma_d must be finite, got inf$"):
         RefineConfig(sigma_d=math.inf)
-
-
-def test_values_take_the_type_of_their_field():
     vote = RefineConfig(k=np.int64(7), sigma_d=2, tau=np.float32(0.5))
     assert [type(x) for x in (vote.k, vote.sigma_d, vote.tau)] == [int, float, float]
     assert SourceOptions(regions_dir="maps").regions_dir == Path("maps")  # type: ignore[arg-type]
@@ -130,7 +127,7 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
             refused(SourceOptions, name, value)
 
 
-def test_texts_that_can_and_that_cannot_be_asked():
+def test_texts_and_devices_that_can_and_that_cannot_be():
     for texts, fact in (
         (["a", ""], "text 2 of 2 of queries"),
         ([" \n\t"], "empty"),
@@ -147,8 +144,6 @@ def test_texts_that_can_and_that_cannot_be_asked():
     fine = ["x" * LONGEST_TEXT, "[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left"]
     check_texts("text", fine)
 
-
-def test_devices():
     assert [check_device(name) for name in ("auto", "cpu", "cuda", "cuda:3")] == ["auto", "cpu", "cuda", "cuda:3"]
     for name in ("gpu", "cuda:x:", "cuda:-1", "cuda:", "cuda:99999", "cudax", "cpu:0", "", "CPU", None, "cuda:٣"):
         with pytest.raises(InputError, match="--device"):

@@ -414,14 +414,12 @@ def test_tasks_of_an_array_and_ranks_within_them_hold_everything_exactly_once(co
     assert held(parts, size) == [1] * size
 
 
-def test_what_the_environment_says():
+def test_what_the_environment_says_and_cannot_say():
     assert make_shard("auto", {}) == make_shard("none", array(1, 3)) == ALL
     assert make_shard("auto", array(5, 4, least=4)) == Shard(1, 4)
     assert make_shard("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}) == Shard(2, 3)
     assert make_shard("3/3", array(1, 5)) == Shard(2, 3)
 
-
-def test_shards_and_environments_that_cannot_be():
     for word in ("", "1", "0/3", "4/3", "-1/3", "1/3/2", "a/b", "٣/٣", "1/99999999", " 1/2"):
         with pytest.raises(InputError, match="--shard must be i/n"):
             make_shard(word, {})

@@ -87,7 +87,6 @@ SPLATS = [
     ("--load-ply file --colmap room --masks none", "none, given with --masks"),
     ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
     ("--load-config room", "config at room"),
-    ("--load-config file", "file is not a nerfstudio config", "method_name"),
     ("", "got 0"),
     ("--load-ply file --load-config config.yml", "got 2"),
     ("--load-ply file --colmap nowhere", "nowhere, given with --colmap"),

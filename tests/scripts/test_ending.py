@@ -36,10 +36,6 @@ def fail(error: BaseException) -> NoReturn:
     raise error
 
 
-def endless(word: str) -> None:
-    endless(word)
-
-
 def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
     for body, code, *facts in (
         (lambda _: fail(InputError("k [/red] :smile:")), 1, "k [/red] :smile:"),
@@ -49,7 +45,7 @@ def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
         (lambda _: fail(KeyboardInterrupt()), 130, "Interrupted. "),
         (lambda _: fail(ValueError("what")), 70, "bug of normlift_ns: ValueError: what"),
         (lambda _: {}["[/bold]"], 70, "KeyError: '[/bold]'"),
-        (endless, 70, "RecursionError"),
+        (lambda _: fail(RecursionError()), 70, "RecursionError"),
         (lambda _: fail(SystemExit(7)), 7, ""),
     ):
         found, out, err = ended(body)

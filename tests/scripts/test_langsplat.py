@@ -1,9 +1,9 @@
-"""From LangSplat's files to answers: the demo room seen through masks that are merged, missing and noisy, with real
-vectors of CLIP's text encoder."""
+"""The commands on LangSplat's files, with real vectors of CLIP, and on the trained captures."""
 
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +14,15 @@ from PIL import Image
 from scipy import ndimage
 
 from benchmarks.captures import SHARED
-from normlift_ns import open_run
+from normlift_ns import Scene, open_run, render
+from normlift_ns.asking import pixel_relevancy
 from normlift_ns.encoders.texts.files import TextVectors
 from normlift_ns.scripts import lift, query
 from normlift_ns.scripts.demo import iou_per_class
 from tests.captures import clip_vectors, needs_shared
 from tests.scripts.conftest import run_entry
 
-pytestmark = [pytest.mark.extra, needs_shared]
+pytestmark = needs_shared
 
 COLOURS = "cream,light brown,teal,chocolate brown,sky blue,dark green,bright blue,pink,orange,red,yellow,green,purple"
 WORDS = "curtain,mattress,doormat,table,sofa,flowerpot,crate,stool,cone,ball,doughnut,box,vase"
@@ -86,6 +87,7 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
         np.save(folder / f"{path.stem}_f.npy", table.astype(np.float16).astype(np.float32))
 
 
+@pytest.mark.extra
 def test_damaged_masks_lift_to_the_right_things(nerfstudio, tmp_path, monkeypatch):
     """mIoU over the Gaussians of 13 classes, mean of three draws of the damage."""
     from benchmarks.plain_room import plain_room  # noqa: PLC0415
@@ -129,3 +131,52 @@ def test_damaged_masks_lift_to_the_right_things(nerfstudio, tmp_path, monkeypatc
     assert summed[1] >= 0.9
     truth = room.labels == room.names.index("sky blue")
     assert sofa["fraction"] == pytest.approx(float(truth.float().mean()), rel=0.2)
+
+
+def maps(config: Path, texts: list[str], split: str, count: int) -> tuple[Scene, torch.Tensor]:
+    """Relevancy of the texts in the first views of a split, [V, H, W, Q]."""
+    run = open_run(config)
+    scene, relevancy = run.scene, run.ask(*texts).relevancy
+    views = getattr(scene, split).cameras[:count]
+    return scene, torch.stack(
+        [pixel_relevancy(*render(scene.gaussians, c, relevancy, rasterize_mode=scene.rasterize_mode)) for c in views]
+    )
+
+
+@pytest.mark.slow
+def test_fox_is_orange_and_the_curtain_crimson(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
+    relative = Path(os.path.relpath(source, tmp_path))
+    flags = ("--encoder", "colour", "--output-dir", "lifted", "--timestamp", "t")
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", relative, *flags) == 0
+    config = tmp_path / "lifted" / "fox" / "normlift" / "t" / "config.yml"
+    asked = ("--load-config", config, "--text", "orange", "crimson", "--json", "a.json")
+    assert run_entry(monkeypatch, query.entrypoint, *asked) == 0
+    assert "reliability" in capsys.readouterr().out
+    orange, crimson = json.loads((tmp_path / "a.json").read_text())["queries"]
+    assert orange["peak"] > 0.5 and crimson["peak"] > 0.6
+    _, values = maps(config, ["orange", "crimson"], "train", 1)
+    boxes = ((180, 330, 250, 330), (750, 930, 330, 480), (100, 190, 470, 535))
+    head, wallpaper, curtain = (values[0, a:b, c:d].mean(dim=(0, 1)).tolist() for a, b, c, d in boxes)
+    assert head[0] > 3 * wallpaper[0] and head[0] > 0.2
+    assert curtain[1] > 3 * max(head[1], wallpaper[1])
+
+
+@pytest.mark.slow
+def test_mug_and_bottle_stand_out_from_the_table(tmp_path, monkeypatch):
+    captures = SHARED / "captures"
+    source = captures / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
+    regions = ("--regions", "files", "--regions-dir", captures / "tabletop" / "instance")
+    flags = ("--encoder", "colour", *regions, "--output-dir", tmp_path, "--timestamp", "t")
+    monkeypatch.chdir(captures)
+    assert run_entry(monkeypatch, lift.entrypoint, "--load-config", source.relative_to(captures), *flags) == 0
+    run, values = maps(tmp_path / "tabletop" / "normlift" / "t" / "config.yml", ["dusty red", "black"], "held_out", 4)
+    masks = [captures / "tabletop" / "instance" / f"{Path(name).stem}.png" for name in run.held_out.names]
+    truth = torch.from_numpy(np.stack([np.array(Image.open(mask)).astype(int) for mask in masks]))
+    assert len(truth) == 4
+    table = truth == 1
+    for q, label, threshold in ((0, 11, 0.25), (1, 12, 0.8)):
+        thing = truth == label
+        found = (values[..., q] > threshold) & (thing | table)
+        assert float((found & thing).sum() / (found | thing).sum()) > 0.85, label
