@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData
 
 import normlift_ns as nl
@@ -20,7 +21,6 @@ from normlift_ns.question import Question
 from normlift_ns.raster import rasterize
 from normlift_ns.raster.backend import Job
 from normlift_ns.raster.backends import choose_backend
-from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
 from normlift_ns.scripts import query
 from tests.scripts.conftest import run_entry, said
 
@@ -31,10 +31,8 @@ def run(lifted: Path) -> nl.LiftedRun:
 
 
 @pytest.fixture(scope="module")
-def scene(trained: Path) -> NerfstudioScene:
-    found = nl.open_scene(trained)
-    assert isinstance(found, NerfstudioScene)
-    return found
+def scene(trained: Path) -> nl.Scene:
+    return nl.open_scene(trained)
 
 
 def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None:
@@ -44,6 +42,10 @@ def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None
     assert torch.equal(answer["yellow"].mask, yellow.mask)
     assert torch.equal(answer.mask, red.mask | yellow.mask)
     assert (run.field.scalars.reliability[answer.mask] >= 0.3).all()
+    lead = run.ask("red", negatives=["orange", "brown"], rule="margin")
+    assert lead.question.threshold == 0.02 and (lead.relevancy[lead.selected] > 0.02).all()
+    loose, sure = (run.ask("red", threshold=0.2, min_reliability=least).mask for least in (0.0, 0.8))
+    assert 0 < int(sure.sum()) < int(loose.sum())
     assert (red.relevancy[red.mask] > 0.5).all()
 
     truth = room.labels == room.names.index("red")
@@ -52,6 +54,7 @@ def test_an_answer_says_what_is_where(run: nl.LiftedRun, room: DemoRoom) -> None
     assert red.centroid == pytest.approx(((weight[:, None] * means).sum(0) / weight.sum()).tolist(), rel=1e-9)
     ball = red.objects[0]
     assert ball.size > 0.6 * int(truth.sum())
+    assert np.allclose(ball.centroid, run.scene.gaussians.means[truth].mean(0), atol=0.05)
     assert np.all(np.array(ball.box["min"]) <= ball.centroid) and np.all(np.array(ball.centroid) <= ball.box["max"])
     with pytest.raises(KeyError, match=r"'blue' .* 'red', 'yellow'"):
         answer["blue"]
@@ -81,10 +84,8 @@ def test_pictures_show_the_answer(run: nl.LiftedRun) -> None:
     plain, red, both = (run.render("0003", found) for found in (None, answer["red"], answer))
     photo = run.scene.train[3].image
     assert (plain.int() - photo.int()).abs().float().mean() < 3
-    coloured = {
-        name: int((np.ptp(x.numpy().astype(int), axis=2) > 60).sum()) for name, x in (("red", red), ("both", both))
-    }
-    assert 20 < coloured["red"] < coloured["both"] < 0.5 * plain[:, :, 0].numel()
+    coloured = [int((np.ptp(x.numpy().astype(int), axis=2) > 60).sum()) for x in (red, both)]
+    assert 20 < coloured[0] < coloured[1] < 0.5 * plain[:, :, 0].numel()
     assert torch.equal(run.render(3), plain)
     assert torch.equal(run.render(run.scene.train.cameras[3]), plain)
     assert torch.equal(run.render("images/0003.png"), plain)
@@ -95,8 +96,8 @@ def test_pictures_show_the_answer(run: nl.LiftedRun) -> None:
 def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Path, monkeypatch, capsys) -> None:
     """Masks of the capture with made-up vectors: the run can be asked from Python and on the command line."""
     vectors = torch.eye(len(room.names))
-    masks = [nl_mask(trained, view.name) for view in scene.train]
-    features = [(mask - 1, vectors) for mask in masks]
+    masks = [trained.parents[4] / "room" / "instance" / Path(view.name).name for view in scene.train]
+    features = [(np.array(Image.open(mask)).astype(int) - 1, vectors) for mask in masks]
     texts = {name: 3 * vector for name, vector in zip(room.names, vectors)} | {"file": vectors[0]}
     run = nl.lift_run(scene, features=features, texts=texts, output_dir=tmp_path, timestamp="own", queries=["red"])
     assert run.folder == tmp_path / "room" / "normlift" / "own"
@@ -117,16 +118,7 @@ def test_features_of_ones_own(trained: Path, scene, room: DemoRoom, tmp_path: Pa
     assert "near names: red" in said(capsys)
 
 
-def nl_mask(trained: Path, name: str) -> torch.Tensor:
-    """Labels of a training image: 0 for nothing, else 1 + class."""
-    from PIL import Image  # noqa: PLC0415
-
-    return torch.from_numpy(
-        np.array(Image.open(trained.parents[3].parent / "room" / "instance" / Path(name).name))
-    ).int()
-
-
-def test_features_by_name_and_without_texts(trained: Path, scene: NerfstudioScene, tmp_path: Path) -> None:
+def test_features_by_name_and_without_texts(trained: Path, scene: nl.Scene, tmp_path: Path) -> None:
     half = (torch.arange(160).expand(120, 160) // 80, np.eye(2, dtype=np.float32))
     some = {name: half for name in scene.train.names[::3]}
     run = nl.lift_run(trained, features=some, output_dir=tmp_path, lift=nl.LiftOptions(refine=False))
@@ -138,23 +130,43 @@ def test_features_by_name_and_without_texts(trained: Path, scene: NerfstudioScen
         run.ask("left")
 
 
-def test_features_that_do_not_fit_are_named(scene: NerfstudioScene, tmp_path: Path) -> None:
+def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_path: Path) -> None:
     labels, vectors = torch.arange(160).expand(120, 160) // 80, torch.eye(2)
     half = (labels, vectors)
-    for features, message in (
-        ([half] * 3, "^3 .* 12 "),
-        ({"nowhere.png": half}, r"nowhere\.png"),
-        ([(labels[:, :80], vectors)] * 12, r"images/0000\.png .*\(120, 80\), .*\(120, 160\)"),
-        ([(labels + 1, vectors)] * 12, r"images/0000\.png .* -1\.\.1, .* 1\.\.2"),
-        ([(labels, 0 * vectors)] * 12, r"images/0000\.png must be \[regions, D\], finite"),
-        ([*[half] * 11, (labels, torch.eye(3))], r"\[2, 3\]"),
-        ([], "^0 .* 12"),
-        ({}, "empty"),
-        ([labels.numpy()] * 12, "got ndarray"),
-        ([(labels * 0.5, vectors)] * 12, "integers, got float32"),
-    ):
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"features": [half] * 3}, "^3 .* 12 "),
+        ({"features": {"nowhere.png": half}}, r"nowhere\.png"),
+        ({"features": [(labels[:, :80], vectors)] * 12}, r"images/0000\.png .*\(120, 80\), .*\(120, 160\)"),
+        ({"features": [(labels + 1, vectors)] * 12}, r"images/0000\.png .* -1\.\.1, .* 1\.\.2"),
+        ({"features": [(labels, 0 * vectors)] * 12}, r"images/0000\.png must be \[regions, D\], finite"),
+        ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"),
+        ({"features": []}, "^0 .* 12"),
+        ({"features": {}}, "empty"),
+        ({"features": [labels.numpy()] * 12}, "got ndarray"),
+        ({"features": [(labels * 0.5, vectors)] * 12}, "integers, got float32"),
+        ({"texts": {"a": np.zeros(2)}}, r"text 'a' must be \[D\], finite and not zero"),
+        ({"texts": {"a": [1.0, float("nan")]}}, "text 'a' must be"),
+        ({"texts": {"a": np.ones((1, 2))}}, "text 'a' must be"),
+        ({"texts": {" ": [1, 2]}}, "cannot be a text"),
+        ({"texts": {"fox.npy": [1, 2]}}, "cannot be a text"),
+        ({"texts": {5: [1, 2]}}, "dictionary"),
+        ({"texts": {"a": ["x", "y"]}}, "numbers"),
+        ({"texts": {"a": [1j, 2]}}, "real numbers"),
+        ({"texts": {"a": [1, 2, 3]}}, r"\[2, 3\]"),
+        ({"texts": {"a": [1, 2]}, "queries": ["b"]}, "'b' .* 1; near names: a"),
+        ({"queries": ["b"]}, "none"),
+        ({"texts": {"a": [1, 2]}, "queries": "a"}, "queries must be a list"),
+        ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="colour")}, "texts"),
+        ({"source": nl.SourceOptions(encoder="colour")}, "source"),
+        ({"load_step": 3}, "open_scene"),
+        *(({name: 5}, name) for name in ("source", "lift", "timestamp", "overwrite", "check", "export", "features")),
+        ({"output_dir": 5}, "output_dir"),
+        *(({"timestamp": x}, "name of a folder") for x in (".", "..", "a/b", "/x", "", ".cache", "x\ny", "\x1b[31m")),
+        ({"timestamp": "a" * 300}, "300 .* 200"),
+    ]
+    for arguments, message in wrong:
         with pytest.raises(nl.InputError, match=message):
-            nl.lift_run(scene, features=features, output_dir=tmp_path)
+            nl.lift_run(scene, **{"output_dir": tmp_path, "features": [half] * 12, "overwrite": True, **arguments})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -165,11 +177,14 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)
-
-
-def _held_out(content: dict[str, Any]) -> list[dict[str, Any]]:
-    """Two frames that are kept for evaluation."""
-    return [frame for frame in content["frames"] if frame["file_path"] in content["test_filenames"]][:2]
+    for config in (None, 5, [], {}, float("nan"), b"x"):
+        for opened in (nl.open_run, nl.open_scene):
+            with pytest.raises(nl.InputError, match="load_config must be a path"):
+                opened(config)
+    wrong = {"precision": "x", "image_source": "x", "weight_power": 0, "storage": "zip", "unlabeled": "x"}
+    for name, value in wrong.items():
+        with pytest.raises(nl.InputError, match=f"{name} must be one of"):
+            nl.LiftOptions(**{name: value})
 
 
 def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_path: Path) -> None:
@@ -191,8 +206,8 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
         if change == "focal":
             content["fl_x"] *= 1.003
         elif change in ("order", "held out"):
-            first, second = (frames[1], frames[2]) if change == "order" else _held_out(content)
-            key = "transform_matrix"
+            held_out = [frame for frame in frames if frame["file_path"] in content["test_filenames"]]
+            (first, second), key = frames[1:3] if change == "order" else held_out[:2], "transform_matrix"
             first[key], second[key] = second[key], first[key]
         else:
             for frame in frames[1 : 2 if change == "one pose" else None]:
@@ -200,61 +215,6 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
         file.write_text(json.dumps(content))
         with pytest.warns(UserWarning, match=f"the {changed} cameras"):
             nl.open_run(lifted, data=room)
-
-
-def test_arguments_of_other_types_are_named(trained: Path, tmp_path: Path) -> None:
-    for config in (None, 5, [], {}, float("nan"), b"x"):
-        for opened in (nl.open_run, nl.open_scene):
-            with pytest.raises(nl.InputError, match="load_config must be a path"):
-                opened(config)
-    for name in ("source", "lift", "timestamp", "overwrite", "check", "output_dir", "export", "features"):
-        with pytest.raises(nl.InputError, match=name):
-            nl.lift_run(trained, **{"output_dir": tmp_path, name: 5})
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_names_of_runs_are_names_of_folders(scene: NerfstudioScene, tmp_path: Path) -> None:
-    half = [(torch.zeros(120, 160, dtype=torch.int64), torch.ones(1, 2))] * 12
-    for stamp in (".", "..", "a/b", "/x", "", "../splatfacto/run", ".cache", "x\ny", "\x1b[31m", "a" * 300):
-        with pytest.raises(nl.InputError, match="300 .* 200" if len(stamp) == 300 else "name of a folder"):
-            nl.lift_run(scene, features=half, output_dir=tmp_path, timestamp=stamp, overwrite=True)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_texts_that_cannot_be_asked_are_refused_before_the_lift(scene: NerfstudioScene, tmp_path: Path) -> None:
-    half = [(np.zeros((120, 160), np.uint16), [[1.0, 2.0]])] * 12
-    for texts, queries, message in (
-        ({"a": np.zeros(2)}, (), r"text 'a' must be \[D\], finite and not zero"),
-        ({"a": [1.0, float("nan")]}, (), "text 'a' must be"),
-        ({"a": np.ones((1, 2))}, (), "text 'a' must be"),
-        ({" ": [1, 2]}, (), "cannot be a text"),
-        ({"fox.npy": [1, 2]}, (), "cannot be a text"),
-        ({5: [1, 2]}, (), "dictionary"),
-        ({"a": ["x", "y"]}, (), "numbers"),
-        ({"a": [1j, 2]}, (), "real numbers"),
-        ({"a": [1, 2, 3]}, (), r"\[2, 3\]"),
-        ({"a": [1, 2]}, ["b"], "'b' .* 1; near names: a"),
-        (None, ["b"], "none"),
-        ({"a": [1, 2]}, "a", "queries must be a list"),
-    ):
-        with pytest.raises(nl.InputError, match=message):
-            nl.lift_run(scene, features=half, texts=texts, queries=queries, output_dir=tmp_path)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_arguments_that_would_be_ignored_are_refused(scene: NerfstudioScene) -> None:
-    colour, half = nl.SourceOptions(encoder="colour"), [(np.zeros((120, 160), int), np.ones((1, 2)))] * 12
-    for arguments, message in (
-        ({"texts": {"a": [1, 2]}}, "texts"),
-        ({"features": half}, "source"),
-        ({"load_step": 3}, "open_scene"),
-    ):
-        with pytest.raises(nl.InputError, match=message):
-            nl.lift_run(scene, source=colour, **arguments)
-    wrong = {"precision": "x", "image_source": "x", "weight_power": 0, "storage": "zip", "unlabeled": "x"}
-    for name, value in wrong.items():
-        with pytest.raises(nl.InputError, match=f"{name} must be one of"):
-            nl.LiftOptions(**{name: value})
 
 
 def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
@@ -281,14 +241,9 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="part must be"):
             run.export(tmp_path / "new" / "a.ply", part)
     for path, more in (
-        ("", {}),
-        ("\0.ply", {}),
-        (None, {}),
-        (5, {}),
-        (tmp_path / "b.ply", {"answer": "x"}),
-        (tmp_path / "b.ply", {"objects": {"a": object()}}),
-        (tmp_path / "b.ply", {"objects": {"a": float("nan")}}),
-        (tmp_path / "b.ply", {"overwrite": "False"}),
+        *((path, {}) for path in ("", "\0.ply", None, 5)),
+        *((tmp_path / "b.ply", {"objects": {"a": value}}) for value in (object(), float("nan"))),
+        *((tmp_path / "b.ply", {name: "False"}) for name in ("answer", "overwrite")),
     ):
         with pytest.raises(nl.InputError):
             run.export(path, **more)  # type: ignore[arg-type]
@@ -323,9 +278,8 @@ def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: P
     again = nl.lift_run(run.config, **given, lift=plain, output_dir=tmp_path / "again")
     assert run.field.manifest["gsplat_rules"] == again.field.manifest["gsplat_rules"] == "1.6"
     lifts = len(drawn)
-    EvaluatedRun(run.scene, run.field, run.texts, True).composited(
-        run.scene.train.cameras[0], torch.ones(len(run.field), 1)
-    )
+    evaluated = EvaluatedRun(run.scene, run.field, run.texts, True)
+    evaluated.composited(run.scene.train.cameras[0], torch.ones(len(run.field), 1))
     run.render(0, run.ask("left"))
     flags = ("--load-config", run.config, "--text", "left", "--render-dir", tmp_path / "pictures")
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
@@ -333,9 +287,8 @@ def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: P
     assert set(drawn) == {nl.RasterSettings.of_gsplat("1.6")}
 
     drawn.clear()
-    assert (
-        nl.lift_run(trained, **given, lift=plain, output_dir=tmp_path / "plain").field.manifest["gsplat_rules"] == "1.4"
-    )
+    run = nl.lift_run(trained, **given, lift=plain, output_dir=tmp_path / "plain")
+    assert run.field.manifest["gsplat_rules"] == "1.4"
     assert set(drawn) == {nl.RasterSettings()}
 
 

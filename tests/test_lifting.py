@@ -9,22 +9,14 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import (
-    Camera,
-    GaussianScene,
-    InputError,
-    LiftOptions,
-    RasterSettings,
-    RefineConfig,
-    lifting,
-    observing,
-)
+from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RasterSettings, RefineConfig, lifting, observing
 from normlift_ns.core.consensus import consensus
 from normlift_ns.encoders import LangSplat, RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder
@@ -42,11 +34,8 @@ from normlift_ns.viewer.pictures import picture_names, training_cameras
 from tests.scenes import Photographs, generator, made_scene
 
 WIDTH, HEIGHT, N = 24, 18, 30
-
-
-_POSE = torch.eye(4)
-_POSE[2, 3] = 2
-CAMERA = Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), _POSE, WIDTH, HEIGHT)
+POSE = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
+CAMERA = Camera(torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), POSE, WIDTH, HEIGHT)
 
 
 def scene(*names: str, count: int = N, held_out: Sequence[str] = (), mask: Any = None, **more: Any) -> Any:
@@ -78,7 +67,7 @@ def files(folder: Path, array: np.ndarray, *stems: str, **options: Any) -> Regio
 FULL = np.ones((HEIGHT, WIDTH), int)
 
 
-def test_nothing_labelled_is_refused(tmp_path: Path) -> None:
+def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
     for value in (0, -1, -5):
         for unlabeled in ("ignore", "dilute"):
             source = files(tmp_path / "maps", value * FULL)
@@ -89,9 +78,6 @@ def test_nothing_labelled_is_refused(tmp_path: Path) -> None:
     for made, why in ((hidden, "masks"), (away, "cameras")):
         with pytest.raises(InputError, match=rf"nothing was labelled: .*{why}"):
             lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
-
-
-def test_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
     made = scene(count=3000)
     made.gaussians.means[5:, 2] -= 100  # behind the camera
     with pytest.warns(UserWarning, match=r" 5 of 3,000 .*0\.17%"):
@@ -101,7 +87,7 @@ def test_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
         lifted(files(tmp_path / "maps", FULL), tmp_path / "cache")
 
 
-def test_images_that_share_a_label_map_are_refused(tmp_path: Path) -> None:
+def test_images_that_share_a_label_map_or_exported_files_are_refused(tmp_path: Path) -> None:
     made = scene("a/0000.png", "b/0000.png")
     source = files(tmp_path / "maps", FULL, "0000")
     with pytest.raises(InputError, match=r"a/0000\.png and b/0000\.png .*label map .*0000\.npy"):
@@ -111,9 +97,13 @@ def test_images_that_share_a_label_map_are_refused(tmp_path: Path) -> None:
     (tmp_path / "maps" / "b" / "0000.npy").symlink_to(tmp_path / "maps" / "a" / "0000.npy")
     with pytest.raises(InputError, match="label map"):
         lifted(source, tmp_path / "cache", made)
+    made, source = scene("a/0.left.png", "b/0.right.png"), files(tmp_path / "maps", FULL, "a/0.left", "b/0.right")
+    with pytest.raises(InputError, match=r"a/0\.left\.png and b/0\.right\.png .*0_s\.npy"):
+        lifted(source, tmp_path / "cache", made, export=Export(tmp_path / "out", True))
+    assert not (tmp_path / "out").exists()
 
 
-def test_images_that_share_an_instance_mask_are_refused(tmp_path: Path) -> None:
+def test_images_that_share_an_instance_mask_or_a_frame_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text('{"1": "a"}')
     np.save(tmp_path / "0000.npy", FULL)
     made = scene("a/0000.png", held_out=("b/0000.png",))
@@ -122,9 +112,6 @@ def test_images_that_share_an_instance_mask_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text('{"2": "a"}')
     with pytest.raises(InputError, match=r"no Gaussian lies in a mask of .*labels\.json"):
         mask_truth(scene("0000.png"), tmp_path, MaskOptions(names=tmp_path / "labels.json"))
-
-
-def test_frames_of_images_of_one_stem_are_refused(tmp_path: Path) -> None:
     info = {"width": WIDTH, "height": HEIGHT}
     egg = {"category": "egg", "segmentation": [[1, 1], [5, 1], [5, 5]]}
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": [egg]}))
@@ -155,20 +142,17 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
         (2 * HEIGHT + 2, 2 * WIDTH + 2, "another size"),
     ):
         for kind in ("langsplat", "files"):
-
-            def source(resample: bool, kind: str = kind, height: int = height, width: int = width) -> FeatureSource:
-                if kind == "langsplat":
-                    return langsplat(tmp_path / kind, height, width, resample=resample)
-                return files(tmp_path / kind, np.ones((height, width), int), resample=resample)
-
+            refused, stretched = (
+                langsplat(tmp_path / kind, height, width, resample=resample)
+                if kind == "langsplat"
+                else files(tmp_path / kind, np.ones((height, width), int), resample=resample)
+                for resample in (False, True)
+            )
             message = rf"{kind}\S+ (of images/a\.png )?is {width}x{height} .*{what}; "
             with pytest.raises(InputError, match=message + r".*24x18\. .*--regions-resample True"):
-                lifted(source(False), tmp_path / "cache", scene(original=RAW))
+                lifted(refused, tmp_path / "cache", scene(original=RAW))
             with pytest.warns(UserWarning, match=message + ".*stretched"):
-                lifted(source(True), tmp_path / "cache", scene(original=RAW))
-
-
-def test_images_say_whether_they_were_undistorted(tmp_path: Path) -> None:
+                lifted(stretched, tmp_path / "cache", scene(original=RAW))
     Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
     for k1, original, size in ((0.0, None, (40, 30)), (0.01, (40, 30), (39, 29))):
         intrinsics = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30, k1)
@@ -188,20 +172,9 @@ def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
     for source in (langsplat(tmp_path / "l", HEIGHT, WIDTH), files(tmp_path / "maps", FULL)):
         with pytest.warns(UserWarning, match="without changing its size"):
             lifted(source, cache, scene(original=(WIDTH, HEIGHT)))
-
-
-def test_exported_files_of_images_of_one_stem_are_refused(tmp_path: Path) -> None:
-    made = scene("a/0.left.png", "b/0.right.png")
-    source = files(tmp_path / "maps", FULL, "a/0.left", "b/0.right")
-    with pytest.raises(InputError, match=r"a/0\.left\.png and b/0\.right\.png .*0_s\.npy"):
-        lifted(source, tmp_path / "cache", made, export=Export(tmp_path / "out", True))
-    assert not (tmp_path / "out").exists()
-
-
-def test_masks_and_images_of_another_size_are_named(tmp_path: Path) -> None:
     mask = torch.ones(HEIGHT, WIDTH + 1, dtype=torch.bool)
     with pytest.raises(InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera \(18, 24\)"):
-        lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", scene(mask=mask))
+        lifted(files(tmp_path / "maps", FULL), cache, scene(mask=mask))
 
 
 def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:
@@ -230,7 +203,12 @@ def test_costs_are_seconds_their_sum_and_the_memory_of_this_process(monkeypatch)
     """`ru_maxrss` would count what the process had from which this one was started."""
     monkeypatch.setattr("resource.getrusage", None)
     (peak,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-    expected = {"a_s": 1.0, "b_s": 0.5, "total_s": 1.5, "memory_gib": pytest.approx(int(peak.split()[1]) / 2**20)}
+    expected = {
+        "a_s": 1.0,
+        "b_s": 0.5,
+        "total_s": 1.5,
+        "memory_gib": pytest.approx(int(peak.split()[1]) / 2**20, rel=0.05),
+    }
     assert cost({"a": 1.0, "b": 0.5}, "cpu") == expected
 
 
@@ -243,9 +221,7 @@ def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):
     lift_scene(made, source, given, tmp_path / "cache", encoder={}, report=lambda *step: told.append(step))
     for stage in ("neighbors", "vote"):
         steps = [done for name, done, total in told if name == stage and total == N]
-        assert steps[0] == 0
-        assert steps[-1] == N
-        assert steps == sorted(steps)
+        assert steps == sorted(steps) and (steps[0], steps[-1]) == (0, N)
     assert len([step for step in told if step[0] == "neighbors"]) == 4
 
 
@@ -273,24 +249,15 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
     """The three views have two masks each, of noise of their own; switching it on rasterizes nothing again, and the
     stored features are those that the formula gives."""
     source = halves(tmp_path / "maps")
-    rasterized: list[int] = []
-    original = observing.rasterize_evidence
-
-    def rasterize(*arguments: Any, **options: Any) -> Any:
-        rasterized.append(1)
-        return original(*arguments, **options)
-
-    monkeypatch.setattr(observing, "rasterize_evidence", rasterize)
     told: list[str] = []
-    results = {}
+    results = []
     for on in (False, True, False):
         given = LiftOptions(refine=False, consensus=on, consensus_sample=7, storage="evidence")
-        results[on] = lift_scene(
-            scene(*THREE), source, given, tmp_path / "cache", encoder={}, report=lambda stage, *_: told.append(stage)
-        )
-    assert len(rasterized) == 1
+        how: Any = {"encoder": {}, "report": lambda stage, *_: told.append(stage)}
+        results.append(lift_scene(scene(*THREE), source, given, tmp_path / "cache", **how))
+        monkeypatch.setattr(observing, "rasterize_evidence", None)
     assert "consensus" in told
-    off, on = results[False], results[True]
+    _, on, off = results
     assert "consensus" not in off.seconds and "consensus" not in off.field.manifest["statistics"]
     assert list(on.seconds).index("consensus") == list(on.seconds).index("evidence") + 1
     facts = on.field.manifest["statistics"]["consensus"]
@@ -312,23 +279,17 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
 def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """R and own evidence are those of the lift without consensus, directions those with it; voting again on the stored
     run takes the same numbers."""
-    source, given = halves(tmp_path / "maps"), {}
-    original = lifting.refine
-
-    def watched(means: Any, directions: Any, reliability: Any, config: Any, **how: Any) -> Any:
-        given[len(given)] = reliability, how["own"]
-        return original(means, directions, reliability, config, **how)
-
+    source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=lifting.refine)
     monkeypatch.setattr(lifting, "refine", watched)
     fields = []
     for on in (False, True):
         options = LiftOptions(consensus=on, beta=0.7, vote=RefineConfig(vote="posterior", k=3))
         fields.append(lift_scene(scene(*THREE), source, options, tmp_path / "cache", encoder={}).field)
-    for before, after in zip(given[0], given[1]):
-        assert torch.equal(after, before)
+    first, second = watched.call_args_list
+    assert torch.equal(first.args[2], second.args[2]) and torch.equal(first.kwargs["own"], second.kwargs["own"])
     plain, agreed = (voting_scalars(field) for field in fields)
     assert torch.allclose(agreed.norm, plain.norm, atol=1e-6)
-    assert torch.allclose(agreed.own_evidence, given[1][1], atol=1e-5)
+    assert torch.allclose(agreed.own_evidence, second.kwargs["own"], atol=1e-5)
     assert torch.equal(plain.norm, fields[0].scalars.norm)
 
 

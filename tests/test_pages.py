@@ -50,7 +50,7 @@ def test_tables_of_the_pages_are_those_of_the_results_and_every_table_stands_on_
     assert shown == {None, *made}
 
 
-def test_a_refresh_changes_tables_alone(pages):
+def test_a_refresh_changes_tables_alone_and_refuses_wrong_markers(pages):
     assert pages.outdated(PAGE, MADE) == ["first", "second"]
     new = pages.refreshed(PAGE, MADE)
     assert new == PAGE.replace("| 7 |", "| 1 |").replace("second -->\r\n", f"second -->\r\n{MADE['second']}")
@@ -58,9 +58,6 @@ def test_a_refresh_changes_tables_alone(pages):
     by_hand = [[part.text for part in pages.split(text, MADE) if part.table is None] for text in (PAGE, new)]
     assert by_hand[0] == by_hand[1]
     assert "".join(part.text for part in pages.split(PAGE, MADE)) == PAGE
-
-
-def test_wrong_markers_are_refused(pages):
     for text, *facts in (
         ("\n<!-- table: third -->\n<!-- end -->\n", "line 2", "third", "first, second"),
         ("<!-- table: first -->\n", "first", "<!-- end -->"),
@@ -75,7 +72,7 @@ def test_wrong_markers_are_refused(pages):
         assert [fact for fact in facts if fact not in str(error.value)] == [], text
 
 
-def test_check_names_the_page_and_the_table(pages, folder, capsys):
+def test_check_names_the_page_and_the_table_and_a_refresh_writes_all_or_nothing(pages, folder, monkeypatch, capsys):
     pages.main(check=True, folder=folder)
     page = folder / "accuracy.md"
     stale = page.read_text().replace("| fitted, for `--vote paper` | 36 |", "| fitted, for `--vote paper` | 48 |")
@@ -86,17 +83,12 @@ def test_check_names_the_page_and_the_table(pages, folder, capsys):
     assert page.read_text() == stale
     assert sorted(path.name for path in folder.iterdir()) == sorted(pages.PAGES)
     assert capsys.readouterr().out == ""
-
-
-def test_a_refresh_writes_pages_in_place_or_nothing(pages, folder, monkeypatch):
     monkeypatch.setattr(pages, "plots", lambda found, folder: [])
-    good, bad, *_ = (folder / name for name in pages.PAGES)
-    good.write_text(good.read_text().replace("| 36 |", "| 48 |"))
-    before = good.read_text()
+    bad = folder / "speed_and_error.md"
     bad.write_text(bad.read_text() + "<!-- end -->\n")
     with pytest.raises(SystemExit, match=r"speed_and_error.md, line \d+"):
         pages.main(check=False, folder=folder)
-    assert good.read_text() == before
+    assert page.read_text() == stale
     bad.write_text(bad.read_text().removesuffix("<!-- end -->\n"))
     pages.main(check=False, folder=folder)
     assert all((folder / name).read_bytes() == (pages.DOCS / name).read_bytes() for name in pages.PAGES)

@@ -12,49 +12,35 @@ from pathlib import Path
 
 import pytest
 
-import normlift_ns
 from normlift_ns import open_scene
 from normlift_ns.scenes.splat import Splat
 from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import SMALL
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = Path(normlift_ns.__file__).parent
-UNIX_ONLY = ("resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton")
-NEEDS_THEM = ("normlift_ns.kernels", "normlift_ns.raster.triton", "normlift_ns.raster.gsplat")
-"""Loaded on a GPU alone."""
-KNOW_NERFSTUDIO = ("normlift_ns.nerfstudio_plugin", "normlift_ns.method_configs", "normlift_ns.plugin")
-
+LACKING = ("resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton", "nerfstudio", "gsplat")
+NEED_THEM = ("kernels", "raster.triton", "raster.gsplat", "nerfstudio_plugin", "method_configs", "plugin", "demo.run")
 PROGRAM = """
-import sys, signal
+import signal, sys
 from importlib import import_module
-for name in sys.argv[1].split():
-    sys.modules[name] = None
-for name in ("SIGKILL", "SIGHUP", "SIGALRM", "SIGUSR1"):
-    if hasattr(signal, name):
-        delattr(signal, name)  # Windows has none of them
-failed = []
-for name in sys.argv[2].split():
-    try:
-        import_module(name)
-    except Exception as error:
-        failed.append(f"{name}: {error!r}")
-print("\\n".join(failed))
+sys.modules.update(dict.fromkeys(sys.argv[1].split()))
+for name in {"SIGKILL", "SIGHUP", "SIGALRM", "SIGUSR1"} & set(dir(signal)):
+    delattr(signal, name)  # Windows has none of them
+for name in sys.argv[2:]:
+    import_module(name)
 """
 
 
 @(pytest.mark.slow if sys.platform == "linux" else pytest.mark.filterwarnings("default"))
-def test_nothing_of_unix_alone_is_imported_when_modules_load():
-    """Nor nerfstudio outside of its folder, nor Triton outside of what only a GPU loads. On Linux test_imports.py reads
-    that in the files, much faster."""
-    paths = (path.relative_to(PACKAGE.parent).with_suffix("") for path in PACKAGE.rglob("*.py"))
+def test_nothing_of_unix_or_of_nerfstudio_is_imported_when_modules_load():
+    """On Linux test_imports.py reads that in the files, much faster."""
+    paths = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "normlift_ns").rglob("*.py"))
     names = sorted(".".join(path.parts).removesuffix(".__init__") for path in paths)
-    modules = [name for name in names if not name.startswith((*NEEDS_THEM, *KNOW_NERFSTUDIO, "normlift_ns.demo.run"))]
-    blocked = " ".join((*UNIX_ONLY, "nerfstudio", "gsplat"))
-    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, blocked, " ".join(modules)]
-    environment = os.environ | {"PYTHONIOENCODING": "cp1252", "PYTHONPATH": str(PACKAGE.parent)}
+    modules = [name for name in names if not name.startswith(tuple(f"normlift_ns.{x}" for x in NEED_THEM))]
+    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, " ".join(LACKING), *modules]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
-    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+    assert (done.returncode, len(modules) > 100) == (0, True), done.stderr
 
 
 def test_the_short_list_is_that_of_the_page_and_of_the_project():

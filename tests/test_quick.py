@@ -70,11 +70,8 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
                 assert value == (pytest.approx(theirs[name], abs=1e-5) if value is not None else None), name
 
 
-def test_every_rule_has_both_formulas_and_its_facts():
+def test_every_rule_has_both_formulas_and_vectors_of_another_encoder_are_refused(tmp_path):
     assert set(FORMULAS) == set(quick.FORMULAS) == set(RULES) == set(get_args(Rule))
-
-
-def test_vectors_of_another_encoder_are_refused(tmp_path):
     lifted, means, source = example()
     SemanticField.build(lifted, means, source).save(tmp_path)
     with pytest.raises(InputError, match=rf"must be \[Q, {D}\].*got \(1, 3\)"):
@@ -134,7 +131,7 @@ def test_lines_become_lines_of_json(lifted, monkeypatch, capsys):
     assert f"{red['fraction']:.2%}" in said(capsys)
 
 
-def test_lines_are_answered_as_they_come(lifted, monkeypatch):
+def test_lines_are_answered_as_they_come_also_those_of_windows(lifted, monkeypatch):
     run, shown = quick.open_quick(lifted), io.StringIO()
     monkeypatch.setattr(sys, "stdout", shown)
 
@@ -146,12 +143,7 @@ def test_lines_are_answered_as_they_come(lifted, monkeypatch):
     assert run is not None
     with pytest.raises(InputError, match="1 of 3"):
         answer_lines(run, {}, lines())
-
-
-def test_lines_of_windows_and_closed_streams(lifted, monkeypatch):
-    run, shown = quick.open_quick(lifted), io.StringIO()
-    assert run is not None
-    monkeypatch.setattr(sys, "stdout", shown)
+    shown.truncate(shown.seek(0))
     answer_lines(run, {}, [b"\xef\xbb\xbfred\r\n"])
     assert json.loads(shown.getvalue())["text"] == "red"
     monkeypatch.setattr(sys, "stdin", None)

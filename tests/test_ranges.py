@@ -104,16 +104,13 @@ def test_options_are_made_or_refused(option, value):
         assert not isinstance(kept, float) or math.isfinite(kept)
 
 
-def test_a_message_names_the_flag_in_a_command_and_the_field_in_python():
+def test_a_message_names_the_flag_or_the_field_and_values_take_the_type_of_their_field():
     with pytest.raises(InputError, match=r"^sigma_d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
     with named_as_flags(), pytest.raises(InputError, match=r"^--sigma-d must be positive, at least 1e-06, got nan$"):
         RefineConfig(sigma_d=math.nan)
     with pytest.raises(InputError, match=r"^sigma_d must be finite, got inf$"):
         RefineConfig(sigma_d=math.inf)
-
-
-def test_values_take_the_type_of_their_field():
     vote = RefineConfig(k=np.int64(7), sigma_d=2, tau=np.float32(0.5))
     assert [type(x) for x in (vote.k, vote.sigma_d, vote.tau)] == [int, float, float]
     assert SourceOptions(regions_dir="maps").regions_dir == Path("maps")  # type: ignore[arg-type]
@@ -130,7 +127,7 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
             refused(SourceOptions, name, value)
 
 
-def test_texts_that_cannot_be_asked():
+def test_texts_and_devices_that_can_and_that_cannot_be():
     for texts, fact in (
         (["a", ""], "text 2 of 2 of queries"),
         ([" \n\t"], "empty"),
@@ -144,23 +141,16 @@ def test_texts_that_cannot_be_asked():
         with pytest.raises(InputError) as told:
             check_texts("queries", texts)
         assert fact in str(told.value) and len(str(told.value)) < 300
+    fine = ["x" * LONGEST_TEXT, "[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left"]
+    check_texts("text", fine)
 
-
-def test_texts_that_can_be_asked():
-    check_texts(
-        "text",
-        ["x" * LONGEST_TEXT, "[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left", "中文"],
-    )
-
-
-def test_devices():
     assert [check_device(name) for name in ("auto", "cpu", "cuda", "cuda:3")] == ["auto", "cpu", "cuda", "cuda:3"]
     for name in ("gpu", "cuda:x:", "cuda:-1", "cuda:", "cuda:99999", "cudax", "cpu:0", "", "CPU", None, "cuda:٣"):
         with pytest.raises(InputError, match="--device"):
             check_device(name)
 
 
-def test_more_neighbours_than_there_are():
+def test_more_neighbours_than_there_are_and_a_reach_that_cannot_be():
     means = torch.rand(6, 3, generator=torch.Generator().manual_seed(0))
     u, r = torch.nn.functional.normalize(means, dim=1), means[:, 0]
     with pytest.warns(UserWarning, match=r"k is 100,000.* 5 "):
@@ -174,12 +164,9 @@ def test_more_neighbours_than_there_are():
         assert kept == replace(RefineConfig(), **kept.numbers._asdict())  # the defaults in numbers
     with pytest.raises(InputError, match="k must be at most 1,024, got 100,000"):
         nearest_neighbors(means, 100_000)
-
-
-def test_objects_have_a_reach():
     for reach in (math.nan, math.inf, 0.0, -1.0):
         with pytest.raises(InputError, match="reach must be"):
-            connected_components(torch.rand(4, 3), torch.ones(4, dtype=torch.bool), reach=reach)
+            connected_components(means, means[:, 0] >= 0, reach=reach)
     assert check_number("reach", 4) == 4.0
 
 

@@ -1,9 +1,14 @@
-"""What the README shows works."""
+"""What the README, the pages, the reference and docstrings show is true; the site builds."""
 
+import doctest
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -11,10 +16,13 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.reference import COMMANDS
+import normlift_ns
+from benchmarks.reference import COMMANDS, PAGE
+from benchmarks.reference import page as reference
 from normlift_ns.scripts.lift import NormLift
 
 ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = Path(normlift_ns.__file__).parent
 README = (ROOT / "README.md").read_text("utf8")
 PYTHON = (ROOT / "docs" / "python.md").read_text("utf8")
 FRONT_ENDS = (ROOT / "docs" / "front_ends.md").read_text("utf8")
@@ -117,11 +125,12 @@ def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
         assert gain in made[table].splitlines()[2] and gain in shown
 
 
-def test_times_of_the_readme_are_those_of_the_results():
-    def metric(document: str, key: str) -> float:
-        found = json.loads((ROOT / "benchmarks" / "results" / f"{document}.json").read_text("utf8"))["metrics"]
-        return next(x["value"] for x in found if x["key"] == key)
+def metric(document: str, key: str) -> float:
+    found = json.loads((ROOT / "benchmarks" / "results" / f"{document}.json").read_text("utf8"))["metrics"]
+    return next(x["value"] for x in found if x["key"] == key)
 
+
+def test_times_of_the_readme_and_of_front_ends_are_those_of_the_results():
     room = {key: metric("h100", f"rooms_1930k.{key}") for key in ("evidence_lift_s", "rgb_s", "neighbors_s", "vote_s")}
     fox = [metric("cpu", f"fox_{key}_s") for key in ("evidence", "lift", "neighbors", "refine")]
     wanted = (
@@ -135,18 +144,13 @@ def test_times_of_the_readme_are_those_of_the_results():
     )
     for text in wanted:
         assert text in README
-
-
-def test_times_of_front_ends_are_those_of_the_results():
-    found = json.loads((ROOT / "benchmarks" / "results" / "front_ends.json").read_text("utf8"))["metrics"]
-    seconds = {x["key"]: x["value"] for x in found}
-    network = seconds["sam_encoder_s"] + seconds["sam_decoder_s"]
-    wanted = (
-        f"costs {network:.2f} s of SAM ViT-H's network and {seconds['view_s']:.2f} s in all, "
-        f"{seconds['view_clip_s']:.2f} s of it for CLIP on the {seconds['sam_masks_l']:.0f} masks of a level; CLIP on "
-        f"300 masks takes {seconds['encode_300_s']:.2f} s, and patches {1000 * seconds['patches_s']:.0f} ms"
-    )
-    assert wanted in " ".join(FRONT_ENDS.split())
+    keys = ("sam_encoder_s", "sam_decoder_s", "view_s", "view_clip_s", "sam_masks_l", "encode_300_s", "patches_s")
+    encoder, decoder, view, clip, masks, encode, patches = (metric("front_ends", key) for key in keys)
+    assert (
+        f"costs {encoder + decoder:.2f} s of SAM ViT-H's network and {view:.2f} s in all, {clip:.2f} s of it for CLIP "
+        f"on the {masks:.0f} masks of a level; CLIP on 300 masks takes {encode:.2f} s, and patches "
+        f"{1000 * patches:.0f} ms"
+    ) in " ".join(FRONT_ENDS.split())
 
 
 def test_messages_of_troubleshooting_are_in_the_code():
@@ -157,3 +161,48 @@ def test_messages_of_troubleshooting_are_in_the_code():
     assert len(messages) > 20
     for part in (part.strip(" ;(") for message in messages for part in message.split("…")):
         assert part in code, part
+
+
+def test_the_reference_is_made_of_the_code_and_has_every_public_name():
+    assert PAGE.read_text("utf8") == reference(), "refresh it: python -m benchmarks.reference"
+    shown = re.findall(r"^::: normlift_ns\.[\w.]*?(\w+)$", (PAGE.parent / "api.md").read_text("utf8"), re.MULTILINE)
+    assert sorted(shown) == sorted(normlift_ns.__all__)
+
+
+@pytest.mark.slow
+def test_the_site_builds_with_examples_as_code_and_loads_nothing_from_elsewhere(tmp_path):
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(words, check=False, capture_output=True, text=True, cwd=ROOT, env=environment)
+    assert built.returncode == 0, built.stdout + built.stderr
+    for made in tmp_path.glob("*.html"):
+        loaded = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?:[^"]+)"', made.read_text("utf8"))
+        assert [url for url in loaded if "github.com/normlift-ns" not in url] == [], made.name
+    text = (tmp_path / "api.html").read_text("utf8")
+    assert "&gt;&gt;&gt; " not in re.sub(r"<pre.*?</pre>", "", text, flags=re.DOTALL)
+    assert text.count("&gt;&gt;&gt;") > 50 and "nearest_neighbors" in text
+
+
+OPENS_A_RUN = re.compile(r"\b(open_run|open_scene|lift_run)\(config\b")
+
+
+@pytest.mark.parametrize("opens_a_run", [False, True])
+def test_examples(opens_a_run, request, tmp_path, monkeypatch):
+    names = {}
+    if opens_a_run:  # examples read the run `config` and write to `folder`
+        names = {"config": request.getfixturevalue("lifted"), "folder": tmp_path}
+        from nerfstudio.utils.rich_utils import CONSOLE  # noqa: PLC0415
+
+        monkeypatch.setattr(CONSOLE, "quiet", True)
+    texts = {path: path.read_text("utf8") for path in sorted(PACKAGE.rglob("*.py"))}
+    printed: list[str] = []
+    for path, text in texts.items():
+        if ">>>" not in text or bool(OPENS_A_RUN.search(text)) != opens_a_run:
+            continue
+        name = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+        found = [test for test in doctest.DocTestFinder().find(import_module(name)) if test.examples]
+        assert found, f"{path} has no examples"
+        for test in found:
+            test.globs |= names
+            doctest.DocTestRunner(verbose=False).run(test, out=printed.append)
+    assert printed == [], "".join(printed)

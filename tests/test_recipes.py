@@ -56,28 +56,6 @@ assert ours.max() > 0.9 and ours.min() < 0.4, (ours.max(), ours.min())
 """
 
 
-@pytest.mark.slow
-def test_a_rule(extended: Path, lifted: Path, tmp_path: Path) -> None:
-    python(extended, "-c", RULE, lifted)
-    asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
-    python(extended, "-m", "normlift_ns.scripts.query", *asked, "--json", tmp_path / "a.json")
-    document = json.loads((tmp_path / "a.json").read_text())
-    assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
-
-
-@pytest.mark.slow
-def test_an_output(extended: Path, lifted: Path, tmp_path: Path) -> None:
-    table = tmp_path / "table.csv"
-    words = ("-m", "normlift_ns.scripts.export", "--load-config", lifted, "--output-dir", tmp_path, "--table", table)
-    python(extended, *words, "--text", "red", "--threshold", "0.9")
-    with table.open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == int(open_run(lifted).ask("red", threshold=0.9).mask.sum()) > 20
-    assert all(0 <= float(row["reliability"]) <= 1 for row in rows)
-    other = ("--output-filename", "other.ply")
-    assert f"{table.name} exists" in " ".join(python(extended, *words, *other, "--text", "red", code=1).split())
-
-
 SOURCE = """
 import sys, numpy as np, torch, normlift_ns as nl
 from pathlib import Path
@@ -99,5 +77,19 @@ else:
 
 
 @pytest.mark.slow
-def test_a_scene_source(extended: Path, lifted: Path, tmp_path: Path) -> None:
+def test_a_rule_an_output_and_a_scene_source(extended: Path, lifted: Path, tmp_path: Path) -> None:
     python(extended, "-c", SOURCE, lifted, tmp_path)
+    python(extended, "-c", RULE, lifted)
+    asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
+    python(extended, "-m", "normlift_ns.scripts.query", *asked, "--json", tmp_path / "a.json")
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
+    table = tmp_path / "table.csv"
+    words = ("-m", "normlift_ns.scripts.export", "--load-config", lifted, "--output-dir", tmp_path, "--table", table)
+    python(extended, *words, "--text", "red", "--threshold", "0.9")
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == int(open_run(lifted).ask("red", threshold=0.9).mask.sum()) > 20
+    assert all(0 <= float(row["reliability"]) <= 1 for row in rows)
+    other = ("--output-filename", "other.ply")
+    assert f"{table.name} exists" in " ".join(python(extended, *words, *other, "--text", "red", code=1).split())

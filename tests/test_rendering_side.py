@@ -19,9 +19,8 @@ def two_layers() -> GaussianScene:
     means = torch.cat([front[:8], wall])  # the sheet covers half of the wall
     n = len(means)
     opacities = torch.cat([torch.full((8,), 0.7), torch.full((16,), 0.9)]).double()
-    return GaussianScene(
-        means, torch.tensor([[1.0, 0, 0, 0]]).double().repeat(n, 1), torch.full((n, 3), 0.2).double(), opacities
-    )
+    quaternions = torch.tensor([[1.0, 0, 0, 0]]).double().repeat(n, 1)
+    return GaussianScene(means, quaternions, torch.full((n, 3), 0.2).double(), opacities)
 
 
 def test_least_squares_renders_better_and_leaves_the_sphere():
@@ -44,17 +43,13 @@ def test_least_squares_renders_better_and_leaves_the_sphere():
     def alignment(u: torch.Tensor) -> torch.Tensor:
         return (torch.nn.functional.normalize(u, dim=1) * (A.T @ B)).sum(1)
 
-    # Rendering side: least squares reproduces the feature images better, by construction.
-    assert residual(joint) < 0.9 * residual(f)
-    # 3D side: back-projection is optimal for every single Gaussian; least squares is not.
+    assert residual(joint) < 0.9 * residual(f)  # least squares reproduces the feature images better
+    # Back-projection is optimal for every single Gaussian; least squares is not.
     gain = alignment(f) - alignment(joint)
     assert (gain >= -1e-9).all()
     assert gain.max() > 0.05 * lifted.scalars.weight.max()
-    # Back-projected norms are shares of agreement; those of least squares are no such thing.
-    assert (f.norm(dim=1) <= 1).all()
-    assert joint.norm(dim=1).max() > 1.2
-    # Coupled solving pushes the hidden wall away from the sheet's class, even to negative cosines; each Gaussian's
-    # own evidence never does.
+    assert (f.norm(dim=1) <= 1).all() and joint.norm(dim=1).max() > 1.2
+    # Coupled solving pushes the hidden wall away from the sheet's class; each Gaussian's own evidence never does.
     hidden = slice(8, 16)
     wall = torch.nn.functional.normalize(joint[hidden], dim=1) @ classes[0]
     assert wall.min() < (lifted.directions()[hidden] @ classes[0]).min() - 0.1

@@ -52,10 +52,6 @@ def test_shares_agreement_and_reliability_are_their_formulas():
         again = found.answer(text, views=[0, 2])
         torch.testing.assert_close(again.relevancy[known], share[known], **close)
         assert bool((again.scalars.reliability >= answer.scalars.reliability)[known].all())
-
-
-def test_masks_of_another_size_or_number_are_refused():
-    scene, cameras = small_scene()
     mask = torch.zeros(1, 24, 40, dtype=torch.bool)
     with pytest.raises(ValueError, match="2 of 3"):
         mask_evidence(scene, cameras, [mask, mask])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -38,6 +40,13 @@ def run_entry(monkeypatch: pytest.MonkeyPatch, entrypoint, *flags: object) -> in
     except SystemExit as stop:
         return int(stop.code or 0)
     return 0
+
+
+def wait_for(done: Callable[[], bool], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 @dataclass
@@ -72,6 +81,16 @@ def ended(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(warnings, "showwarning", show)  # as without pytest
     return run
+
+
+@pytest.fixture
+def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """nerfstudio's exporter; open3d, which it imports for meshes, needs system libraries."""
+    monkeypatch.setitem(sys.modules, "open3d", MagicMock())
+    from nerfstudio.scripts import exporter  # noqa: PLC0415
+
+    yield exporter
+    sys.modules.pop("nerfstudio.scripts.exporter")
 
 
 @pytest.fixture(scope="session")

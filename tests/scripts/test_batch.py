@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -15,6 +15,8 @@ from itertools import count, permutations
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from normlift_ns.core.disk.claims import State, claim, read_states
 from normlift_ns.core.disk.lines import read_lines
@@ -24,13 +26,15 @@ from normlift_ns.scripts import batch
 from normlift_ns.scripts.captures.listed import Capture, is_lifted, read_captures
 from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest, worst
 from normlift_ns.scripts.captures.process import run_program
+from normlift_ns.scripts.captures.shards import ALL, Shard, make_shard
 from normlift_ns.scripts.captures.work import work
 from tests.processes import FORK, killed_at
 from tests.scripts import stand_in
-from tests.scripts.conftest import SMALL, run_entry, said
+from tests.scripts.conftest import SMALL, run_entry, said, wait_for
 
 STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
 PATIENCE = 1.5
+ROOT = Path(__file__).parents[2]
 CONFIG = """experiment_name: {}
 method_name: splatfacto
 timestamp: run
@@ -109,13 +113,6 @@ def alive(pid: int) -> bool:
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def wait_for(done: Callable[[], bool], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("begun", [1, 7])
 def test_captures_are_lifted_once_though_a_worker_is_killed(begun, tmp_path):
@@ -166,8 +163,7 @@ def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes with those that started them")
 def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
     made = Batch(tmp_path, ["60"])
-    worker = made.start()
-    begun = tmp_path / "begun.txt"
+    worker, begun = made.start(), tmp_path / "begun.txt"
     wait_for(lambda: begun.exists() and begun.read_text().endswith("\n"))
     pid = int(begun.read_text().split()[1])
     assert alive(pid)
@@ -269,8 +265,7 @@ def test_lines_of_the_list(tmp_path, monkeypatch):
     lines += ["--load-gsplat x#1.pt --transforms t.json", "X.PLY"]
     Path("list.txt").write_text("\r\n".join(lines), "utf8")
     found = read_captures(Path("list.txt"), ("--encoder", "colour"))
-    own = [capture.words[2:-2] for capture in found]
-    assert own == [
+    assert [capture.words[2:-2] for capture in found] == [
         ("--load-config", "a/config.yml"),
         ("--load-ply", "b c.ply", "--colmap", "b c", "--beta", "2"),
         ("--load-gsplat", "x#1.pt", "--transforms", "t.json"),
@@ -278,10 +273,8 @@ def test_lines_of_the_list(tmp_path, monkeypatch):
     ]
     assert all(capture.words[:2] == ("--encoder", "colour") for capture in found)
     assert all(capture.words[-2:] == ("--timestamp", f"batch_{capture.key}") for capture in found)
-    assert [capture.run for capture in found[:2]] == [
-        None,  # the config is not there
-        tmp_path / "outputs" / "b c" / "normlift" / f"batch_{found[1].key}",
-    ]
+    assert found[0].run is None  # the config is not there
+    assert found[1].run == tmp_path / "outputs" / "b c" / "normlift" / f"batch_{found[1].key}"
     assert len({capture.key for capture in found}) == 4
 
 
@@ -309,14 +302,12 @@ def test_the_identity_of_a_capture_is_that_of_scene_and_options(tmp_path):
 def test_lists_that_cannot_be(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for text, options, facts in (
-        ("", (), ("list.txt",)),
         ("# none\n\n", (), ("list.txt",)),
         ("a\nb 'c\n", (), ("list.txt, line 2", "b 'c")),
         ("a\n\nb --encodr x\n", (), ("list.txt, line 3", "--encodr")),
         ("a --k 0\n", (), ("list.txt, line 1", "k must be at least 1, got 0")),
         ("a\nb\n./a\n", (), ("list.txt, line 3", "line 1")),
         ("a --timestamp x", (), ("list.txt, line 1", "--timestamp")),
-        ("a", ("--overwrite", "True"), ("After --", "--overwrite")),
         ("a", ("--nothing",), ("After --", "--nothing")),
         ("a", ("--load-ply", "x.ply"), ("--load-ply", "after --")),
         ("a\0b", (), ("list.txt, line 1", "load_config")),
@@ -326,10 +317,6 @@ def test_lists_that_cannot_be(tmp_path, monkeypatch):
         with pytest.raises(InputError) as told:
             read_captures(Path("list.txt"), options)
         assert all(fact in str(told.value) for fact in facts), (text, options, told.value)
-
-
-def command(monkeypatch, *flags: object) -> int:
-    return run_entry(monkeypatch, batch.entrypoint, *flags)
 
 
 def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsys):
@@ -344,7 +331,7 @@ def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsy
         (("list.txt", "--results", "file"), "file", "--results"),
         (("list.txt", "--", "--k", "0"), "--k must be at least 1, got 0"),
     ):
-        assert command(monkeypatch, *flags) == 1
+        assert run_entry(monkeypatch, batch.entrypoint, *flags) == 1
         text = said(capsys)
         assert all(fact in text for fact in facts) and "Traceback" not in text, flags
         assert sorted(os.listdir()) == ["file", "list.txt"]
@@ -356,7 +343,7 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
     for task in range(3):
         for name, value in {"ID": task + 4, "COUNT": 3, "MIN": 4, "MAX": 6, "STEP": 1}.items():
             monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
-        assert command(monkeypatch, made.list) == 0
+        assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
         assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
     lines = read_lines(made.results, Outcome)
     assert len(lines) == len({line.key for line in lines}) == 5
@@ -369,19 +356,17 @@ def test_real_captures_one_of_them_damaged(trained, tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     Path("list.txt").write_text(f"{trained}\ngone/config.yml\n")
     flags = ("list.txt", "--results", "results", "--", *SMALL, "--output-dir", "lifted", "--queries", "red")
-    assert command(monkeypatch, *flags) == 1
+    assert run_entry(monkeypatch, batch.entrypoint, *flags) == 1
     text = said(capsys)
     assert "1 lifted, 1 failed" in text and "No config at gone/config.yml" in text
     (config,) = Path().glob("lifted/room/normlift/batch_*/config.yml")
     stored = open_run(config).ask_stored()
     assert stored is not None and stored["red"].peak > 0.8
     lines = [json.loads(line) for path in Path("results").glob("*.jsonl") for line in path.read_text().splitlines()]
-    assert {(line["capture"], line["state"], line["code"]) for line in lines} == {
-        (str(trained), "done", 0),
-        ("gone/config.yml", "failed", 1),
-    }
+    found = sorted((line["state"], line["capture"], line["code"]) for line in lines)
+    assert found == [("done", str(trained), 0), ("failed", "gone/config.yml", 1)]
     Path("list.txt").write_text(f"{trained}\n")
-    assert command(monkeypatch, *flags) == 0
+    assert run_entry(monkeypatch, batch.entrypoint, *flags) == 0
     assert said(capsys).endswith("1 lifted")
     assert len(list(Path("results/logs").iterdir())) == 2
 
@@ -397,3 +382,92 @@ def test_the_last_attempt_counts_whatever_the_clocks_say():
     for order in permutations([failed, found]):
         assert latest(order) == {"a": found}
     assert latest([broken, done, found]) == {"a": broken}
+
+
+def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str]:
+    """The variables of a task of a Slurm array."""
+    numbers = {"ID": task, "COUNT": count, "MIN": least, "MAX": least + step * (count - 1), "STEP": step}
+    return {f"SLURM_ARRAY_TASK_{name}": str(number) for name, number in numbers.items()}
+
+
+def held(parts: list[Shard], size: int) -> list[int]:
+    """How many parts hold each entry of a list; no part is larger than another by more than one."""
+    sizes = [sum(map(part.holds, range(size))) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+    return [sum(part.holds(position) for part in parts) for position in range(size)]
+
+
+@given(st.integers(1, 50), st.integers(0, 200))
+def test_shards_hold_everything_exactly_once(count, size):
+    words = held([make_shard(f"{i}/{count}", {}) for i in range(1, count + 1)], size)
+    ranks = held([make_shard("auto", {"RANK": str(i), "WORLD_SIZE": str(count)}) for i in range(count)], size)
+    assert words == ranks == [1] * size
+
+
+@given(st.integers(1, 12), st.integers(0, 5), st.integers(1, 4), st.integers(1, 4), st.integers(0, 100))
+def test_tasks_of_an_array_and_ranks_within_them_hold_everything_exactly_once(count, least, step, ranks, size):
+    parts = [
+        make_shard("auto", array(least + i * step, count, least, step) | {"RANK": str(r), "WORLD_SIZE": str(ranks)})
+        for i in range(count)
+        for r in range(ranks)
+    ]
+    assert held(parts, size) == [1] * size
+
+
+def test_what_the_environment_says_and_cannot_say():
+    assert make_shard("auto", {}) == make_shard("none", array(1, 3)) == ALL
+    assert make_shard("auto", array(5, 4, least=4)) == Shard(1, 4)
+    assert make_shard("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}) == Shard(2, 3)
+    assert make_shard("3/3", array(1, 5)) == Shard(2, 3)
+
+    for word in ("", "1", "0/3", "4/3", "-1/3", "1/3/2", "a/b", "٣/٣", "1/99999999", " 1/2"):
+        with pytest.raises(InputError, match="--shard must be i/n"):
+            make_shard(word, {})
+    for environment, *facts in (
+        ({"RANK": "0"}, "RANK is set", "WORLD_SIZE is not"),
+        ({"WORLD_SIZE": "2"}, "WORLD_SIZE is set", "RANK is not"),
+        ({"RANK": "2", "WORLD_SIZE": "2"}, "RANK is 2", "WORLD_SIZE, 2"),
+        ({"RANK": "x", "WORLD_SIZE": "2"}, "RANK", "at least 0", "'x'"),
+        ({"RANK": "0", "WORLD_SIZE": "0"}, "WORLD_SIZE", "at least 1", "'0'"),
+        ({"SLURM_ARRAY_TASK_ID": "1"}, "SLURM_ARRAY_TASK_ID is set", "SLURM_ARRAY_TASK_COUNT is not"),
+        (array(7, 3, least=1), "SLURM_ARRAY_TASK_ID is 7", "3 tasks", "from 1"),
+        (array(3, 2, least=0, step=2), "without gaps"),
+        (array(0, 2, least=1), "without gaps"),
+    ):
+        with pytest.raises(InputError) as told:
+            make_shard("auto", environment)
+        assert [fact for fact in facts if fact not in str(told.value)] == [], told.value
+
+
+RAY = f"""#!{sys.executable}
+from normlift_ns.scripts.captures import work
+from normlift_ns.scripts.start import batch
+work.work.__kwdefaults__["program"] = {STAND_IN!r}
+batch()
+"""
+
+
+@pytest.mark.extra
+def test_the_recipe_for_ray(tmp_path, monkeypatch, capsys):
+    """Of docs/scale.md, with processors in place of GPUs."""
+    ray = pytest.importorskip("ray", reason="ray is not installed; it is no dependency: pip install ray")
+    made = Batch(tmp_path, ["0.05"] * 12)
+    (recipe,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "scale.md").read_text("utf8"), flags=re.DOTALL)
+    for before, after in (("num_gpus", "num_cpus"), ('"GPU"', '"CPU"'), ("os.getcwd()", repr(str(tmp_path)))):
+        assert recipe.count(before) == 1
+        recipe = recipe.replace(before, after)
+    command = tmp_path / "bin" / "ns-normlift-batch"
+    command.parent.mkdir()
+    command.write_text(RAY)
+    command.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{command.parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # it would leave a token in the home folder
+    try:
+        exec(compile(recipe, "docs/scale.md", "exec"), {"__name__": "recipe"})
+    finally:
+        ray.shutdown()
+    assert "0" in capsys.readouterr().out.splitlines()  # among what the workers say
+    options = ("--regions", "sam")
+    made.check_lifted_once(*options)
+    assert set(made.states(*options)) == {"done"} and sum(made.begun().values()) == 12

@@ -32,9 +32,7 @@ def states(found: dict) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_a_capture_is_checked_and_lifted_as_planned(
-    checked: Callable[..., tuple[int, dict]], trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_a_capture_is_checked_and_lifted_as_planned(checked, trained, tmp_path, monkeypatch, capsys) -> None:
     code, found = checked("--max-views", 6)
     assert code == 0
     rows = states(found)
@@ -60,9 +58,7 @@ def test_a_capture_is_checked_and_lifted_as_planned(
     assert sorted(path for path in (tmp_path / "out").rglob("*")) == before
 
 
-def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(
-    checked: Callable[..., tuple[int, dict]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_path, monkeypatch, capsys) -> None:
     code, found = checked("--load-config", tmp_path / "config.yml")
     assert code == 1 and states(found) == {"options": "error"} and found["plan"] is None
     assert "No config at" in found["findings"][0]["found"]
@@ -72,11 +68,13 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(
     code, found = checked("--check", "False")
     assert code == 1 and states(found)["in view"] == "error" and found["plan"] is None
     assert "Correct the errors above" in said(capsys)
+    file = tmp_path / "mine.json"
+    file.write_text("mine")
+    assert run_entry(monkeypatch, check.entrypoint, "--load-config", trained, *SMALL, "--json", file) == 1
+    assert "mine.json" in said(capsys) and file.read_text() == "mine"
 
 
-def test_weights_that_would_be_downloaded_are_a_warning_and_no_plan(
-    checked: Callable[..., tuple[int, dict]], monkeypatch: pytest.MonkeyPatch, trained: Path, tmp_path: Path, capsys
-) -> None:
+def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, trained, tmp_path, capsys) -> None:
     monkeypatch.setattr("normlift_ns.encoders.weights.probe", lambda address: None)
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     code, found = checked("--encoder", "open_clip", "--regions", "patches")
@@ -98,13 +96,6 @@ def test_texts_of_sam3_are_those_of_the_lift(checked, monkeypatch, trained, tmp_
     given = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--device", "cpu", *flags)
     assert run_entry(monkeypatch, lift.entrypoint, *given, "--dry-run", "True") == 1
     assert "SAM 3 checkpoint" in said(capsys)
-
-
-def test_what_exists_is_not_replaced_unasked(trained: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    file = tmp_path / "check.json"
-    file.write_text("mine")
-    assert run_entry(monkeypatch, check.entrypoint, "--load-config", trained, *SMALL, "--json", file) == 1
-    assert "check.json" in said(capsys) and file.read_text() == "mine"
 
 
 def test_memory_and_disk_are_compared_with_what_is_free() -> None:

@@ -36,10 +36,6 @@ def fail(error: BaseException) -> NoReturn:
     raise error
 
 
-def endless(word: str) -> None:
-    endless(word)
-
-
 def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
     for body, code, *facts in (
         (lambda _: fail(InputError("k [/red] :smile:")), 1, "k [/red] :smile:"),
@@ -49,7 +45,7 @@ def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
         (lambda _: fail(KeyboardInterrupt()), 130, "Interrupted. "),
         (lambda _: fail(ValueError("what")), 70, "bug of normlift_ns: ValueError: what"),
         (lambda _: {}["[/bold]"], 70, "KeyError: '[/bold]'"),
-        (endless, 70, "RecursionError"),
+        (lambda _: fail(RecursionError()), 70, "RecursionError"),
         (lambda _: fail(SystemExit(7)), 7, ""),
     ):
         found, out, err = ended(body)
@@ -61,11 +57,6 @@ def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
             assert "Traceback" in log.read_text() and str(log) in err
             assert log.stat().st_mode & 0o777 == 0o600
             log.unlink()
-
-
-def test_flags_that_cannot_be_read_are_mistakes_of_the_user(ended):
-    code, out, err = ended(say, "--wrod", "a")
-    assert (code, out) == (1, "") and "--wrod" in err
 
 
 def test_what_cannot_be_encoded_is_replaced(ended, monkeypatch):

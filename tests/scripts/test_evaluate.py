@@ -26,57 +26,41 @@ from tests.scripts.conftest import run_entry, said
 
 
 @pytest.fixture
-def lifted(little_lifted: Path) -> Path:
-    return little_lifted
+def capture(little_lifted: Path) -> Path:
+    return little_lifted.parents[4] / "room"
 
 
 @pytest.fixture
-def room(little_room):
-    return little_room
-
-
-@pytest.fixture
-def capture(lifted: Path) -> Path:
-    return lifted.parents[4] / "room"
-
-
-@pytest.fixture
-def scored(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The document that a protocol writes."""
 
     def score(protocol: str, labels: Path, *flags: object) -> dict:
-        given = ("--protocol", protocol, "--load-config", lifted, "--labels", labels, "--overwrite", True)
+        given = ("--protocol", protocol, "--load-config", little_lifted, "--labels", labels, "--overwrite", True)
         assert run_entry(monkeypatch, evaluate.entrypoint, *given, "--output-path", tmp_path / "s.json", *flags) == 0
         return json.loads((tmp_path / "s.json").read_text())
 
     return score
 
 
-def test_nothing_is_replaced_unasked(lifted, capture, tmp_path, monkeypatch, capsys):
+def test_nothing_is_replaced_unasked(little_lifted, capture, tmp_path, monkeypatch, capsys):
     masks = ("--protocol", "masks", "--labels", capture / "instance", "--study", "sweeps", "signals")
     coverage = ("--protocol", "none", "--study", "coverage")
     monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
     monkeypatch.chdir(tmp_path)
-    for existing, flags in (
-        ("scores.json", masks),
-        ("scores_sweeps.svg", masks),
-        ("scores_signals.svg", masks),
-        ("scores.json", coverage),
-        ("scores_coverage_camera_path.json", coverage),
-        ("scores_coverage_pose_5.png", coverage),
-        ("output.json", masks),
-    ):
+    plots = ("scores.json", "scores_sweeps.svg", "scores_signals.svg", "output.json")
+    coverages = ("scores_coverage_camera_path.json", "scores_coverage_pose_5.png")
+    for existing, flags in (*((name, masks) for name in plots), *((name, coverage) for name in coverages)):
         Path(existing).write_text("mine")
         output = () if existing == "output.json" else ("--output-path", tmp_path / "scores.json")
-        assert run_entry(monkeypatch, evaluate.entrypoint, "--load-config", lifted, *flags, *output) == 1
+        assert run_entry(monkeypatch, evaluate.entrypoint, "--load-config", little_lifted, *flags, *output) == 1
         shown = said(capsys)
         assert f"{existing} exists" in shown and "--output-path" in shown and "--overwrite True" in shown
         assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(existing, "mine")]
         Path(existing).unlink()
 
 
-def test_coverage_needs_no_truth(lifted, tmp_path, monkeypatch, capsys):
-    flags = ("--load-config", lifted, "--study", "coverage", "--output-path", tmp_path / "next.json")
+def test_coverage_needs_no_truth(little_lifted, tmp_path, monkeypatch, capsys):
+    flags = ("--load-config", little_lifted, "--study", "coverage", "--output-path", tmp_path / "next.json")
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 0
     document = json.loads((tmp_path / "next.json").read_text())
     assert document["results"] == {}
@@ -143,8 +127,8 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     assert min(row["miou_3d"] for row in rows.values()) > 0.2
 
 
-def test_baselines_of_features_of_ones_own_are_refused(lifted, capture, tmp_path, monkeypatch, capsys):
-    scene = nl.open_scene(lifted)
+def test_baselines_of_features_of_ones_own_are_refused(little_lifted, capture, tmp_path, monkeypatch, capsys):
+    scene = nl.open_scene(little_lifted)
     halves = [((torch.arange(c.width) * 2 // c.width).expand(c.height, -1), torch.eye(2)) for c in scene.train.cameras]
     texts = dict.fromkeys(read_names(capture / "labels.json").classes, torch.tensor([1.0, 1.0]))
     how = nl.LiftOptions(refine=False, consensus=False)
@@ -155,13 +139,13 @@ def test_baselines_of_features_of_ones_own_are_refused(lifted, capture, tmp_path
     assert "how its regions and features were made" in said(capsys)
 
 
-def test_scannet_with_stand_in_names(scored, room, tmp_path):
-    ids = list(NYU40)[: len(room.names)]
-    vertices = np.zeros(len(room.labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u2")])
-    vertices["label"] = [ids[label] if label >= 0 else 0 for label in room.labels.tolist()]
+def test_scannet_with_stand_in_names(scored, little_room, tmp_path):
+    ids = list(NYU40)[: len(little_room.names)]
+    vertices = np.zeros(len(little_room.labels), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u2")])
+    vertices["label"] = [ids[label] if label >= 0 else 0 for label in little_room.labels.tolist()]
     path = tmp_path / "scene0000_00_vh_clean_2.labels.ply"
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
-    colours = [*room.names, *["black", "white", "grey", "beige", "magenta", "lime"]]
+    colours = [*little_room.names, *["black", "white", "grey", "beige", "magenta", "lime"]]
     names = [*NYU40.values(), "shower curtain"]
     vectors = ("--text-vectors", stand_ins(tmp_path / "names.npz", dict(zip(names, [*colours, "cyan"]))))
     document = scored("scannet", path, "--study", "signals", "ablation", *vectors)
@@ -193,10 +177,10 @@ def write_polygons(folder: Path, instance: Path, names: tuple[str, ...], wanted:
 WANTED = ("sky blue", "bright blue", "dark green")
 
 
-def test_lerf_with_stand_in_words(scored, room, capture, tmp_path):
+def test_lerf_with_stand_in_words(scored, little_lifted, little_room, capture, tmp_path, monkeypatch, capsys):
     labels = tmp_path / "label" / "room"
     for stem in ("0000", "0006"):  # a training view and a held-out one
-        write_polygons(labels, capture / "instance" / f"{stem}.png", room.names, WANTED)
+        write_polygons(labels, capture / "instance" / f"{stem}.png", little_room.names, WANTED)
     (labels / "0099.json").write_text((labels / "0000.json").read_text())
     words = {**{name: name for name in WANTED}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
     words |= {"floor": "light brown", "object": "chocolate brown", "things": "grey"}
@@ -217,23 +201,18 @@ def test_lerf_with_stand_in_words(scored, room, capture, tmp_path):
     assert "all.accuracy_refined" not in signals  # nothing tells the class of a Gaussian
     assert scored("lerf", labels, "--clean", True, *vectors)["results"]["miou"] != results["miou"]
 
-
-def test_several_scenes_are_averaged_and_pooled(lifted, room, capture, tmp_path, monkeypatch, capsys):
-    """One run under two names, with two frames and one."""
-    for scene, stems in (("kitchen", ("0000", "0006")), ("hall", ("0000",))):
-        for stem in stems:
-            write_polygons(tmp_path / "two" / scene, capture / "instance" / f"{stem}.png", room.names, WANTED)
-    words = {**{name: name for name in WANTED}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
-    labels, output = (tmp_path / "two" / "kitchen", tmp_path / "two" / "hall"), tmp_path / "two.json"
-    flags = ("--protocol", "lerf", "--load-config", lifted, lifted, "--labels", *labels, "--output-path", output)
-    flags += ("--text-vectors", stand_ins(tmp_path / "words.npz", words), "--study", "signals")
+    hall, output = tmp_path / "label" / "hall", tmp_path / "two.json"  # one run under two names, averaged and pooled
+    write_polygons(hall, capture / "instance" / "0000.png", little_room.names, WANTED)
+    flags = ("--protocol", "lerf", "--load-config", little_lifted, little_lifted, "--labels", labels, hall)
+    flags += ("--output-path", output, "--study", "signals", *vectors)
+    said(capsys)
     assert run_entry(monkeypatch, evaluate.entrypoint, *flags) == 0
     document = json.loads(output.read_text())
-    kitchen, hall = document["scenes"]
-    assert (kitchen["scene"], kitchen["frames"], hall["scene"], hall["frames"]) == ("kitchen", 2, "hall", 1)
+    room, hall = document["scenes"]
+    assert (room["scene"], room["frames"], hall["scene"], hall["frames"]) == ("room", 2, "hall", 1)
     results = document["results"]
-    assert results["miou"] == pytest.approx((kitchen["miou"] + hall["miou"]) / 2)
-    assert results["miou_pooled"] == pytest.approx((2 * kitchen["miou"] + hall["miou"]) / 3)
-    assert kitchen["miou"] != hall["miou"]
-    assert [row["scene"] for row in document["studies"]["signals"]] == ["kitchen", "hall", "all scenes"]
-    assert "kitchen" in said(capsys) and torch.is_grad_enabled()
+    assert results["miou"] == pytest.approx((room["miou"] + hall["miou"]) / 2)
+    assert results["miou_pooled"] == pytest.approx((2 * room["miou"] + hall["miou"]) / 3)
+    assert room["miou"] != hall["miou"]
+    assert [row["scene"] for row in document["studies"]["signals"]] == ["room", "hall", "all scenes"]
+    assert "hall" in said(capsys) and torch.is_grad_enabled()

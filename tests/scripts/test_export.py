@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterator
+import shutil
+import subprocess
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from normlift_ns.viewer.pictures import view_mask
 from tests.scripts.conftest import run_entry, said
 
 if TYPE_CHECKING:
-    from normlift_ns.demo import DemoRoom
+    pass
 
 EXTRA = ["reliability", "n_eff", "relevancy_0", "relevancy_1", "class_id", "instance_id"]
 
@@ -34,19 +34,7 @@ def scene_ply(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "splat.ply"
 
 
-@pytest.fixture
-def ns_export(nerfstudio, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """nerfstudio's exporter; open3d, which it imports for meshes, needs system libraries."""
-    monkeypatch.setitem(sys.modules, "open3d", MagicMock())
-    from nerfstudio.scripts import exporter  # noqa: PLC0415
-
-    yield exporter
-    sys.modules.pop("nerfstudio.scripts.exporter")
-
-
-def test_the_file_is_that_of_ns_export_and_more(
-    scene_ply: Path, lifted: Path, nerfstudio, ns_export, monkeypatch, tmp_path
-) -> None:
+def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
     from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
 
@@ -96,29 +84,23 @@ def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> Non
 
 
 def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
-    """trimesh, and the way in which the reference code of 3D Gaussian splatting picks properties by their prefix."""
+    """trimesh, open3d, and the way in which the code of 3D Gaussian splatting picks properties by their prefix."""
     import trimesh  # noqa: PLC0415
 
     count = len(np.load(scene_ply.with_name("splat_rows.npy")))
-    cloud = trimesh.load(scene_ply)
-    assert cloud.vertices.shape == (count, 3)
+    assert trimesh.load(scene_ply).vertices.shape == (count, 3)
     ply = PlyData.read(scene_ply)
     names = [p.name for p in ply.elements[0].properties]
     assert ply.header.startswith("ply\nformat binary_little_endian 1.0\n")
     for prefix, number in (("f_rest_", 45), ("f_dc_", 3), ("scale_", 3), ("rot", 4), ("opacity", 1)):
         assert len([n for n in names if n.startswith(prefix)]) == number
-
-
-def test_open3d_opens_it(scene_ply: Path) -> None:
     open3d = pytest.importorskip("open3d", reason="open3d needs system libraries here", exc_type=ImportError)
     cloud = open3d.t.io.read_point_cloud(str(scene_ply))
-    assert cloud.point.positions.shape[0] == len(np.load(scene_ply.with_name("splat_rows.npy")))
+    assert cloud.point.positions.shape[0] == count
     assert cloud.point.reliability.numpy().max() < 1
 
 
-def test_selection_and_rest_make_up_the_scene(
-    scene_ply: Path, lifted: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_selection_and_rest_make_up_the_scene(scene_ply, lifted, tmp_path, monkeypatch, capsys) -> None:
     rows = {}
     for part in ("selection", "rest"):
         flags = ("--load-config", lifted, "--output-dir", tmp_path, "--part", part, "--text", "red")
@@ -130,7 +112,7 @@ def test_selection_and_rest_make_up_the_scene(
     assert "Objects" in capsys.readouterr().out
 
 
-def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monkeypatch) -> None:
+def test_objects_of_the_room(lifted: Path, tmp_path: Path, monkeypatch) -> None:
     flags = ("--load-config", lifted, "--output-dir", tmp_path, "--text", "red", "--threshold", "0.8")
     assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
     document = json.loads((tmp_path / "splat_objects.json").read_text())
@@ -140,24 +122,18 @@ def test_objects_of_the_room(lifted: Path, room: DemoRoom, tmp_path: Path, monke
     assert sizes == sorted(sizes, reverse=True)
     assert sum(sizes) + red["in_smaller_parts"] == red["gaussians"]
     assert (red["class_id"], [found["instance_id"] for found in red["objects"]]) == (1, [*range(1, len(sizes) + 1)])
-    ball, run = red["objects"][0], open_run(lifted)
-    truth = run.scene.gaussians.means[room.labels == room.names.index("red")]
-    assert ball["size"] > 0.6 * len(truth)
-    assert np.allclose(ball["centroid"], truth.mean(0), atol=0.05)
+    ball = red["objects"][0]
     assert np.all(np.array(ball["box"]["min"]) <= ball["centroid"])
     assert np.all(np.array(ball["centroid"]) <= ball["box"]["max"])
     assert 0.3 < ball["mean_reliability"] < 1
 
 
-def test_mistakes_have_a_message(lifted, tmp_path, monkeypatch, capsys) -> None:
+def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_path, monkeypatch, capsys) -> None:
     given = ("--load-config", lifted, "--output-dir", tmp_path / "x", "--text")
     for flags, fact in ((("red", "--threshold", "1.5", "--part", "selection"), "no Gaussian"), (("oragne",), "orange")):
         assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
         assert fact in said(capsys)
         assert not list((tmp_path / "x").glob("*"))
-
-
-def test_an_export_stays_in_its_folder(lifted: Path, tmp_path: Path, monkeypatch) -> None:
     flags = ("--load-config", lifted, "--output-dir", tmp_path / "a" / "b", "--output-filename", "../../evil.ply")
     assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.ply")] == ["a/b/evil.ply"]
@@ -186,9 +162,7 @@ def test_no_part_of_an_export_is_replaced_unasked(lifted: Path, tmp_path: Path, 
         (tmp_path / existing).unlink()
 
 
-def test_masks_arrays_and_labels_of_a_cloud(
-    scene_ply: Path, lifted: Path, room: DemoRoom, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, monkeypatch, capsys) -> None:
     run = open_run(lifted)
     answer, means = run.ask("red", "yellow"), run.scene.gaussians.means
     points = np.concatenate([run.to_capture.points(means[:50].double().numpy()), [[1e6, 0, 0]]])
@@ -200,9 +174,7 @@ def test_masks_arrays_and_labels_of_a_cloud(
     assert "98.0%" in said(capsys)
     rows, splat = np.load(scene_ply.with_name("splat_rows.npy")), PlyData.read(scene_ply)["vertex"]
     arrays = {name: np.load(tmp_path / "arrays" / f"{name}.npy") for name in ("coord", "segment", "instance")}
-    assert {name: array.dtype.str for name, array in arrays.items()} == {
-        "coord": "<f4", "segment": "<i4", "instance": "<i4",
-    }  # fmt: skip
+    assert [array.dtype.str for array in arrays.values()] == ["<f4", "<i4", "<i4"]
     assert np.array_equal(arrays["coord"], np.stack([splat[axis] for axis in "xyz"], 1))
     assert np.array_equal(arrays["segment"], splat["class_id"].astype(int) - 1)
     assert np.array_equal(arrays["instance"], splat["instance_id"].astype(int) - 1)
@@ -232,3 +204,56 @@ def test_masks_arrays_and_labels_of_a_cloud(
     assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
     assert "class_id, instance_id, relevancy_0, relevancy_1" in said(capsys)
     assert not (tmp_path / "again").exists()  # refused before anything is written
+
+
+VERSION, NODE = "3.7.0", "22"
+FOLDER = Path(tempfile.gettempdir()) / f"normlift-splat-transform-{VERSION}"
+"""Kept, so that it is downloaded once."""
+
+
+@pytest.fixture(scope="module")
+def converter() -> list[str]:
+    """The words that start @playcanvas/splat-transform from npm. Its version 2.7.1, which older nodes get without a
+    word, hides what version 3 does to signed numbers."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("npm is absent, which brings the converter")
+    package = FOLDER / "node_modules" / "@playcanvas" / "splat-transform" / "package.json"
+    node = FOLDER / "node_modules" / "node" / "bin" / "node"
+    if not (package.is_file() and node.is_file()):
+        FOLDER.mkdir(exist_ok=True)
+        (FOLDER / "package.json").write_text('{"private": true}')
+        install = [npm, "install", "--no-audit", "--no-fund", f"@playcanvas/splat-transform@{VERSION}", f"node@{NODE}"]
+        done = subprocess.run(install, cwd=FOLDER, capture_output=True, text=True, timeout=300, check=False)
+        if done.returncode != 0 or not node.is_file():
+            pytest.skip(f"npm cannot install the converter: {' '.join((done.stderr + done.stdout).split())[-300:]}")
+    assert json.loads(package.read_text())["version"] == VERSION
+    binary = json.loads(package.read_text())["bin"]
+    start = package.parent / (binary if isinstance(binary, str) else binary["splat-transform"])
+    return [str(node), str(start)]
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_the_converter_keeps_what_we_say(mode, converter, lifted: Path, tmp_path: Path) -> None:
+    node = subprocess.run([converter[0], "--version"], capture_output=True, text=True, check=True).stdout
+    assert node.startswith(f"v{NODE}.")
+    run = open_run(lifted)
+    if mode == "antialiased":
+        run.scene.model_config.rasterize_mode = mode  # type: ignore[attr-defined]
+    run.export(tmp_path / "a.ply", answer=run.ask("red", "yellow"))
+    ours = PlyData.read(tmp_path / "a.ply")
+    assert ("SplatRenderMode: mip" in ours.comments) == (mode == "antialiased")
+    words = [*converter, str(tmp_path / "a.ply"), str(tmp_path / "b.ply")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    theirs = PlyData.read(tmp_path / "b.ply")["vertex"]
+    assert theirs.count == ours["vertex"].count
+    order = [np.lexsort([table[name] for name in "xyz"]) for table in (theirs, ours["vertex"])]
+    for name in {p.name for p in ours["vertex"].properties} - {"nx", "ny", "nz"}:
+        found, wanted = (t[name][o].astype(float) for t, o in zip((theirs, ours["vertex"]), order))
+        assert np.allclose(found, wanted, rtol=0 if name.endswith("_id") else 1e-5, atol=1e-5), name
+    kept = [*converter, str(tmp_path / "a.ply"), "--filter-value", "class_id,eq,1", str(tmp_path / "c.ply")]
+    done = subprocess.run(kept, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert PlyData.read(tmp_path / "c.ply")["vertex"].count == int((ours["vertex"]["class_id"] == 1).sum())

@@ -109,6 +109,8 @@ def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhi
             patch.setattr(command, "run_command", begun.append)
             command.entrypoint()
             assert begun == [COMMANDS[name]] * 2, name
+        assert run_entry(monkeypatch, command.entrypoint, "--version") == 0
+        assert capsys.readouterr() == (f"normlift_ns {normlift_ns.__version__}\n", "")
         with monkeypatch.context() as patch:
 
             def interrupted(module: str, begun: list[Any] = begun) -> None:
@@ -120,13 +122,6 @@ def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhi
                 getattr(start, function)()
         assert (stop.value.code, begun[2:]) == (130, [f"normlift_ns.scripts.{function}"])
         assert capsys.readouterr() == ("", "Interrupted.\n")
-
-
-def test_version(monkeypatch, capsys):
-    for function in (place.split(":")[1] for place in SCRIPTS.values()):
-        entrypoint = import_module(f"normlift_ns.scripts.{function}").entrypoint
-        assert run_entry(monkeypatch, entrypoint, "--version") == 0
-        assert capsys.readouterr() == (f"normlift_ns {normlift_ns.__version__}\n", "")
 
 
 def test_a_process_prints_help_of_80_columns_and_its_version():

@@ -1,4 +1,4 @@
-"""ns-normlift-query --objects, and the catalogue of a run."""
+"""ns-normlift-query --objects and --why, honest answers in its table, and ns-normlift-export --part clean."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import Camera, InputError, open_run
-from normlift_ns.objects.catalogue import Similarity, view_shares
+from normlift_ns.objects.catalogue import view_shares
 from normlift_ns.objects.tables import columns
 from normlift_ns.raster.rasterize import render
 from normlift_ns.runs.splats import instances_of
-from normlift_ns.scripts import query
+from normlift_ns.scripts import export, query
 from normlift_ns.scripts.answers.catalogue import show_catalogue
 from normlift_ns.scripts.shared import CONSOLE
 from tests.scripts.conftest import run_entry, said
@@ -54,7 +55,7 @@ def test_places_are_those_of_the_capture(written: Path, lifted: Path, room: Demo
     assert ratio == pytest.approx(np.full(3, transform["scale"] / 0.5))
 
 
-def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None:
+def test_of_many_objects_the_table_has_the_largest_and_breaks_no_number(lifted: Path, monkeypatch, capsys) -> None:
     run = open_run(lifted)
     few = run.catalogue(run.ask("red"))
     many = tuple(replace(few.objects[0], id=i, gaussians=1000 + i) for i in range(1, 43))
@@ -62,15 +63,10 @@ def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None
     shown = said(capsys)
     assert "1,042" in shown and "1,003" in shown and "1,002" not in shown
     assert "2 smaller objects" in shown and "--objects-dir" in shown
-
-
-def test_objects_fit_into_the_terminal_and_no_number_is_broken(lifted: Path, monkeypatch, capsys) -> None:
-    run = open_run(lifted)
-    found = run.catalogue(run.ask("red"))
-    place = found.objects[0].capture
+    place = few.objects[0].capture
     for width in (60, 80, 120):
         monkeypatch.setattr(CONSOLE, "width", width)
-        show_catalogue(found)
+        show_catalogue(few)
         lines = capsys.readouterr().out.splitlines()
         assert max(map(len, lines)) <= width
         words = " ".join(lines).replace("│", " ").split()
@@ -95,9 +91,7 @@ def test_table_boxes_and_document_say_the_same(written: Path) -> None:
         corners = np.stack([mesh["vertex"][axis] for axis in "xyz"], 1).reshape(-1, 8, 3)
         faces = np.stack(mesh["face"]["vertex_indices"])
         assert (len(corners), len(faces)) == (len(table), 6 * len(table))
-        assert mesh["vertex"]["instance_id"].tolist() == [
-            found["id"] for found in document["objects"] for _ in range(8)
-        ]
+        assert mesh["vertex"]["instance_id"].tolist() == np.repeat([x["id"] for x in document["objects"]], 8).tolist()
         for found, eight in zip(document["objects"], corners):
             box = found[place]["box"]
             along = (eight - box["center"]) @ np.array(box["axes"]).T
@@ -140,17 +134,6 @@ def test_views_are_those_that_show_it(lifted: Path) -> None:
             run.catalogue(answer, metres_per_unit=wrong)
 
 
-def test_similarities_undo_what_they_should() -> None:
-    g = np.random.default_rng(0)
-    rotation = np.linalg.qr(g.normal(size=(3, 3)))[0]
-    transform, scale, points = np.column_stack([rotation, g.normal(size=3)]), 3.0, g.normal(size=(9, 3))
-    there = scale * (points @ rotation.T + transform[:, 3])
-    back = Similarity.undoing(transform, scale)
-    assert np.allclose(back.points(there), points)
-    assert np.allclose(back.times(2.0).points(there), 2 * points)
-    assert np.allclose(back.then(back).points(there), back.points(back.points(there)))
-
-
 def test_the_page_explains_every_column() -> None:
     page = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
     explained = set(re.findall(r"`([a-z0-9_]+)`", page))
@@ -163,3 +146,64 @@ def test_a_catalogue_is_not_overwritten_unasked(written: Path, lifted: Path, mon
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     shown = said(capsys)
     assert "objects.json exists" in shown and "--objects-dir" in shown
+
+
+def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    pictures, table = tmp_path / "why", tmp_path / "table.json"
+    flags = ("--load-config", lifted, "--text", "red", "--why", "--why-dir", pictures, "--json", table)
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    shown = said(capsys)
+    assert "C_inter 0.9" in shown
+    (row,) = json.loads(table.read_text())["queries"]
+    why = row["why"]
+    assert why["gaussians"] == round(row["fraction"] * len(open_run(lifted).field))
+    assert sum(view["share"] for view in why["views"]) == pytest.approx(1)
+    names = sorted(path.name for path in pictures.iterdir())
+    heaviest = [Path(view["photograph"]).stem for view in why["views"][:3]]
+    assert names[:3] == [f"0_red_{i}_{stem}.png" for i, stem in enumerate(heaviest, 1)]
+    assert len(names) == 6
+    assert Image.open(pictures / names[0]).size == (160, 120)
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2]) == 1
+    assert "exists" in said(capsys)
+
+
+def test_what_is_not_in_the_scene_is_said(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    flags = ("--load-config", lifted, "--text", "red", "bright magenta", "--json", tmp_path / "x.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    shown = said(capsys)
+    assert "bright magenta: probably not in this scene" in shown
+    assert "red: probably not" not in shown
+    there, absent = json.loads((tmp_path / "x.json").read_text())["queries"]
+    assert (there["stands_out"], absent["stands_out"]) == (True, False)
+    assert absent["histogram"]["top"] < 0.9 < there["histogram"]["top"]
+    assert sum(there["histogram"]["counts"]) == sum(absent["histogram"]["counts"]) > 1000
+    nothing = ("--load-config", lifted, "--text", "bright magenta", "--why")
+    assert run_entry(monkeypatch, query.entrypoint, *nothing, "--threshold", "0.999") == 0
+    assert "bright magenta: nothing is selected" in said(capsys)
+
+
+def test_a_threshold_can_be_suggested(lifted: Path, tmp_path: Path, monkeypatch) -> None:
+    flags = ("--load-config", lifted, "--text", "red", "--threshold", "auto", "--json", tmp_path / "x.json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    document = json.loads((tmp_path / "x.json").read_text())
+    (row,) = document["queries"]
+    assert document["threshold"] == pytest.approx(row["suggested_threshold"])
+    found = open_run(lifted).ask("red", threshold="auto")
+    assert found.question.threshold == pytest.approx(document["threshold"], abs=1e-5)
+    assert found["red"].suggested_threshold == pytest.approx(found.question.threshold)
+    assert row["fraction"] == pytest.approx(found["red"].fraction, abs=1e-3)
+
+
+def test_clean_is_the_scene_without_likely_floaters(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    rows = {}
+    for part in ("scene", "clean"):
+        flags = ("--load-config", lifted, "--output-dir", tmp_path, "--output-filename", f"{part}.ply", "--part", part)
+        assert run_entry(monkeypatch, export.entrypoint, *flags) == 0
+        rows[part] = np.load(tmp_path / f"{part}_rows.npy")
+    mask = open_run(lifted).floaters().mask
+    assert np.array_equal(np.setdiff1d(rows["scene"], rows["clean"]), np.flatnonzero(mask.numpy()))
+    assert 0 < int(mask.sum()) < 0.05 * len(mask)
+    assert f"{int(mask.sum()):,} likely floaters are left out" in said(capsys)
+    limit = ("--floater-limit", "100", "--overwrite")
+    assert run_entry(monkeypatch, export.entrypoint, *flags, *limit) == 0
+    assert np.array_equal(np.load(tmp_path / "clean_rows.npy"), rows["scene"])

@@ -8,15 +8,15 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from tests.captures import SHARED
+from tests.captures import SHARED, needs_shared
+from tests.scripts.conftest import wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -87,33 +87,19 @@ def test_two_and_three_processes_write_the_files_of_one(trained, alone, tmp_path
 
 
 @pytest.mark.extra
-def test_other_options_too(trained, tmp_path):
-    for count in (1, 2):
-        flags = ("--vote", "paper", "--consensus", "False", "--storage", "float16")
+@pytest.mark.parametrize("tabletop", [False, pytest.param(True, marks=needs_shared)])
+def test_other_options_too(tabletop, trained, tmp_path):
+    flags: tuple[str, ...] = ("--vote", "paper", "--consensus", "False", "--storage", "float16")
+    if tabletop:
+        trained, flags = TABLETOP, ("--max-views", "6", "--lift-downscale", "4")
+    for count in (1, 2 + tabletop):
         done = lifted(*words(trained, tmp_path / str(count), count, *flags))
         assert done.returncode == 0, done.stderr
-    check_same([tmp_path / str(count) for count in (1, 2)])
-
-
-@pytest.mark.extra
-@pytest.mark.skipif(
-    not TABLETOP.exists(), reason="the trained captures (folder shared beside the repository) are absent"
-)
-def test_the_tabletop_is_the_same(tmp_path):
-    for count in (1, 3):
-        done = lifted(*words(TABLETOP, tmp_path / str(count), count, "--max-views", "6", "--lift-downscale", "4"))
-        assert done.returncode == 0, done.stderr
-    check_same([tmp_path / str(count) for count in (1, 3)])
+    check_same([tmp_path / str(count) for count in (1, 2 + tabletop)])
 
 
 def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def wait_for(done: Callable[[], bool], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not done() and time.monotonic() < end:
-        time.sleep(0.05)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

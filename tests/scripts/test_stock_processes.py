@@ -1,7 +1,9 @@
-"""nerfstudio's own commands on a lifted run, as a user starts them, on the CPU."""
+"""nerfstudio's own commands on lifted runs, in this process and as a user starts them, on the CPU."""
 
 from __future__ import annotations
 
+import gzip
+import json
 import os
 import shutil
 import signal
@@ -12,22 +14,29 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+from plyfile import PlyData
 
-from normlift_ns import open_scene
+from normlift_ns import open_run, open_scene, render
 from normlift_ns.options import SourceOptions, SplatOptions
+from normlift_ns.runs.question import load_question
 from normlift_ns.scenes.splat import Splat
+from normlift_ns.scripts import query
 from tests.scenes.made import ply_columns, write_ply
-
-pytestmark = pytest.mark.slow
+from tests.scripts.conftest import run_entry
 
 BIN = Path(sys.executable).parent
 ENVIRONMENT = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
 SECONDS = 300
 """Until a command must have done its work; importing nerfstudio takes 20 of them."""
+
+SCALARS = ["selection", "reliability_value", "n_eff", "relevancy_0", "relevancy_1"]
+NAMES = ["overlay", "segmentation", "reliability", *SCALARS]
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +56,7 @@ def stranger(little: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return config
 
 
+@pytest.mark.slow
 def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
     names = ("rgb", "reliability", "relevancy_0")
     flags = ("dataset", "--load-config", stranger, "--output-path", "out", "--image-format", "png", "--split", "test")
@@ -63,6 +73,21 @@ def test_ns_render_draws_reliability_and_relevancy(stranger, tmp_path):
     assert np.abs(rendered - photo).mean() < 3
 
 
+@pytest.mark.slow
+def test_ns_export_and_ns_eval_where_no_run_existed(stranger, ns_export, tmp_path):
+    """In this process."""
+    from nerfstudio.scripts.eval import ComputePSNR  # noqa: PLC0415
+
+    ns_export.ExportGaussianSplat(load_config=stranger, output_dir=tmp_path).main()
+    open_run(stranger).export(tmp_path / "ours.ply")
+    theirs, ours = (PlyData.read(tmp_path / name)["vertex"] for name in ("splat.ply", "ours.ply"))
+    for name in (p.name for p in theirs.properties):
+        assert np.array_equal(theirs[name], ours[name]), name
+    ComputePSNR(stranger, output_path=tmp_path / "eval.json").main()
+    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 25
+
+
+@pytest.mark.slow
 def test_ns_viewer_answers(stranger, tmp_path):
     assert b"<html" in viewer_page(stranger, cwd=tmp_path, log=tmp_path / "log")
 
@@ -100,3 +125,88 @@ def first_page(address: str, viewer: subprocess.Popen[bytes]) -> bytes:
         except (urllib.error.URLError, OSError):
             time.sleep(0.5)
     return b""
+
+
+@pytest.fixture(autouse=True)
+def without_encoders(nerfstudio: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    def never(*args: object) -> None:
+        raise AssertionError("an encoder was made")
+
+    monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.asker.encoder_of", never)
+
+
+def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
+    from nerfstudio.scripts.render import DatasetRender  # noqa: PLC0415
+
+    names = [*NAMES, "raw-relevancy_1", "raw-selection", "depth"]
+    DatasetRender(lifted, output_path=tmp_path, rendered_output_names=names, split="test", image_format="png").main()
+    run = open_run(lifted)
+    answer = run.ask("red", "yellow")  # as stored
+    values = torch.stack([answer.relevancy[:, 1], answer.selected.any(dim=1).float()], dim=1)
+    for name, camera in zip(run.scene.held_out.names, run.scene.held_out.cameras):
+        expected, _ = render(run.scene.gaussians, camera, values)
+        for i, output in enumerate(("raw-relevancy_1", "raw-selection")):
+            with gzip.open(tmp_path / "test" / output / f"{Path(name).stem}.npy.gz") as file:
+                assert np.allclose(np.load(file)[..., 0], expected[..., i].numpy(), atol=1e-5)
+        overlay = np.asarray(Image.open(tmp_path / "test" / "overlay" / f"{Path(name).stem}.png")).astype(int)
+        found = expected[..., 1].numpy() > 0.9
+        assert found.sum() > 50
+        assert (np.ptp(overlay[found], axis=1) > 20).mean() > 0.95  # the least relevant are faint
+        assert (np.ptp(overlay[expected[..., 1].numpy() < 0.01], axis=1) < 8).mean() > 0.99
+    assert {path.name for path in (tmp_path / "test").iterdir()} == set(names)
+
+
+def test_ns_render_draws_every_output(little_lifted: Path, tmp_path: Path) -> None:
+    from nerfstudio.scripts.render import DatasetRender  # noqa: PLC0415
+
+    DatasetRender(little_lifted, output_path=tmp_path, split="test", image_format="png").main()
+    stock = {"gt-rgb", "rgb", "depth", "accumulation", "background"}
+    assert {path.name for path in (tmp_path / "test").iterdir()} == stock | set(NAMES)
+
+
+def test_ns_render_camera_path_and_interpolate(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from nerfstudio.scripts.render import RenderCameraPath, RenderInterpolated  # noqa: PLC0415
+
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)  # for videos only
+    pose = np.vstack([open_scene(lifted).train._poses[0].numpy(), [0, 0, 0, 1]])
+    camera = {"camera_to_world": pose.flatten().tolist(), "fov": 60, "aspect": 1}
+    path = {"camera_type": "perspective", "render_height": 40, "render_width": 60, "camera_path": [camera] * 2}
+    (tmp_path / "path.json").write_text(json.dumps({**path, "seconds": 1, "fps": 2}))
+    options = {"rendered_output_names": ["overlay", "relevancy_0"], "output_format": "images", "image_format": "png"}
+    of_a: Any = {"camera_path_filename": tmp_path / "path.json", "output_path": tmp_path / "a" / "x.mp4", **options}
+    of_b: Any = {"pose_source": "eval", "interpolation_steps": 2, "output_path": tmp_path / "b" / "x.mp4", **options}
+    RenderCameraPath(lifted, **of_a).main()
+    RenderInterpolated(lifted, **of_b).main()
+    for folder, size in (("a", (120, 40)), ("b", (320, 120))):
+        pictures = sorted((tmp_path / folder / "x").iterdir())
+        assert len(pictures) == 2
+        assert Image.open(pictures[0]).size == size
+
+
+def test_ns_eval(lifted: Path, tmp_path: Path) -> None:
+    from nerfstudio.scripts.eval import ComputePSNR  # noqa: PLC0415
+
+    with pytest.warns(UserWarning, match="LPIPS"):
+        ComputePSNR(lifted, output_path=tmp_path / "eval.json", render_output_path=tmp_path / "pictures").main()
+    document = json.loads((tmp_path / "eval.json").read_text())
+    assert document["method_name"] == "normlift" and document["results"]["psnr"] > 25
+    assert (tmp_path / "pictures").exists()
+
+
+def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
+    shutil.copytree(lifted.parent, copy.parent)
+    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save", "True")
+    rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
+    stored = load_question(copy.parent / "normlift")
+    assert stored is not None and stored.texts == ("teal", "pink", "orange")
+    assert (stored.threshold, stored.min_reliability, stored.refined) == (0.7, 0.25, False)
+    before = (copy.parent / "normlift" / "queries.safetensors").read_bytes()
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "oragne") == 1
+    assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 0
+    assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before

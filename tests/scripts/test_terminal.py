@@ -8,11 +8,13 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from normlift_ns.errors import InputError
-from normlift_ns.scripts import lift
+from normlift_ns.scripts import evaluate, export, lift, query, view
+from normlift_ns.scripts.mistyped import plain_errors
 from normlift_ns.scripts.shared import say, say_opening, say_progress
 from normlift_ns.scripts.terminal import Terminal, terminal_flags
 from tests.scripts.conftest import SMALL, run_entry
@@ -90,20 +92,22 @@ def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
 def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_path: Path) -> None:
     import pty  # noqa: PLC0415 (Windows has none)
 
-    master, slave = pty.openpty()
     environment = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "NO_COLOR")}
     environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
     program = "from normlift_ns.scripts.start import lift; lift()"
-    words = [sys.executable, "-c", program, "--load-config", str(tmp_path / ("long-" * 30) / "no.yml")]
-    process = subprocess.Popen(words, stdout=slave, stderr=slave, env=environment)
-    process.wait(60)
-    os.close(slave)
-    shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
-    os.close(master)
-    assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
-    lines = shown.splitlines()
-    assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
-    assert str(tmp_path) in lines[1]  # one line, at the left, however long
+    config = tmp_path / ("long-" * 30) / "no.yml"
+    for flags, fact in ((("--load-config", str(config)), str(config)), (("--k", "many"), "--k cannot be 'many'.")):
+        master, slave = pty.openpty()
+        words = [sys.executable, "-c", program, *flags]
+        subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)
+        os.close(slave)
+        shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
+        os.close(master)
+        assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
+        lines = shown.splitlines()
+        assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
+        assert fact in re.sub(r"\x1b\[[\d;]*m", "", lines[1])  # one line, at the left, however long
+        assert not set("│╭╰") & set(shown)
 
 
 def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys, tmp_path: Path) -> None:
@@ -118,3 +122,60 @@ def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys
     assert "show in no image" in words
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", "True", "--quiet") == 0
     assert capsys.readouterr().out.splitlines() == [shown.splitlines()[-1]]
+
+
+ALL = "All options: command --help"
+CASES = (
+    (lift, "--load-confg x", "Unknown options: --load-confg, x.", "Perhaps you meant: --load-config", ALL),
+    (lift, "--load-config x y", "Unknown options: y.", ALL),
+    (lift, "--load-config", "--load-config needs a value.", ALL),
+    (lift, "--refine perhaps", "--refine cannot be 'perhaps'.", "'True', 'False'", ALL),
+    (lift, "--k many", "--k cannot be 'many'. --k INT: "),
+    (lift, "--beta high", "--beta cannot be 'high'. --beta FLOAT: "),
+    (lift, "--max-views few", "--max-views cannot be 'few'. --max-views {None}|INT: "),
+    (query, "--load-config x --threshold low", "--threshold cannot be 'low'. --threshold"),
+    (export, "--load-config x", "command needs: --output-dir PATH: "),
+    (evaluate, "--studdy x", "Unknown options: --studdy x.", ALL),
+    (view, "", "command needs: --load-config PATH: "),
+)
+
+
+def test_a_mistyped_flag_is_one_line_with_what_to_type(monkeypatch, capsys):
+    for i, (command, words, *facts) in enumerate(CASES):
+        monkeypatch.setenv("COLUMNS", "40" if i % 2 == 0 else "200")
+        assert run_entry(monkeypatch, command.entrypoint, *words.split()) == 1, words
+        shown = capsys.readouterr()
+        title, line = shown.err.splitlines()
+        assert (shown.out, title) == ("", "Error")
+        assert [fact for fact in facts if fact not in line] == [], line
+        assert not set("│╭╰─\\") & set(line)
+
+
+def test_a_warning_meanwhile_is_not_lost_nor_is_help(monkeypatch, capsys) -> None:
+    assert run_entry(monkeypatch, lift.entrypoint, "--help") == 0
+    assert "usage: " in capsys.readouterr().out
+    with plain_errors("command"):
+        print("k is lowered", file=sys.stderr)
+    assert capsys.readouterr().err == "k is lowered\n"
+
+
+def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
+    doors: list[tuple[str, int]] = []
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def door(host: str, port: int) -> SimpleNamespace:
+        doors.append((host, port))
+        return SimpleNamespace(server=SimpleNamespace(port=7010))
+
+    monkeypatch.setattr("normlift_ns.viewer.serving.door.Door", door)
+    monkeypatch.setattr(view, "check_lifted", lambda *_: None)
+    monkeypatch.setattr(view.NormLiftView, "open", interrupted)
+    for host, port in (("127.0.0.1", 7008), ("0.0.0.0", 7010)):
+        view.NormLiftView(Path("config.yml"), host=host, port=port).main()
+    taken, *lines = capsys.readouterr().out.splitlines()
+    assert "7008" in taken and len(lines) == 4
+    assert "http://127.0.0.1:7010" in lines[0] and lines[:2] == lines[2:]
+    assert doors == [("127.0.0.1", 7008), ("0.0.0.0", 7010)]
+    assert view.NormLiftView(Path("config.yml")).host == "127.0.0.1"

@@ -10,8 +10,9 @@ from typing import Any
 from rich.console import Console
 
 from normlift_ns.errors import visible
+from normlift_ns.insight.why import ViewVote, Why
 from normlift_ns.scripts import evaluate, export, lift, query, shared
-from normlift_ns.scripts.answers import prompting
+from normlift_ns.scripts.answers import prompting, reasons
 from tests.scripts.conftest import run_entry
 
 HOSTILE = [
@@ -58,19 +59,16 @@ def printed(content: Any, **options: Any) -> str:
 
 def test_hostile_texts_are_shown_as_they_are():
     """Also on a console that would interpret markup, in colours."""
+    for name, table in TABLES.items():
+        for text in (":smile: [/red]", "\x1b[31m[bold]red"):
+            shown = printed(table(text))
+            assert visible(text) in shown and "\x1b[31m" not in shown, name
     for text in HOSTILE:
         for options in ({}, {"markup": False, "emoji": False, "highlight": False}):
             shown = printed(shared.plain(text), **options)
             assert visible(text) in shown, text
             assert not [x for x in ("\x1b]", "\x1b[31m", "\x07", "\r", "\u202e", "\x9b") if x in shown], text
             shown.encode("utf8")
-
-
-def test_every_table_shows_texts_as_they_are():
-    for name, table in TABLES.items():
-        for text in (":smile: [/red]", "\x1b[31m[bold]red"):
-            shown = printed(table(text))
-            assert visible(text) in shown and "\x1b[31m" not in shown, name
 
 
 def test_lines_are_texts_too(capsys):
@@ -80,10 +78,7 @@ def test_lines_are_texts_too(capsys):
         shown = capsys.readouterr()
         assert shown.out == f"Written: {visible(text)}/{'long/' * 60}end\n"
         assert shown.err == f"{visible(text)} does not exist\n"
-
-
-def test_the_consoles_of_commands_interpret_nothing(capsys):
-    for text in HOSTILE[:5]:
+    for text in HOSTILE[:5]:  # nor does the console interpret anything
         shared.CONSOLE.rule(text)
         shared.CONSOLE.print(text)
         shared.ERRORS.print(text)
@@ -109,12 +104,17 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     assert all(visible(text) in shown for text in texts)
 
 
-def test_an_answer_fits_into_the_terminal_with_all_its_numbers():
+def test_answers_and_reasons_fit_into_the_terminal_with_all_their_numbers():
     row = {"text": "tomato red", **NUMBERS, "centroid": [-0.18, 0.25, -0.45], "extent": [0.26, 0.27, 0.1]}
+    votes = tuple(ViewVote(i, 13_320.0, 0.088, 0.994 - i, 0.21, ()) for i in range(2))
+    why, names = Why(606, 60, 1.0, 1.0, 1.0, 16.6, 0.9, votes), ["images/0012.png", "images/0017.png"]
     for width in (60, 80, 120):
-        file = io.StringIO()
-        Console(file=file, width=width).print(prompting.table([row], "cosine > 0.5", 0.5, narrow=width < 100))
-        shown = file.getvalue()
-        assert max(map(len, shown.splitlines())) <= width
-        assert "…" not in shown
-        assert all(number in shown for number in ("-0.18", "0.25", "-0.45", "0.26", "0.27", "0.10"))
+        for table, numbers in (
+            (prompting.table([row], "cosine > 0.5", 0.5, narrow=width < 100), "-0.18 0.25 -0.45 0.26 0.27 0.10"),
+            (reasons.table(names, ["tomato red"], [why], narrow=width < 120), "8.8% 0.994 -0.006 21%"),
+        ):
+            Console(file=(file := io.StringIO()), width=width).print(table)
+            shown = file.getvalue()
+            assert max(map(len, shown.splitlines())) <= width and "…" not in shown
+            assert all(number in shown for number in numbers.split())
+        assert (width < 120) == ("13,320" not in shown)
