@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.own_viewer import Own
 from tests.browser.person import chromium
 from tests.browser.server import OWN, STOCK, Server, copied, faults
-from tests.browser.viewer import Tab
+from tests.browser.viewer import Own, Tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

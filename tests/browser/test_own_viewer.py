@@ -10,9 +10,9 @@ import pytest
 from plyfile import PlyData
 
 from normlift_ns.runs.question import load_question
-from tests.browser.own_viewer import Own
 from tests.browser.person import ARMED, RED, YELLOW, changed, coloured, covers, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
+from tests.browser.viewer import Own
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

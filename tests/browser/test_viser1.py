@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.own_viewer import Own, own_viewer
 from tests.browser.person import ARMED, RED, YELLOW, covers, hue_mask, middle, needs_chromium
 from tests.browser.server import copied
+from tests.browser.viewer import Own, own_viewer
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
