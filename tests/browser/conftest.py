@@ -36,33 +36,28 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def stock_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    yield from served(STOCK, lifted, tmp_path_factory.mktemp("stock"))
-
-
-@pytest.fixture(scope="session")
-def own_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    yield from served(OWN, lifted, tmp_path_factory.mktemp("own"))
-
-
-def served(program: str, config: Path, folder: Path) -> Iterator[Server]:
-    """A server of a copy of a run, which has printed no traceback in the end."""
-    server = Server(program, copied(config, folder), folder / "viewer.log", cwd=folder)
-    yield server
-    server.stop()
-    assert faults(server.said()) == []
+def servers(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Server]]:
+    """Servers of copies of a run, which have printed no traceback in the end."""
+    made = {}
+    for program in (STOCK, OWN):
+        folder = tmp_path_factory.mktemp("viewer")
+        made[program] = Server(program, copied(lifted, folder), folder / "viewer.log", cwd=folder)
+    yield made
+    for server in made.values():
+        server.stop()
+        assert faults(server.said()) == []
 
 
 @pytest.fixture
-def stock(stock_server: Server) -> Iterator[Server]:
+def stock(servers: dict[str, Server]) -> Iterator[Server]:
     """nerfstudio's viewer before a lifted room that stores the queries red and yellow."""
-    yield from as_stored(stock_server)
+    yield from as_stored(servers[STOCK])
 
 
 @pytest.fixture
-def own(own_server: Server) -> Iterator[Server]:
+def own(servers: dict[str, Server]) -> Iterator[Server]:
     """Our own viewer before the same room."""
-    yield from as_stored(own_server)
+    yield from as_stored(servers[OWN])
 
 
 def as_stored(server: Server) -> Iterator[Server]:

@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData
 
 from benchmarks.captures import SHARED
-from tests.browser.person import middle, needs_chromium
+from tests.browser.person import needs_chromium
 from tests.browser.server import STOCK, Server
 from tests.browser.viewer import Tab, overlaid
 from tests.captures import needs_shared
@@ -59,16 +59,6 @@ def test_a_person_finds_the_fox(fox: Path, tmp_path: Path, browser: Browser, pic
         tab.choose("Prompt shown", "2: crimson")
         tab.sees(lambda seen: (overlaid(seen) & orange).sum() < 0.05 * orange.sum(), "the fox is not crimson")
 
-        x, y = map(int, middle(orange))
-        tab.arm("More like this")
-        tab.click((x, y))
-        tab.until(lambda: tab.typed("Prompts") == "like click 1" and tab.selected() > 0, "clicked")
-        tab.sees(lambda seen: overlaid(seen)[y - 2 : y + 3, x - 2 : x + 3].mean() > 0.5, "it is drawn")
-        tab.press("Only")
-        tab.show("rgb")
-        background = (38, 42, 55)
-        tab.sees(lambda seen: (np.abs(seen.astype(int) - background).max(axis=2) < 12).mean() > 0.4, "alone")
-        tab.page.screenshot(path=pictures / "fox_alone.png")
         vertices = PlyData.read(tab.save("Download selection", tmp_path))["vertex"]
         assert 0 < vertices.count <= tab.selected()
         tab.leave()

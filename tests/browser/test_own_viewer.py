@@ -12,7 +12,7 @@ from plyfile import PlyData
 from normlift_ns.runs.question import load_question
 from tests.browser.person import ARMED, RED, YELLOW, changed, coloured, covers, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
-from tests.browser.viewer import Own
+from tests.browser.viewer import Own, Tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -165,14 +165,16 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(
     four.leave()
 
 
-def test_a_phone(own: Server, browser: Browser, pictures: Path) -> None:
-    phone = Own(browser, own.address, (390, 700))
-    phone.ask("red, sky blue")
-    phone.selects(lambda count: count > 0, "an answer")
-    phone.until(lambda: phone.images("svg") == 2, "histograms")
-    phone.page.screenshot(path=pictures / "view_phone.png")
-    phone.fits("Ask", "Cancel", "Select")
-    phone.leave()
+def test_a_phone(own: Server, stock: Server, browser: Browser, pictures: Path) -> None:
+    buttons = ("Ask", "Undo", "Clear", "Hide", "Why?", "Download selection")
+    for server, kind, fits in ((own, Own, ("Ask", "Cancel", "Select")), (stock, Tab, buttons)):
+        phone = kind(browser, server.address, (390, 700))
+        phone.ask("red, sky blue")
+        phone.selects(lambda count: count > 0, "an answer")
+        phone.until(lambda phone=phone: phone.images("svg") == 2, "histograms")
+        phone.page.screenshot(path=pictures / f"{kind.__name__}_phone.png")
+        phone.fits(*fits)
+        phone.leave()
 
 
 def test_a_browser_without_webgl_gets_pictures_from_the_server(
@@ -206,20 +208,13 @@ def test_a_browser_without_webgl_gets_pictures_from_the_server(
 def test_held_keys_add_and_take_away(page: Own, pictures: Path) -> None:
     _, red, yellow = red_and_yellow(page)
 
-    def click_holding(key: str, mask: np.ndarray) -> None:
-        page.page.keyboard.down(key)
-        page.says(ARMED)
-        page.click(middle(mask))
-        page.page.keyboard.up(key)
-        page.until(lambda: ARMED not in page.text(), "released")
-
-    click_holding("Shift", red)
+    page.click_holding("Shift", middle(red))
     ball = page.selects(lambda count: count > 0, "the ball")
-    click_holding("Shift", yellow)
+    page.click_holding("Shift", middle(yellow))
     both = page.selects(lambda count: count > ball, "both")
     page.sees(lambda seen: covers(seen, red | yellow), "an overlay of both")
     page.page.screenshot(path=pictures / "view_shift.png")
-    click_holding("Alt", red)
+    page.click_holding("Alt", middle(red))
     page.selects(lambda count: count == both - ball, "the ball is taken away")
     page.click(middle(red))  # does nothing, or there would be one more to undo
     for keys, count in (("Control+z", both), ("Control+Shift+z", both - ball)):

@@ -193,16 +193,6 @@ def test_two_tabs_and_everything_at_once(tab: Tab, stock: Server, browser: Brows
     other.leave()
 
 
-def test_a_phone(stock: Server, browser: Browser, pictures: Path) -> None:
-    phone = Tab(browser, stock.address, size=(390, 700))
-    phone.fresh()
-    phone.asks("red, sky blue", answered=2)
-    phone.until(lambda: phone.images("svg") == 2, "histograms")
-    phone.page.screenshot(path=pictures / "panel_phone.png")
-    phone.fits("Ask", "Undo", "Clear", "Hide", "Why?", "Download selection")
-    phone.leave()
-
-
 def test_a_page_outlives_its_server_and_a_saved_click_is_asked_again(tab: Tab, stock: Server, pictures: Path) -> None:
     yellow = things_in(tab)["yellow"]
     tab.arm("More like this")

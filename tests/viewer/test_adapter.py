@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import socket
-import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -19,6 +18,7 @@ import pytest
 from websockets.sync.client import ClientConnection
 
 from normlift_ns.viewer.adapter import Page, Server, pass_over_the_gone
+from tests.viewer.scenes import free_port, until
 from tests.viewer.wire import ONE, messages, opened
 
 pytestmark = pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
@@ -32,19 +32,9 @@ def pages() -> list[Page]:
 
 @pytest.fixture(scope="module")
 def server(pages: list[Page]) -> Iterator[Server]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = Server("127.0.0.1", port, "label", pages.append, lambda _: None)
+    server = Server("127.0.0.1", free_port(), "label", pages.append, lambda _: None)
     yield server
     server.stop()
-
-
-def until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 @contextmanager
