@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,16 +15,6 @@ from tests.browser.viewer import Own, Tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
-
-
-@pytest.fixture(scope="session")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder for screenshots; NORMLIFT_SCREENSHOTS names one that is kept."""
-    kept = os.environ.get("NORMLIFT_SCREENSHOTS")
-    folder = tmp_path_factory.mktemp("screenshots") if kept is None else Path(kept)
-    folder.mkdir(parents=True, exist_ok=True)
-    print(f"screenshots in {folder}")
-    return folder
 
 
 @pytest.fixture(scope="session")
@@ -82,6 +71,5 @@ def tab(stock: Server, browser: Browser) -> Iterator[Tab]:
 @pytest.fixture
 def page(own: Server, browser: Browser) -> Iterator[Own]:
     """A fresh tab before our own viewer."""
-    page = Own(browser, own.address)
-    yield page
+    yield (page := Own(browser, own.address))
     page.leave()

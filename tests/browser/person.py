@@ -146,7 +146,9 @@ class Person:
         self.button("Ask").wait_for()
 
     def leave(self) -> None:
-        """Closes the tab, in which nothing has gone wrong."""
+        """Closes the tab, in which nothing has gone wrong. NORMLIFT_SCREENSHOTS names a folder for its last picture."""
+        if "NORMLIFT_SCREENSHOTS" in os.environ:
+            self.page.screenshot(path=Path(os.environ["NORMLIFT_SCREENSHOTS"]) / f"{time.time_ns()}.png")
         self.context.close()
         assert self.problems == []
 

@@ -77,18 +77,16 @@ class Tab(Person):
                 self.page.get_by_role("option", name=option, exact=True).click()
 
     def tab(self, name: str) -> None:
-        """Opens one of the viewer's tabs."""
         self.page.get_by_role("tab", name=name, exact=True).click()
 
     def output(self) -> str:
-        """The output that is shown; the tab Search is open afterwards."""
+        """The output that is shown; as after `show`, the tab Search is open afterwards."""
         self.tab("Control")
         found = self.typed("Output type")
         self.tab("Search")
         return found
 
     def show(self, output: str) -> None:
-        """Chooses the output; the tab Search is open afterwards."""
         self.tab("Control")
         self.choose("Output type", output)
         self.tab("Search")

@@ -7,7 +7,6 @@ import socket
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import Any
@@ -182,9 +181,8 @@ def test_what_a_closed_page_asked_is_passed_over_and_all_else_is_told():
     assert heard == 2 * [4, 5, 5, 5, 5, 5]
 
 
-def test_nobody_can_publish_the_server_and_the_version_is_known(server):
+def test_nobody_can_publish_the_server(server):
     from viser import _messages  # noqa: PLC0415
 
     handlers = server._server._websock_server._incoming_handlers
     assert not handlers.get(_messages.ShareUrlRequest)
-    assert version("viser").split(".")[0] == "1" or version("viser").split(".")[:2] == ["0", "2"]

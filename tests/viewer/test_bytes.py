@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from websockets.sync.client import connect
@@ -19,18 +18,14 @@ MOST_REST = 8_000
 """Bytes of widgets and headers, less than one per Gaussian."""
 
 
-def served(side: int, folder: Path) -> Door:
-    door, people = Door("127.0.0.1", free_port()), People(run_of(folder, cubes(side)))
-    door.open("", people.come, people.go)
-    return door
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
 def test_an_answer_costs_32_bytes_per_drawn_gaussian(tmp_path):
     from benchmarks.view import Client  # noqa: PLC0415
 
-    door, rests, block = served(14, tmp_path), [], 14**3
+    rests, block = [], 14**3
+    door, people = Door("127.0.0.1", free_port()), People(run_of(tmp_path, cubes(14)))
+    door.open("", people.come, people.go)
     try:
         with connect(f"ws://127.0.0.1:{door.server.port}", max_size=None) as line:
             client = Client(line)
