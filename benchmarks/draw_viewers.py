@@ -14,9 +14,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from benchmarks.plots import DOCS
-from tests.browser.own_viewer import Own, own_viewer
 from tests.browser.person import PANEL, chromium, coloured
-from tests.browser.viewer import TITLE, Tab, ns_viewer
+from tests.browser.viewer import TITLE, Own, Tab, ns_viewer, own_viewer
 
 CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
 OWN, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,23 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.own_viewer import Own
 from tests.browser.person import chromium
 from tests.browser.server import OWN, STOCK, Server, copied, faults
-from tests.browser.viewer import Tab
+from tests.browser.viewer import Own, Tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
-
-
-@pytest.fixture(scope="session")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder for screenshots; NORMLIFT_SCREENSHOTS names one that is kept."""
-    kept = os.environ.get("NORMLIFT_SCREENSHOTS")
-    folder = tmp_path_factory.mktemp("screenshots") if kept is None else Path(kept)
-    folder.mkdir(parents=True, exist_ok=True)
-    print(f"screenshots in {folder}")
-    return folder
 
 
 @pytest.fixture(scope="session")
@@ -37,33 +25,28 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def stock_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    yield from served(STOCK, lifted, tmp_path_factory.mktemp("stock"))
-
-
-@pytest.fixture(scope="session")
-def own_server(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    yield from served(OWN, lifted, tmp_path_factory.mktemp("own"))
-
-
-def served(program: str, config: Path, folder: Path) -> Iterator[Server]:
-    """A server of a copy of a run, which has printed no traceback in the end."""
-    server = Server(program, copied(config, folder), folder / "viewer.log", cwd=folder)
-    yield server
-    server.stop()
-    assert faults(server.said()) == []
+def servers(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Server]]:
+    """Servers of copies of a run, which have printed no traceback in the end."""
+    made = {}
+    for program in (STOCK, OWN):
+        folder = tmp_path_factory.mktemp("viewer")
+        made[program] = Server(program, copied(lifted, folder), folder / "viewer.log", cwd=folder)
+    yield made
+    for server in made.values():
+        server.stop()
+        assert faults(server.said()) == []
 
 
 @pytest.fixture
-def stock(stock_server: Server) -> Iterator[Server]:
+def stock(servers: dict[str, Server]) -> Iterator[Server]:
     """nerfstudio's viewer before a lifted room that stores the queries red and yellow."""
-    yield from as_stored(stock_server)
+    yield from as_stored(servers[STOCK])
 
 
 @pytest.fixture
-def own(own_server: Server) -> Iterator[Server]:
+def own(servers: dict[str, Server]) -> Iterator[Server]:
     """Our own viewer before the same room."""
-    yield from as_stored(own_server)
+    yield from as_stored(servers[OWN])
 
 
 def as_stored(server: Server) -> Iterator[Server]:
@@ -88,6 +71,5 @@ def tab(stock: Server, browser: Browser) -> Iterator[Tab]:
 @pytest.fixture
 def page(own: Server, browser: Browser) -> Iterator[Own]:
     """A fresh tab before our own viewer."""
-    page = Own(browser, own.address)
-    yield page
+    yield (page := Own(browser, own.address))
     page.leave()

@@ -146,7 +146,9 @@ class Person:
         self.button("Ask").wait_for()
 
     def leave(self) -> None:
-        """Closes the tab, in which nothing has gone wrong."""
+        """Closes the tab, in which nothing has gone wrong. NORMLIFT_SCREENSHOTS names a folder for its last picture."""
+        if "NORMLIFT_SCREENSHOTS" in os.environ:
+            self.page.screenshot(path=Path(os.environ["NORMLIFT_SCREENSHOTS"]) / f"{time.time_ns()}.png")
         self.context.close()
         assert self.problems == []
 
@@ -255,6 +257,13 @@ class Person:
         """Clicks on the picture, pixels from its upper left corner."""
         self.page.mouse.click(place[0], self.top + place[1])
 
+    def click_holding(self, key: str, place: tuple[float, float]) -> None:
+        self.page.keyboard.down(key)
+        self.says(ARMED)
+        self.click(place)
+        self.page.keyboard.up(key)
+        self.until(lambda: ARMED not in self.text(), "released")
+
     def drag(self, x: float, y: float, button: Any = "left") -> None:
         """Drags from the middle of the picture: turns the camera, with the right button moves it."""
         middle = ((self.size[0] - PANEL) / 2, (self.top + self.size[1]) / 2)
@@ -273,17 +282,11 @@ class Person:
 
 def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:
     """Pixels of a hue, strongly coloured; without the axes in the lower left corner."""
-    rgb = picture.astype(float) / 255
-    high, low = rgb.max(axis=2), rgb.min(axis=2)
-    spread = np.maximum(high - low, 1e-6)
-    red, green, blue = np.moveaxis(rgb, 2, 0)
-    turn = np.where(
-        high == red,
-        (green - blue) / spread % 6,
-        np.where(high == green, (blue - red) / spread + 2, 4 + (red - green) / spread),
-    )
-    near = np.abs((turn / 6 - hue + 0.5) % 1 - 0.5) < 0.04
-    return without_axes(near & (spread / np.maximum(high, 1e-6) > saturation) & (high > 0.25))
+    from matplotlib.colors import rgb_to_hsv  # noqa: PLC0415
+
+    turn, strong, bright = np.moveaxis(rgb_to_hsv(picture / 255), 2, 0)
+    near = np.abs((turn - hue + 0.5) % 1 - 0.5) < 0.04
+    return without_axes(near & (strong > saturation) & (bright > 0.25))
 
 
 def coloured(picture: np.ndarray) -> np.ndarray:

@@ -10,9 +10,9 @@ import pytest
 from plyfile import PlyData
 
 from normlift_ns.runs.question import load_question
-from tests.browser.own_viewer import Own
 from tests.browser.person import ARMED, RED, YELLOW, changed, coloured, covers, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
+from tests.browser.viewer import Own, Tab
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -26,13 +26,12 @@ def red_and_yellow(page: Own) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return photo, hue_mask(photo, *RED), hue_mask(photo, *YELLOW)
 
 
-def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictures: Path, tmp_path: Path) -> None:
+def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, tmp_path: Path) -> None:
     _, red, yellow = red_and_yellow(page)
     page.ask("red, zebra; yellow", key=True)
     both = page.selects(lambda count: count > 0, "an answer")
     page.says(r"⚠\s+zebra")
     overlay = page.sees(lambda seen: covers(seen, red | yellow), "an overlay of both")
-    page.page.screenshot(path=pictures / "view_asked.png")
     page.type("Threshold", "0.97")
     page.selects(lambda count: count < both, "a higher threshold selects less")
     page.press("Undo")
@@ -62,20 +61,12 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictur
     page.says("yellow object 1")
     page.press("Hide")
     page.sees(lambda seen: coloured(seen)[red | yellow].mean() < 0.05, "both stay hidden")
-    page.page.screenshot(path=pictures / "view_hidden.png")
     for _ in range(3):
         page.press("Undo")
     page.selects(lambda count: count == ball, "hides undone")
 
     page.page.get_by_text("Box", exact=True).click()
-    bare = page.sees(lambda seen: coloured(seen)[yellow].mean() < 0.05, "only the ball is coloured")
     page.press("Around")
-
-    def outlined(seen: np.ndarray) -> bool:
-        line = np.abs(seen.astype(int) - bare).max(axis=2) > 60
-        return 200 < line.sum() < 0.1 * line.size and bool((np.diff(seen[line].mean(axis=0)) < -30).all())  # orange
-
-    page.sees(outlined, "the outline of the box")
     page.press("Outside")
     page.selects(lambda count: count == 0, "cut")
     page.press("None")
@@ -85,37 +76,16 @@ def test_a_person_asks_hides_clicks_and_downloads(page: Own, own: Server, pictur
     page.until(lambda: page.images("svg") == 2, "two histograms")
     page.press("Why?")
     page.until(lambda: page.images("jpeg") >= 3, "photographs")
-    page.press("Go to nearest: maroon")
-    page.sees(lambda seen: changed(seen, overlay) > 3, "the camera is there")
-    page.press("Select likely floaters")
-    page.until(lambda: page.images("jpeg") == 0, "the reasons of another selection are gone")
-    page.selects(lambda count: count > 0, "floaters")
-    page.page.screenshot(path=pictures / "view_floaters.png")
     page.ask("red, yellow")
     page.says("red object 1")
     page.press("go to")
-    near = page.sees(lambda seen: changed(seen, overlay) > 3, "the camera has moved")
-    page.page.screenshot(path=pictures / "view_go_to.png")
+    page.sees(lambda seen: changed(seen, overlay) > 3, "the camera has moved")
     file = page.save("export", tmp_path)
     vertices = PlyData.read(file)["vertex"]
-    colours = np.stack([vertices[f"f_dc_{i}"] for i in range(3)], axis=1).mean(axis=0) * 0.2821 + 0.5
-    assert (file.name, 50 < vertices.count <= both) == ("red_1.ply", True)
-    assert colours[0] > 0.5 > max(colours[1:]) + 0.2
-
-    page.arm("More like this")
-    page.click(middle(coloured(near)))
-    page.until(lambda: page.typed("Prompts") == "like click 1" and page.text().count("■") >= 1, "asked by a click")
-    page.press("Save prompts in run")
-    page.says(r"3 prompts")
-    question = load_question(own.config.parent / "normlift")
-    assert question is not None and question.texts == ("red", "yellow", "like click 1")
-    page.ask("like click 1, red")
-    page.until(lambda: page.text().count("■") >= 2, "the click is asked again")
+    assert file.name == "red_1.ply" and 50 < vertices.count <= both
 
 
-def test_browsers_have_their_own_questions_and_outlive_the_server(
-    own: Server, browser: Browser, pictures: Path
-) -> None:
+def test_browsers_have_their_own_questions_and_outlive_the_server(own: Server, browser: Browser) -> None:
     one, two = Own(browser, own.address), Own(browser, own.address)
     one.ask("red")
     two.ask("yellow, teal")
@@ -140,6 +110,8 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(
     alike = two.selected()
     two.press("Save prompts in run")
     two.says("3 prompts")
+    question = load_question(own.config.parent / "normlift")
+    assert question is not None and question.texts == ("red", "yellow", "like click 1")
     two.leave()
 
     one.press("Link")
@@ -150,7 +122,6 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(
     three = Own(browser, link)
     three.selects(lambda count: count == red, "the link asks its question")
     three.sees(lambda seen: changed(seen, before) < 6, "from its camera")
-    three.page.screenshot(path=pictures / "view_link.png")
 
     own.start("--share-readonly", "True")
     three.until(lambda: three.button("Save prompts in run").count() == 0, "the page finds the new server")
@@ -165,19 +136,20 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(
     four.leave()
 
 
-def test_a_phone(own: Server, browser: Browser, pictures: Path) -> None:
-    phone = Own(browser, own.address, (390, 700))
-    phone.ask("red, sky blue")
-    phone.selects(lambda count: count > 0, "an answer")
-    phone.until(lambda: phone.images("svg") == 2, "histograms")
-    phone.page.screenshot(path=pictures / "view_phone.png")
-    phone.fits("Ask", "Cancel", "Select")
-    phone.leave()
+def test_a_phone(own: Server, stock: Server, browser: Browser) -> None:
+    buttons = ("Ask", "Undo", "Clear", "Hide", "Why?", "Download selection")
+    for server, kind, fits in ((own, Own, ("Ask", "Cancel", "Select")), (stock, Tab, buttons)):
+        phone = kind(browser, server.address, (390, 700))
+        if isinstance(phone, Tab):
+            phone.fresh()
+        phone.ask("red, sky blue")
+        phone.selects(lambda count: count > 0, "an answer")
+        phone.until(lambda phone=phone: phone.images("svg") == 2, "histograms")
+        phone.fits(*fits)
+        phone.leave()
 
 
-def test_a_browser_without_webgl_gets_pictures_from_the_server(
-    page: Own, own: Server, browser: Browser, pictures: Path
-) -> None:
+def test_a_browser_without_webgl_gets_pictures_from_the_server(page: Own, own: Server, browser: Browser) -> None:
     _, *drawn = red_and_yellow(page)
     assert page.page.locator("#normlift_still").count() == 0
     blind = Own(browser, own.address, webgl=False)
@@ -188,7 +160,6 @@ def test_a_browser_without_webgl_gets_pictures_from_the_server(
         return all(iou(mask, hue_mask(seen, *rule)) > 0.8 for mask, rule in zip(drawn, (RED, YELLOW)))
 
     photo = blind.sees(as_drawn, "what the browser draws")
-    blind.page.screenshot(path=pictures / "view_without_webgl.png")
     red, yellow = hue_mask(photo, *RED), hue_mask(photo, *YELLOW)
     blind.ask("red", key=True)
     blind.sees(lambda seen: covers(seen, red), "an overlay")
@@ -199,42 +170,27 @@ def test_a_browser_without_webgl_gets_pictures_from_the_server(
     before = blind.sees(lambda seen: hue_mask(seen, *YELLOW).sum() < 50, "hidden")
     blind.drag(80, 20)
     blind.sees(lambda seen: changed(seen, before) > 3, "the camera has turned")
-    blind.page.screenshot(path=pictures / "view_without_webgl_turned.png")
     blind.leave()
 
 
-def test_held_keys_add_and_take_away(page: Own, pictures: Path) -> None:
+def test_held_keys_add_and_take_away(page: Own) -> None:
     _, red, yellow = red_and_yellow(page)
 
-    def click_holding(key: str, mask: np.ndarray) -> None:
-        page.page.keyboard.down(key)
-        page.says(ARMED)
-        page.click(middle(mask))
-        page.page.keyboard.up(key)
-        page.until(lambda: ARMED not in page.text(), "released")
-
-    click_holding("Shift", red)
+    page.click_holding("Shift", middle(red))
     ball = page.selects(lambda count: count > 0, "the ball")
-    click_holding("Shift", yellow)
+    page.click_holding("Shift", middle(yellow))
     both = page.selects(lambda count: count > ball, "both")
     page.sees(lambda seen: covers(seen, red | yellow), "an overlay of both")
-    page.page.screenshot(path=pictures / "view_shift.png")
-    click_holding("Alt", red)
+    page.click_holding("Alt", middle(red))
     page.selects(lambda count: count == both - ball, "the ball is taken away")
     page.click(middle(red))  # does nothing, or there would be one more to undo
     for keys, count in (("Control+z", both), ("Control+Shift+z", both - ball)):
         page.page.keyboard.press(keys)
         page.selects(lambda found, count=count: found == count, keys)
-    page.until(lambda: '"held":""' in page.page.evaluate(SESSION), "Shift is released")
+    session = page.page.locator('xpath=//label[text()="Session"]/ancestor::*[.//input][1]//input').first
+    page.until(lambda: '"held":""' in session.input_value(), "Shift is released")
     page.field("Prompts").press_sequentially("RED", delay=50)
     page.page.keyboard.down("Shift")  # within a text it holds nothing
-    assert '"held":""' in page.page.evaluate(SESSION)
+    page.page.evaluate("new Promise(setTimeout)")  # after what waits for a moment
+    assert '"held":""' in session.input_value()
     page.page.keyboard.up("Shift")
-
-
-SESSION = """() => new Promise((done) => setTimeout(() => {
-  let row = [...document.querySelectorAll("label")].find((label) => label.textContent === "Session");
-  while (!row.querySelector("input")) row = row.parentElement;
-  done(row.querySelector("input").value);
-}))"""
-"""What the page has told the server of itself, after what waits for a moment."""

@@ -1,17 +1,18 @@
-"""ns-viewer in a process of its own, and a person before it."""
+"""Both viewers in processes of their own, and a person before each."""
 
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tests.browser.person import COARSE, Person, coloured
-from tests.browser.server import STOCK, Server
+from tests.browser.person import Person, coloured
+from tests.browser.server import OWN, STOCK, Server
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -29,16 +30,34 @@ def ns_viewer(config: Path, log: Path, *, cwd: Path) -> Iterator[str]:
         yield address
 
 
+@contextmanager
+def own_viewer(config: Path, log: Path, *flags: str, python: Path | str = sys.executable) -> Iterator[str]:
+    """The same for ns-normlift-view."""
+    with Server(OWN, config, log, python=python).running(*flags) as address:
+        yield address
+
+
+class Own(Person):
+    """A browser tab with our own viewer in it, where every tab has a panel of its own."""
+
+    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (960, 480), **how: Any) -> None:
+        super().__init__(browser, address, size, **how)
+        self.ready()
+
+    def ready(self) -> None:
+        """Waits until the page has the prompts that the run stores, or those that it had before."""
+        self.button("Ask").wait_for()
+        self.until(lambda: self.typed("Prompts"), "greeted")
+
+
 class Tab(Person):
     """A browser tab with nerfstudio's viewer in it, whose panel all tabs share."""
 
     top = TITLE
     drawn = r"\b512(x\d+)?px"
 
-    def __init__(
-        self, browser: Browser, address: str, *, size: tuple[int, int] = (1300, 1000), sharpness: float = COARSE
-    ) -> None:
-        super().__init__(browser, address, size, sharpness=sharpness)
+    def __init__(self, browser: Browser, address: str, size: tuple[int, int] = (1300, 1000), **how: Any) -> None:
+        super().__init__(browser, address, size, **how)
 
     def fresh(self) -> None:
         """Takes back what was done before in any tab, but for what is stored."""
@@ -58,18 +77,16 @@ class Tab(Person):
                 self.page.get_by_role("option", name=option, exact=True).click()
 
     def tab(self, name: str) -> None:
-        """Opens one of the viewer's tabs."""
         self.page.get_by_role("tab", name=name, exact=True).click()
 
     def output(self) -> str:
-        """The output that is shown; the tab Search is open afterwards."""
+        """The output that is shown; as after `show`, the tab Search is open afterwards."""
         self.tab("Control")
         found = self.typed("Output type")
         self.tab("Search")
         return found
 
     def show(self, output: str) -> None:
-        """Chooses the output; the tab Search is open afterwards."""
         self.tab("Control")
         self.choose("Output type", output)
         self.tab("Search")

@@ -38,24 +38,6 @@ def test_every_valid_gaussian_is_in_one_bin(values, threshold, seed):
     assert (len(line), line.count("|")) == (BINS // 2 + 1, 1)
 
 
-@examples(15)
-@given(values=VALUES, scale=st.floats(0.01, 100), shift=st.floats(-5, 5))
-def test_the_suggestion_has_no_unit(values, scale, shift):
-    valid = np.ones(len(values), bool)
-    plain, moved = (suggested_threshold(x[:, None], valid) for x in (values.astype(float), scale * values + shift))
-    assert moved == pytest.approx(scale * plain + shift, abs=1e-4 * (1 + scale))
-
-
-def test_a_suggestion_selects_something_where_a_fixed_number_selects_nothing():
-    """Cosines as CLIP has them: an object of 2 % at 0.33, all else at 0.24."""
-    g = np.random.default_rng(0)
-    truth = g.random(20_000) < 0.02
-    cosine = np.where(truth, 0.33, 0.24) + 0.01 * g.standard_normal(20_000)
-    assert not (cosine > 0.5).any()
-    chosen = cosine > suggested_threshold(cosine[:, None], np.ones(20_000, bool))
-    assert (chosen & truth).sum() / (chosen | truth).sum() > 0.95
-
-
 def asked(encoder: str | None, **how) -> Question:
     lifted, means, source = example(0)
     field = SemanticField.build(lifted, means, source, provenance={"encoder": {"encoder": encoder}})

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,3 +48,17 @@ def run_of(folder: Path, space: Space, scene: Any = None) -> Run:
     scene = scene_of(spheres(space.means, 0.3), cameras=(camera(),)) if scene is None else scene
     (folder / FIELD_FOLDER).mkdir(exist_ok=True)
     return Run(folder, scene, space, make_records(scene), lambda: SimpleNamespace(rows=read))
+
+
+def until(true: Callable[[], Any], said: Callable[[], Any] = str) -> None:
+    """Waits until something holds."""
+    deadline = time.monotonic() + 60
+    while not true():
+        assert time.monotonic() < deadline, said()
+        time.sleep(0.002)
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,17 +23,19 @@ from normlift_ns.viewer.links import View, read_link, write_link
 from normlift_ns.viewer.people import People
 from normlift_ns.viewer.shared import Run
 from tests.session.worlds import BLOCK, cubes, read, rows
-from tests.viewer.scenes import run_of
+from tests.viewer.scenes import run_of, until
 from tests.viewer.test_reasons import FakeVotes
 
 
-class Widget:
+class Widget(contextlib.nullcontext):
     """A handle of viser's, without a browser."""
 
-    def __init__(self, label: str, value: Any) -> None:
-        self.label, self._value, self.disabled, self.visible, self.content = label, value, False, True, ""
-        self.options, self.range, self.removed, self._told, self.order = (), (), False, [], 0.0
+    enter_result = None
+
+    def __init__(self, label: str, value: Any, **shown: Any) -> None:
+        self.label, self._value, self.disabled, self.removed, self._told, self.order = label, value, False, False, [], 0
         self._impl = SimpleNamespace(value="")
+        vars(self).update(shown)
 
     @property
     def value(self) -> Any:
@@ -56,36 +58,31 @@ class Widget:
     def remove(self) -> None:
         self.removed = True
 
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
 
 class Gui:
     """All widgets of a page, by their labels."""
 
     def __init__(self) -> None:
-        self.made: list[Widget] = []
+        self.made: list[Any] = []
 
     def __getattr__(self, name: str) -> Callable[..., Widget]:
         def add(label: str, *rest: Any, **options: Any) -> Widget:
             first = 0 if name in ("add_text", "add_vector3") else 3 if name == "add_slider" else 1
-            widget = Widget(label, options.get("initial_value", rest[first] if len(rest) > first else None))
-            widget.options = rest[0] if name in ("add_dropdown", "add_button_group") else ()
-            widget.range = rest if name == "add_slider" else ()
-            widget.content, widget.visible = label, options.get("visible", True)
-            self.made.append(widget)
-            return widget
+            value = options.get("initial_value", rest[first] if len(rest) > first else None)
+            choices = rest[0] if name in ("add_dropdown", "add_button_group") else ()
+            limits, visible = rest if name == "add_slider" else (), options.get("visible", True)
+            self.made.append(Widget(label, value, content=label, options=choices, range=limits, visible=visible))
+            return self.made[-1]
 
         return add
 
-    def __getitem__(self, label: str) -> Widget:
+    def __getitem__(self, label: str) -> Any:
         return next(w for w in self.made if w.label == label and not w.removed)
 
     def says(self) -> str:
         return "\n".join(w.content for w in self.made if w.visible and not w.removed)
 
-    def rows(self) -> list[Widget]:
+    def rows(self) -> list[Any]:
         """The buttons of the found objects."""
         return [w for w in self.made if w.options == ("go to", "only", "hide", "export") and w.visible]
 
@@ -93,65 +90,48 @@ class Gui:
 class FakePage:
     """A page that keeps what it is told."""
 
+    token = link = ""
+    drawn: Any = None
+    box: Any = None
+    clicked: Any = None
+    gone = slow = False
+    looks = 0
+    together = contextlib.nullcontext
+
     def __init__(self, number: int) -> None:
-        self.number, self.gui, self.clicked = number, Gui(), None
+        self.number, self.gui = number, Gui()
         self.camera = SimpleNamespace(
             position=np.zeros(3), look_at=np.ones(3), up_direction=np.array([0.0, 0, 1]), fov=1.0
         )
-        self.drawn: np.ndarray | None = None
         self.files: dict[str, bytes] = {}
-        self.token = self.link = ""
-        self.box: np.ndarray | None = None
-        self.gone, self.slow, self.looks = False, False, 0
+        self.download = self.files.__setitem__
+        self.draw, self.outline, self.become, self.address, self.on_click = (
+            partial(setattr, self, kept) for kept in ("drawn", "box", "token", "link", "clicked")
+        )
 
     @property
     def behind(self) -> bool:
         self.looks += 1
         return self.slow
 
-    def together(self) -> Any:
-        return contextlib.nullcontext()
-
-    def draw(self, buffer: np.ndarray) -> None:
-        self.drawn = buffer
-
-    def outline(self, corners: np.ndarray | None) -> None:
-        self.box = corners
-
     def up(self, direction: np.ndarray) -> None: ...
 
     def listen(self) -> None: ...
 
-    def become(self, token: str) -> None:
-        self.token = token
-
-    def address(self, fragment: str) -> None:
-        self.link = fragment
-
-    def download(self, name: str, content: bytes) -> None:
-        self.files[name] = content
-
-    def on_click(self, clicked: Any) -> None:
-        self.clicked = clicked
-
     def click(self, origin: tuple, direction: tuple) -> None:
         """Clicks on the scene once that waits for it."""
         self.until(lambda: self.clicked is not None)
-        assert self.clicked is not None
         self.clicked(origin, direction)
 
     def hello(self, token: str, link: str = "") -> None:
-        self.gui["Session"].press(json.dumps({"token": token, "link": link}))
+        self.press("Session", json.dumps({"token": token, "link": link}))
 
     def ask(self, line: str) -> None:
-        self.gui["Prompts"].value = line
-        self.gui["Ask"].press()
+        self.press("Prompts", line)
+        self.press("Ask")
 
-    def until(self, true: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 60
-        while not true():
-            assert time.monotonic() < deadline, self.gui.says()
-            time.sleep(0.002)
+    def until(self, true: Callable[[], Any]) -> None:
+        until(true, self.gui.says)
 
     def says(self, text: str) -> None:
         self.until(lambda: text in self.gui.says())
@@ -457,7 +437,7 @@ def test_a_slow_page_gets_the_last_picture_and_not_all_of_them(crowd):
     page.asks("red", 2 * BLOCK)
     page.draws(4 * BLOCK)
     drawn, draw, state = [], page.draw, lambda: crowd._here[0].state
-    page.draw = lambda buffer: drawn.append(len(buffer)) or draw(buffer)  # type: ignore[method-assign]
+    page.draw = lambda buffer: drawn.append(len(buffer)) or draw(buffer)
     page.slow = True
     for deed in ("Hide", "Unhide", "Only"):
         page.press("Selection", deed)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import threading
-import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +19,7 @@ from normlift_ns.viewer.blind.stills import Stills, still
 from normlift_ns.viewer.eye import Eye
 from normlift_ns.viewer.shared import Run
 from tests.session.worlds import world
-from tests.viewer.scenes import camera, run_of, scene_of, spheres
+from tests.viewer.scenes import camera, run_of, scene_of, spheres, until
 
 AXES = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 """Right, down and forward of a camera, as columns."""
@@ -87,12 +86,6 @@ def test_pictures_follow_camera_and_state_and_get_fine_at_rest(run, page):
     state, told = State(run.space), []
     before = set(threading.enumerate())
     stills = Stills(run, page, Eye(page, run.records), lambda: state, told.append)  # type: ignore[arg-type]
-
-    def until(true: Any) -> None:
-        deadline = time.monotonic() + 60
-        while not true():
-            assert time.monotonic() < deadline, (len(page.pictures), told)
-            time.sleep(0.01)
 
     (drawing,) = [one for one in threading.enumerate() if one not in before and "_draw_on" in one.name]
     stills.change()
