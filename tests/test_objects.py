@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.box_overlap import box_iou, half_spaces
 from normlift_ns import InputError
-from normlift_ns.objects import connected_components
+from normlift_ns.objects import connected_components, find_objects
 from normlift_ns.objects.boxes import OrientedBox, oriented_box
 from tests.examples import examples
 from tests.scenes import generator
@@ -34,6 +34,12 @@ def test_only_what_is_selected_connects():
     selected[10:16] = False
     assert connected_components(line, selected).tolist() == [1] * 10 + [-1] * 6 + [0] * 14
     assert connected_components(line, selected, reach=8.0).tolist() == [0] * 10 + [-1] * 6 + [0] * 14
+
+
+def test_parts_smaller_than_one_gaussian_are_refused():
+    for min_size in (0, 1.5):
+        with pytest.raises(InputError, match="min_size"):
+            find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_size=min_size)
 
 
 def test_scale_and_order_do_not_matter():

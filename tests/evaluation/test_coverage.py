@@ -8,8 +8,10 @@ from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from normlift_ns import Camera, GaussianScene, SemanticField, lift, rasterize_evidence
@@ -326,6 +328,17 @@ def test_poses_and_pictures_are_written(one_side, tmp_path, monkeypatch):
     fewer = replace(found, poses=found.poses[:1], pictures=found.pictures[:1])
     fewer.save(tmp_path / "next.json", overwrite=True)
     assert {path.name for path in tmp_path.iterdir()} == {"next.json", "next_camera_path.json", "next_pose_1.png"}
+
+
+def test_the_reliability_is_drawn_over_the_gray_image(tmp_path):
+    from normlift_ns.evaluation.coverage.files import Picture, save_picture  # noqa: PLC0415 (imports matplotlib)
+
+    image = torch.zeros(20, 30, 3, dtype=torch.uint8)
+    image[:, 20:] = 160
+    save_picture(tmp_path / "a.png", "title", Picture(image, torch.full((20, 30), torch.nan)))
+    drawn = np.asarray(Image.open(tmp_path / "a.png").convert("L"))
+    row = drawn[drawn.shape[0] // 2, drawn.shape[1] // 2 : -drawn.shape[1] // 8]  # without the color bar
+    assert (row == 0).sum() / (row == 160).sum() == pytest.approx(2, abs=0.1)
 
 
 def test_a_camera_that_looks_straight_down():

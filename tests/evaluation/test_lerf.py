@@ -51,8 +51,9 @@ def test_files_that_do_not_fit(tmp_path):
     with pytest.raises(InputError, match=r"frame_2\.json"):
         read_frame(bad, 40, 30)
     assert match_views([good, bad], ["images/frame_1.jpg"]) == ({good: "images/frame_1.jpg"}, ["frame_2"])
-    with pytest.raises(InputError, match="none of the 2 label files"):
-        match_views([good, bad], ["other.jpg"])
+    with pytest.raises(InputError, match="none of the 2 label files") as caught:
+        match_views([good, bad], [f"image_{letter}.jpg" for letter in "abcd"])
+    assert "image_c" in str(caught.value) and "image_d" not in str(caught.value)  # three are enough
     with pytest.raises(InputError, match=r"frame_1\.json .*a/frame_1\.jpg and b/frame_1\.jpg"):
         match_views([good], ["a/frame_1.jpg", "b/frame_1.jpg"])
     assert match_views([good], ["a/frame_1.jpg", "a/frame_2.jpg", "b/frame_2.jpg"])[1] == []

@@ -26,6 +26,7 @@ from plyfile import PlyData
 
 from normlift_ns.asking import answer
 from normlift_ns.insight.floaters import find_floaters
+from normlift_ns.nerfstudio_plugin.said import found_table
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.question import Question
 from normlift_ns.runs.question import load_question
@@ -193,6 +194,10 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     assert (panel.answer.texts, output.value) == (("left", "right"), "overlay")
     assert list(outputs(pipeline))[4:7] == ["relevancy_left", "relevancy_right", "reliability"]
     assert torch.equal(chosen(pipeline), both.any(dim=1))
+    best = panel.answer.relevancy[panel.answer.valid].amax(dim=0).tolist()
+    rows = [[cell.strip() for cell in line.split("|")] for line in found_table(panel.state).splitlines()[-2:]]
+    expected = [(text, str(int(n)), f"{peak:.2f}") for text, n, peak in zip(panel.answer.texts, both.sum(dim=0), best)]
+    assert [(row[2], row[3], row[4]) for row in rows] == expected
     widgets.shown.value = "2: right"
     until(lambda: panel.state.shown == 1)
     assert torch.equal(chosen(pipeline), both[:, 1])

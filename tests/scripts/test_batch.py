@@ -172,6 +172,17 @@ def test_the_process_of_a_killed_worker_ends_with_it(tmp_path):
     wait_for(lambda: not alive(pid))
 
 
+def test_a_process_that_ends_has_time_to_clean_up(tmp_path):
+    program = """if True:
+        import signal, sys, time
+        def end(*_): time.sleep(0.2); open(sys.argv[1], "w").close(); sys.exit()
+        signal.signal(signal.SIGTERM, end); open(sys.argv[2], "w").close(); time.sleep(60)"""
+    ready, cleaned = tmp_path / "ready", tmp_path / "cleaned"
+    words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready)]
+    assert run_program(words, tmp_path / "log", lambda: not ready.exists(), every=0.01) is None
+    assert cleaned.exists()
+
+
 def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
     made = Batch(tmp_path, ["0", "fail", "crash", "bug"])
     outcomes = made.work()
