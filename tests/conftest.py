@@ -7,6 +7,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -120,17 +121,18 @@ def _gradients() -> Iterator[None]:
 def _closed(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fails a test that leaves one of its own files open."""
     yield
-    folder, open_files = request.node.funcargs.get("tmp_path"), Path("/proc/self/fd")
-    if folder is not None and open_files.is_dir():
-        left = [name for fd in open_files.iterdir() if (name := _target(fd)).startswith(f"{folder}/")]
-        assert left == [], "files left open"
+    folder = request.node.funcargs.get("tmp_path")
+    if folder is not None and _open_files(folder):
+        gc.collect()  # an exception and its frames hold what they have read
+        assert _open_files(folder) == [], "files left open"
 
 
-def _target(link: Path) -> str:
-    try:
-        return os.readlink(link)
-    except OSError:  # closed meanwhile
-        return ""
+def _open_files(folder: Path) -> list[str]:
+    names = []
+    for link in Path("/proc/self/fd").glob("*"):
+        with suppress(OSError):  # closed meanwhile
+            names.append(os.readlink(link))
+    return [name for name in names if name.startswith(f"{folder}/")]
 
 
 @pytest.fixture(scope="session")
