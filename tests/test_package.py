@@ -73,7 +73,9 @@ def test_wheel_and_sdist_hold_one_package_and_its_readme(built):
 def test_every_place_has_the_same_version_and_the_project_has_addresses():
     version = normlift_ns.__version__
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    assert re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf8"), re.MULTILINE)[0] == version
+    sections = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf8"), re.MULTILINE)
+    assert [name for name in sections if name != "Unreleased"][0] == version  # noqa: RUF015
+    assert "Unreleased" not in sections[1:]
     assert {"Source", "Issues", "Changelog"} <= set(project()["urls"])
 
 
