@@ -329,7 +329,6 @@ def pytest(root: Path, tier: str, *words: str, limit: float) -> list[str]:
         process.wait()
         return [TIME_OUT]
     failed = re.findall(r"^(?:FAILED|ERROR) (tests/.*?|normlift_ns/.*?)(?: - .*)?$", printed, re.MULTILINE)
-    print(words[:3], process.returncode, printed[-150:].strip().splitlines()[-1:], flush=True)
     return failed or (["collection"] if process.returncode not in (0, 5) else [])
 
 
