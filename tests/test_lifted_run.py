@@ -175,6 +175,8 @@ def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
         nl.lift_run(trained, source=nl.SourceOptions(encoder="colour"), timestamp="one")
     with pytest.raises(TypeError, match=r"config\.yml .* got int"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]
+    with pytest.raises(nl.InputError, match="name of a folder"):  # before a scene is looked for
+        nl.lift_run("nowhere/config.yml", source=nl.SourceOptions(encoder="colour"), timestamp="a/b", device="cpu")
     with pytest.raises(FileNotFoundError, match="without semantics"):
         nl.open_run(trained)
     for config in (None, 5, [], {}, float("nan"), b"x"):

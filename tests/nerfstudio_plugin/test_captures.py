@@ -34,7 +34,7 @@ def test_the_run_is_loaded_whole(capture: Path, tmp_path: Path, monkeypatch: pyt
         assert np.array_equal(camera.K.numpy(), fixture["K"])
         assert np.abs(camera.world_to_camera.numpy() - fixture["w2c"]).max() < 1e-6
         assert (camera.height, camera.width) == fixture["labels"].shape
-    views = [run.train[i] for i in range(0, len(run.train), 9)]
+    views = [run.train[i] for i in range(0, len(run.train), 6)]
     gaps = [(render_picture(run, view.camera).float() - view.image.float()) / 255 for view in views]
     measured = [float(-10 * gap.square().mean().log10()) for gap in gaps]
-    assert abs(np.mean(measured) - EXPECTED[name]["psnr"]) < 0.9
+    assert abs(np.mean(measured) - EXPECTED[name]["psnr"]) < 0.7

@@ -105,6 +105,7 @@ def test_colors_without_spherical_harmonics(workspace: Path, registered: None, t
     torch.testing.assert_close(_outputs(pipeline, 1)["rgb"].cpu(), theirs["rgb"], atol=2e-5, rtol=1e-4)
     picture = render_picture(run, run.train.cameras[1])
     torch.testing.assert_close(picture.float() / 255, theirs["rgb"], atol=0.51 / 255, rtol=0)
+    assert pipeline.model.splats()[1:] == (False, "antialiased")  # as a PLY file of it has to say
 
 
 def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticField) -> None:

@@ -458,7 +458,7 @@ batch()
 """
 
 
-@pytest.mark.extra
+@pytest.mark.slow
 def test_the_recipe_for_ray(tmp_path, monkeypatch, capsys):
     """Of docs/scale.md, with processors in place of GPUs."""
     ray = pytest.importorskip("ray", reason="ray is not installed; it is no dependency: pip install ray")

@@ -233,7 +233,7 @@ def converter() -> list[str]:
     return [str(node), str(start)]
 
 
-@pytest.mark.extra
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_the_converter_keeps_what_we_say(mode, converter, lifted: Path, tmp_path: Path) -> None:
     node = subprocess.run([converter[0], "--version"], capture_output=True, text=True, check=True).stdout

@@ -79,10 +79,9 @@ COMMANDS = {
     "ns-normlift-export --overwrite True": ("export", "out"),
     "ns-normlift-query --save True": ("query", "outputs/room/normlift/one"),
 }
-NAMES = [*list(COMMANDS)[:2], pytest.param(list(COMMANDS)[2], marks=pytest.mark.extra)]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record) -> None:
     command, below = COMMANDS[name]
     words = {
