@@ -59,7 +59,8 @@ class Heart:
     def stop(self, well: bool) -> bool:
         """Tells the others that this process has ended by itself. Whether it is the first of those that have failed.
 
-        If the store is gone, process 0 has ended, which holds it and has reported its own error.
+        If the store is gone, process 0 has ended, which holds it: it has reported its own error, unless it is the loss
+        that this process has noticed.
 
         Args:
             well: it has done its work. Otherwise the others have to end too.
@@ -71,7 +72,7 @@ class Heart:
             if well and self.rank == 0:  # the store may be in this process
                 self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * BEAT))
             return first
-        return self.rank == 0
+        return self.rank == 0 or self.lost is not None
 
     def wait_for_a_loss(self) -> Lost | None:
         """Who is gone, once that is known; None where all are well. For a process that could not reach another one."""

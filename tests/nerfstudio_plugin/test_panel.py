@@ -115,8 +115,8 @@ def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.Monkey
     model.normlift._asker.encoder.clear()
     output.set_options(["rgb", "overlay"])
     output.value = "rgb"
-    for name, value in (("rule", "auto"), ("refined", True), ("reliability", 0.0)):
-        getattr(model.normlift._widgets, name).value = value
+    model.normlift._widgets.rule.value = "auto"
+    adjust(model.normlift, refined=True, reliability=0.0)
     model.attach(field, asking("left"))
     yield viewed[0]
     model.attach(field)
@@ -138,6 +138,15 @@ def press(button: Any, browser: Browser | None = None) -> None:
 def ask(panel: Any, prompts: str, negatives: str = "") -> None:
     panel._widgets.prompts.value, panel._widgets.negatives.value = prompts, negatives
     press(panel._widgets.ask)
+
+
+def adjust(panel: Any, *, refined: bool, reliability: float) -> None:
+    """Sets widgets as a browser does, and waits until viser's threads have called what the panel does then."""
+    widgets = panel._widgets
+    widgets.refined.value, widgets.reliability.value = refined, reliability
+    until(lambda: (widgets._values["refined"], widgets._values["Minimum reliability"]) == (refined, reliability))
+    with widgets._lock:  # held while the panel acts
+        pass
 
 
 def button(panel: Any, label: str) -> Any:
@@ -276,8 +285,8 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
 def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     widgets, settings = panel._widgets, ("reliability", "rule", "refined", "negatives")
     before = {name: getattr(widgets, name).value for name in settings}
-    widgets.rule.value, widgets.negatives.value, widgets.refined.value = "cosine", "0.5", False
-    widgets.reliability.value = 1.0  # before the first question, which takes it over
+    widgets.rule.value, widgets.negatives.value = "cosine", "0.5"
+    adjust(panel, refined=False, reliability=1.0)  # before the first question, which takes it over
     ask(panel, "left, banana")
     question = panel.answer.question
     assert (question.min_reliability, question.rule, question.refined) == (1.0, "cosine", False)

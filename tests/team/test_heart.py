@@ -158,7 +158,16 @@ def test_a_store_that_is_gone_is_process_0(world: World) -> None:
     world.store.gone = True
     lost = hearts[1].wait_for_a_loss()
     assert lost is not None and (lost.rank, lost.failed) == (0, False)
-    assert hearts[1].stop(well=False)  # to nobody
+    assert hearts[1].stop(well=False)  # to nobody, and it reports the loss
+
+
+def test_where_the_store_is_gone_process_0_has_reported_its_error(world: World) -> None:
+    hearts = world.team(2)
+    world.kill(0)
+    world.kill(1)  # before it can notice
+    world.store.gone = True
+    assert not hearts[1].stop(well=False)
+    assert hearts[0].stop(well=False)
 
 
 def test_an_environment_that_cannot_be() -> None:
