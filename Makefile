@@ -40,10 +40,10 @@ QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metric
 quick-tests: .venv/installed
 	$(BIN)/pytest -q $(BESIDE) -m "not slow and not extra" $(QUICK) tests/test_imports.py
 
-# Types are checked while the tests run
+# Types of the package are checked while its tests run; make lint checks those of the benchmarks too
 test: style
-	@$(BIN)/basedpyright > .venv/types.log & types=$$!; \
-	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow and not extra"; tests=$$?; \
+	@$(BIN)/basedpyright normlift_ns > .venv/types.log & types=$$!; \
+	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow and not extra" --ignore=tests/browser --ignore=tests/torture; tests=$$?; \
 	wait $$types; types=$$?; cat .venv/types.log; exit $$((tests + types))
 
 # A browser and the viewer that it shows fill two cores: their tests run after the rest, one at a time

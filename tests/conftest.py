@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import inspect
 import os
@@ -52,8 +53,8 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Lets Python end as usual."""
-    gc.unfreeze()
+    """Lets Python end as usual, after pytest has collected garbage for the last time."""
+    atexit.register(gc.unfreeze)
 
 
 def _patch_triton_once() -> None:

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn, Protocol, TextIO, TypeVar, cast, get_type_hints
@@ -297,6 +298,7 @@ def _plain_warnings() -> Iterator[None]:
         yield
 
 
+@cache
 def with_help(options: Any, *, nested: bool = False) -> Any:
     """The dataclass, with the docstring under each field as the help of its flag, and the first paragraph of its own as
     the help of all of them.
