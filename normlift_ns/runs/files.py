@@ -55,7 +55,7 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
 
 
 def cache_folder(run_dir: Path) -> Path:
-    """Return the folder that caches 2D features, evidence and text embeddings, shared by lifted runs next to each other."""
+    """Return the cache folder for 2D features, evidence and text embeddings, shared by sibling runs."""
     return run_dir.parent / ".cache"
 
 
