@@ -19,9 +19,11 @@ from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.raster.settings import RasterSettings
 
 SEEN = 0.1
-"""An image shows an object if the object covers at least this fraction of its largest share of any image."""
+"""An image shows an object if the object's share of the image is at least this times its largest share of any image."""
 WHOLE = 0.95
-"""An object is wholly in an image if the fraction of it inside the frame is at least this times its largest one."""
+"""An image shows the whole object if the fraction of the object inside its frame is at least this times the largest
+such fraction.
+"""
 BEST = 3
 _RENDER_SIZE = 256
 """Longer side, in pixels, of the renders that rank images by object; more resolution does not change the order."""

@@ -20,7 +20,7 @@ _NEIGHBORS = 8
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One object, in the units of the scene. Averages are weighted by W_j, the total weight of Gaussian j in all views."""
+    """One object, in units of the scene; means are weighted by W_j, the total weight of Gaussian j over all views."""
 
     size: int
     """Number of Gaussians."""
