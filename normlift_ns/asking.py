@@ -29,9 +29,9 @@ class Answer:
     >>> from normlift_ns.question import Question
     >>> from normlift_ns.asking import answer
     >>> from normlift_ns.core.evidence import Entries
-    >>> seen = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
+    >>> entries = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
+    >>> field = SemanticField.build(lift(Evidence.from_entries([entries], 3), torch.eye(2)), means)
     >>> result = answer(field, means, Question(("fox", "shield"), torch.eye(2)))
     >>> result["fox"].mask.tolist(), result["shield"].relevancy.tolist(), result["shield"].centroid
     ([True, False, False], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
@@ -95,9 +95,9 @@ class Finding:
     >>> from normlift_ns.question import Question
     >>> from normlift_ns.asking import answer
     >>> from normlift_ns.core.evidence import Entries
-    >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 2]), torch.tensor([3.0, 1.0, 1.0]), (2,))
+    >>> entries = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 2]), torch.tensor([3.0, 1.0, 1.0]), (2,))
     >>> means = torch.tensor([[0.0, 0, 0], [4, 0, 0], [9, 9, 9]])
-    >>> field = SemanticField.build(lift(Evidence.from_entries([seen], 3), torch.eye(2)), means)
+    >>> field = SemanticField.build(lift(Evidence.from_entries([entries], 3), torch.eye(2)), means)
     >>> fox = answer(field, means, Question(("fox",), torch.tensor([[1.0, 0]])))["fox"]
     >>> fox.mask.tolist(), [round(x, 3) for x in fox.centroid], fox.peak, fox.mean_reliability
     ([True, True, False], [1.0, 0.0, 0.0], 1.0, 0.5)

@@ -122,8 +122,8 @@ def open_quick(
 ) -> QuickRun | None:
     """Open the field of a lifted run; return None if its files alone do not determine the scene.
 
-    That is so for runs of version 0.1, which do not store Gaussian centers, and for runs with a checkpoint that the
-    lift did not write. Such runs need `means`.
+    Runs of version 0.1 do not store Gaussian centers, and other runs may hold a checkpoint that the lift did not write.
+    Such runs need `means`.
 
     Args:
         load_config: path of the run's config.yml.

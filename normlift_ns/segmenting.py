@@ -1,15 +1,16 @@
 """Lifting of SAM 3 masks: each prompt is one region per view, against the rest of the image.
 
-A Gaussian's relevancy for a prompt is the fraction of its weight inside the masks, sum_v E_in / sum_v (E_in + E_out),
-with the weights of the rasterizer that trained the scene, over the voting views.
+A Gaussian's relevancy for a prompt is the fraction of its weight inside the masks of the voting views,
+sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
 
 Voting views are chosen in two rounds, because such masks fail for whole views, by missing an object or by confusing it
-with another. First, the views in which the prompt was found vote. Their result is rendered into every view, and a view
-votes in the second round if the intersection over union of its mask and that render is more than one half.
+with another. In the first round, the views in which the prompt was found vote. In the second round, a view votes if its
+mask agrees with the Gaussians that the first round selected: their weighted intersection over union exceeds one half.
+If this leaves no view in which the prompt was found, the first round counts.
 
-A view that does not vote counts as unlabeled with `unlabeled="dilute"`, which lowers reliability: an object found in
-one of eight views has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for two
-regions per view, "in" and "out", with the features (1, 0) and (0, 1).
+A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
+eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
+two regions per view, "in" and "out", with the features (1, 0) and (0, 1).
 """
 
 from __future__ import annotations

@@ -4,13 +4,14 @@ The score of a visible Gaussian j is::
 
     log2(d_j / (s_j + s'_j)) + 2 max(0, log2(median ||f|| / ||f_j||)) + (1 - o_j)
 
-where d_j is the distance to its 8th nearest visible neighbor, s_j its largest standard deviation, s'_j the median
-largest standard deviation of these 8 neighbors, f_j its mean feature (equation 3 of the paper) and o_j its opacity.
+where d_j is the distance to its 8th nearest visible neighbor, and s_j is its largest standard deviation. s'_j is the
+median of the largest standard deviations of these 8 neighbors. f_j is its mean feature (equation 3 of the paper), and
+o_j its opacity.
 
 * The first term is high if the neighbors are too far away to touch, counted in doublings; Gaussians on a surface
   overlap their neighbors.
-* The second term is high if views disagree about Gaussian j more than about the rest of the scene, because a floater
-  is seen in front of different objects. It is 0 without evidence.
+* The second term is high if views disagree about Gaussian j more than about the rest of the scene. Views see a floater
+  in front of different objects. The term is 0 without evidence.
 * The third term is high for transparent Gaussians.
 
 docs/honest_answers.md reports detection and false-positive rates, and the variants that did not help.
@@ -48,8 +49,8 @@ class Floaters(NamedTuple):
     >>> means = torch.cat([wall, torch.tensor([[2.0, 2.0, 9.0]])])
     >>> scene = GaussianScene(means, torch.ones(26, 4), torch.full((26, 3), 0.6), torch.full((26,), 0.8))
     >>> one = torch.ones(26)
-    >>> found = find_floaters(scene, Scalars(one, one, one, one, one, one, one.int()))
-    >>> found.mask.nonzero().tolist(), round(float(found.score[25]), 2)
+    >>> floaters = find_floaters(scene, Scalars(one, one, one, one, one, one, one.int()))
+    >>> floaters.mask.nonzero().tolist(), round(float(floaters.score[25]), 2)
     ([[25]], 3.12)
     """
 

@@ -1,7 +1,7 @@
 """Histogram of the relevancies of one prompt, with a suggested threshold and a test for absence from the scene.
 
-Let m be the median relevancy of the Gaussians that have a direction, and t the relevancy that one in a thousand of them
-exceeds (the top). If more than half of them are at the top, m is the minimum instead, so that a threshold can still
+Let m be the median relevancy of the Gaussians that have a direction, and t their top: the relevancy that one in a
+thousand exceeds. If more than half of them are at the top, m is the minimum instead, so that a threshold can still
 separate them.
 
 * The suggested threshold is m + 0.6 (t - m). It adapts to the range of relevancies, so it suits any encoder and rule.
@@ -43,8 +43,8 @@ class Histogram:
     >>> import numpy as np
     >>> from normlift_ns.insight.histogram import histogram
     >>> values = np.array([0.1] * 60 + [0.2] * 30 + [0.9] * 10)
-    >>> found = histogram(values, np.ones(100, bool), threshold=0.5, limit=0.62)
-    >>> int(found.counts.sum()), round(found.suggested, 6), found.stands_out
+    >>> hist = histogram(values, np.ones(100, bool), threshold=0.5, limit=0.62)
+    >>> int(hist.counts.sum()), round(hist.suggested, 6), hist.stands_out
     (100, 0.58, True)
     """
 

@@ -8,8 +8,8 @@ the unit feature of region s::
     a_v  = cos(S_v, sum_v S_v)                 agreement of image v with the sum of all votes
     C_inter = ||sum_v S_v|| / sum_v ||S_v||    and norm, C_intra, N_eff, R as in `core.lift`
 
-The disagreement 1 - C_inter is the sum over images of ||S_v|| (1 - a_v) / sum_v ||S_v||, so the images that disagree
-most have the largest terms. A Gaussian that copied the direction of a neighbor counts with that neighbor's evidence.
+The disagreement 1 - C_inter is the sum over images of ||S_v|| (1 - a_v) / sum_v ||S_v||. The images that disagree most
+have the largest terms. A Gaussian that copied the direction of a neighbor counts with that neighbor's evidence.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class Why:
     >>> from normlift_ns import Evidence
     >>> from normlift_ns.core.evidence import Entries
     >>> from normlift_ns.insight.why import explain_selection
-    >>> seen = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3]), torch.tensor([3.0, 1, 3, 1]), (1, 1))
-    >>> evidence = Evidence.from_entries([seen], 3)
+    >>> entries = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3]), torch.tensor([3.0, 1, 3, 1]), (1, 1))
+    >>> evidence = Evidence.from_entries([entries], 3)
     >>> why = explain_selection(evidence, torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([True, True, False]))
     >>> [(vote.view, vote.weight, round(vote.agreement, 3)) for vote in why.views]
     [(0, 6.0, 0.949), (1, 2.0, 0.316)]

@@ -39,7 +39,7 @@ class OrientedBox:
 
     @property
     def corners(self) -> Float64[np.ndarray, "8 3"]:
-        """The eight corners; corner 4 a + 2 b + c is at the far end of axis 0 if a = 1, 1 if b = 1, and 2 if c = 1."""
+        """The eight corners. Bits a, b, c of index 4 a + 2 b + c select the far end of axes 0, 1 and 2."""
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         return self.center + (signs * self.size) @ self.axes
 
@@ -54,8 +54,8 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
     """Return the oriented box of the central points.
 
     The axes are those of the smallest box (trimesh) around the points between the 1st and the 99th percentile along
-    each of 13 directions, so a few distant points cannot rotate the box. Along each axis, the box extends from the 1st
-    to the 99th percentile of all points.
+    each of 13 directions. A few distant points therefore cannot rotate the box. Along each axis, the box extends from
+    the 1st to the 99th percentile of all points.
 
     Raises:
         ValueError: there are no points, or some are not finite.

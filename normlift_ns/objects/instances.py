@@ -23,7 +23,7 @@ class Instances:
     class_id: Int32[Tensor, " n"]
     """Class, 1 for the first prompt; 0 if no prompt selects the Gaussian."""
     instance_id: Int32[Tensor, " n"]
-    """Object, numbered 1, 2, … over all prompts, by descending size within each prompt; 0 for Gaussians without a class
+    """Object, numbered 1, 2, … over all prompts, by descending size within each prompt. 0 for Gaussians without a class
     or in a component that is too small.
     """
     classes: tuple[int, ...]
@@ -62,8 +62,8 @@ def find_instances(
 
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 0, 0]])
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
-    >>> found = find_instances(("cup", "box"), means, relevancy, relevancy > 0.5, min_size=1)
-    >>> found.class_id.tolist(), found.instance_id.tolist(), found.classes
+    >>> instances = find_instances(("cup", "box"), means, relevancy, relevancy > 0.5, min_size=1)
+    >>> instances.class_id.tolist(), instances.instance_id.tolist(), instances.classes
     ([1, 1, 2, 0], [1, 1, 2, 0], (1, 2))
     """
     class_id = strongest(relevancy, selected) + 1

@@ -91,9 +91,9 @@ def connected_components(
 ) -> Int32[Tensor, " n"]:
     """Label each selected Gaussian with its connected component, 0 for the largest; label the others -1.
 
-    Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, and their
-    distance is at most `reach` times the median spacing. The spacing of a selected Gaussian is the distance to the
-    nearest selected one at a different position. Components of equal size are ordered by their first Gaussian.
+    Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, within `reach`
+    times the median spacing. The spacing of a selected Gaussian is its distance to the nearest selected one at a
+    different position. Components of equal size are ordered by their first Gaussian.
 
     Args:
         reach: maximum distance in units of the median spacing, > 0.

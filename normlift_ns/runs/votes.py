@@ -100,8 +100,8 @@ class Votes:
 
         Raises:
             FileNotFoundError: an image does not exist any more.
-            ValueError: an image has changed, the cache no longer holds its regions, or the features of the lift were
-                passed from Python, so that no file has their regions.
+            ValueError: an image has changed, or the cache no longer holds its regions. Features passed from Python
+                always raise this error, because no file has their regions.
         """
         for vote in votes:
             block, images = self._observe([vote.view])

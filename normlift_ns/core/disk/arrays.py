@@ -1,8 +1,8 @@
 """Safetensors files with a digest of their whole content, which is checked before any of it is used.
 
 This module does not need torch. The digest is the 128-bit XXH3. It detects damaged and misplaced files, but it does not
-protect against forgery. One core of an AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b: 1.5 ms instead of
-50 ms for a field of 44 MB.
+protect against forgery. One core of an AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b. For a field of
+44 MB, this is 1.5 ms instead of 50 ms.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Write-ahead journal for replacing several files or a folder, so that a crash in the middle can be completed.
 
-A journal moves and deletes files, so `complete` follows only journals that the same user's programs wrote: each is
+A journal moves and deletes files, so `complete` follows only journals that the same user's programs wrote. Each is
 signed with a key in the user's state folder. A folder received from somebody else cannot contain a valid signature.
 """
 
