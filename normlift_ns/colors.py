@@ -1,8 +1,8 @@
-"""Colours of what is found, the same in every viewer and picture.
+"""Colors of query results, the same in every viewer and figure.
 
-Relevancy goes through a perceptual colour map that colour-blind people can read, the more opaque the larger it is, so
-that weak matches stay quiet. A prompt that names a colour has that colour; the others have colours that people with any
-colour vision tell apart (Okabe and Ito, 2008), as far as there are enough.
+Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, which
+keeps weak matches unobtrusive. A prompt that names a color is drawn in that color. The other prompts get colors that
+are distinguishable with any color vision (Okabe and Ito, 2008), as long as there are enough of these.
 """
 
 from __future__ import annotations
@@ -20,25 +20,27 @@ from normlift_ns.encoders.texts.colours import colour_names, survey
 
 Colormap = Literal["viridis", "cividis", "inferno", "magma", "turbo"]
 COLORMAPS: tuple[Colormap, ...] = get_args(Colormap)
-"""The first is the default. turbo is there for people who are used to it; it is neither even nor safe."""
+"""Available colormaps, the default first. turbo is offered because it is well known; it is neither perceptually uniform
+nor readable with color blindness.
+"""
 RELIABILITY_COLORS: Colormap = "cividis"
-"""Of R, always from 0 to 1."""
+"""Colormap of R, always over the range 0 to 1."""
 FAINT, OPAQUE = 0.35, 0.9
-"""Opacity over the scene of the least and of the most relevant of what is selected."""
+"""Opacity over the scene at the lowest and at the highest selected relevancy."""
 _OKABE_ITO = ("e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7")
-_LEAST_SATURATION = 0.3
-"""A prompt for something grey is not drawn in grey, which is the colour of all that is not selected."""
-_APART = 0.25
-"""Distance in RGB at which two colours are told apart."""
+_MIN_SATURATION = 0.3
+"""Prompts that name a less saturated color are not drawn in it: gray is the color of everything not selected."""
+_MIN_DISTANCE = 0.25
+"""Distance in RGB at which two colors are distinguishable."""
 
 
 def colors_of(colormap: Colormap) -> Float[Tensor, "256 3"]:
-    """RGB in 0..1 of matplotlib's colour map.
+    """Return the RGB values, in 0..1, of a matplotlib colormap.
 
     >>> [round(x, 2) for x in colors_of("viridis")[255].tolist()]
     [0.99, 0.91, 0.14]
     """
-    from matplotlib import colormaps  # noqa: PLC0415 (a lift does without)
+    from matplotlib import colormaps  # noqa: PLC0415 (a lift does not need it)
 
     return torch.from_numpy(colormaps[colormap](torch.arange(256).numpy())[:, :3]).float()
 
@@ -50,11 +52,12 @@ def heat(
     *,
     faint: float = FAINT,
 ) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n"]]:
-    """Colour, and opacity over the scene, by relevancy.
+    """Map relevancy to a color and an opacity over the scene.
 
     Args:
-        scale: relevancies of the first and the last colour; what is beyond them gets these.
-        faint: opacity of the first colour; that of the last is `OPAQUE`.
+        scale: relevancies of the first and the last color; relevancies outside this range are clamped.
+        colors: RGB values of a colormap, in 0..1.
+        faint: opacity of the first color; the last color has opacity `OPAQUE`.
 
     >>> heat(torch.tensor([0.0, 0.5, 1.0]), (0.0, 1.0), colors_of("viridis"))[1]
     tensor([0.3500, 0.6250, 0.9000])
@@ -64,7 +67,9 @@ def heat(
 
 
 def named_color(text: str) -> tuple[float, float, float] | None:
-    """RGB in 0..1 of the first strong colour that a text names, by the XKCD colour survey; None: it names none.
+    """Return the first saturated color that a prompt names, as RGB in 0..1; None if it names none.
+
+    Color names are those of the XKCD color survey.
 
     >>> [round(255 * x) for x in named_color("a sky blue bowl")]
     [117, 187, 253]
@@ -72,41 +77,41 @@ def named_color(text: str) -> tuple[float, float, float] | None:
     (None, None)
     """
     table = survey()
-    named = [table[name] for name in colour_names(text) if name in table]  # without a slash, as one of each pair is
+    named = [table[name] for name in colour_names(text) if name in table]  # each name with a slash has a twin without
     colors = [(c[0] / 255, c[1] / 255, c[2] / 255) for c in (bytes.fromhex(code[1:]) for code in named)]
-    return next((color for color in colors if colorsys.rgb_to_hsv(*color)[1] >= _LEAST_SATURATION), None)
+    return next((color for color in colors if colorsys.rgb_to_hsv(*color)[1] >= _MIN_SATURATION), None)
 
 
 def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
-    """RGB in 0..1 of every prompt: the colour that it names, or one that is told apart from those before.
+    """Return a color for each prompt, as RGB in 0..1: the color that it names, or one distinguishable from the others.
 
     >>> (prompt_colors(["fox", "sky blue", "sky blue bowl"]) * 255).round().int().tolist()
     [[230, 159, 0], [117, 187, 253], [0, 158, 115]]
     """
-    found: list[tuple[float, ...] | None] = []
+    colors: list[tuple[float, ...] | None] = []
     for text in texts:
         color = named_color(text)
-        found.append(None if color in found else color)
-    taken = [color for color in found if color is not None]
-    for i, color in enumerate(found):
+        colors.append(None if color in colors else color)
+    used = [color for color in colors if color is not None]
+    for i, color in enumerate(colors):
         if color is None:
-            found[i] = _another(taken)
-            taken.append(found[i])  # type: ignore[arg-type]
-    return torch.tensor(found, dtype=torch.float32).reshape(len(found), 3)
+            colors[i] = _distinct(used)
+            used.append(colors[i])  # type: ignore[arg-type]
+    return torch.tensor(colors, dtype=torch.float32).reshape(len(colors), 3)
 
 
-def _another(taken: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
-    """The first of `_candidates` that is told apart from the colours taken, or the one farthest from them."""
-    if len(taken) == 0:
+def _distinct(used: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
+    """Return the first of `_candidates` that is distinguishable from the used colors, or the one farthest from them."""
+    if len(used) == 0:
         return _candidates()[0]
-    distance = torch.cdist(torch.tensor(_candidates()), torch.tensor(taken)).amin(dim=1)
-    apart = (distance >= _APART).nonzero()
-    return _candidates()[int(apart[0]) if len(apart) > 0 else int(distance.argmax())]
+    distance = torch.cdist(torch.tensor(_candidates()), torch.tensor(used)).amin(dim=1)
+    distinct = (distance >= _MIN_DISTANCE).nonzero()
+    return _candidates()[int(distinct[0]) if len(distinct) > 0 else int(distance.argmax())]
 
 
 @cache
 def _candidates() -> tuple[tuple[float, ...], ...]:
-    """Okabe and Ito's colours, then hues a golden section of the circle apart, in four tones."""
-    safe = (tuple(int(color[i : i + 2], 16) / 255 for i in (0, 2, 4)) for color in _OKABE_ITO)
-    tones = ((0.85, 0.95), (0.6, 0.95), (0.85, 0.65), (0.45, 0.75))
-    return (*safe, *(colorsys.hsv_to_rgb((i * 0.618034) % 1, *tones[i % 4]) for i in range(160)))
+    """Return Okabe and Ito's colors, then hues spaced by the golden ratio of the color wheel, in four tones."""
+    okabe_ito = (tuple(int(color[i : i + 2], 16) / 255 for i in (0, 2, 4)) for color in _OKABE_ITO)
+    tones = ((0.85, 0.95), (0.6, 0.95), (0.85, 0.65), (0.45, 0.75))  # saturation and value
+    return (*okabe_ito, *(colorsys.hsv_to_rgb((i * 0.618034) % 1, *tones[i % 4]) for i in range(160)))

@@ -295,7 +295,7 @@ class LiftedRun:
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
         >>> why = run.why(run.ask("red")["red"])
-        >>> why.words.startswith("The photographs agree"), 0.9 < sum(vote.share for vote in why.views) < 1.1
+        >>> why.words.startswith("The images agree"), 0.9 < sum(vote.share for vote in why.views) < 1.1
         (True, True)
         >>> [picture.image.shape for picture in run.votes.pictures(why.views[:1])]
         [torch.Size([120, 160, 3])]

@@ -1,4 +1,7 @@
-"""Texts as a question to a semantic field: their vectors, and the rule by which they select. Needs no torch."""
+"""Queries for a semantic field: prompts with their embeddings, and the rule that selects Gaussians.
+
+This module does not need torch.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ from normlift_ns.text_encoders import Field, default_rule, encoder_digest
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Q texts as the encoder of a field sees them, and what is selected by them. Vectors may be given as tensors."""
+    """A query: Q prompts, their embeddings, and how they select Gaussians. Embeddings may be passed as tensors."""
 
     texts: tuple[str, ...]
     vectors: Float[np.ndarray, "q d"]
-    """One per text, of any length > 0."""
+    """One embedding per prompt, of any norm > 0."""
     negatives: tuple[str, ...] = ()
-    """What the texts are compared with, where the rule compares."""
+    """Negative prompts, for rules that compare with them."""
     negative_vectors: Float[np.ndarray, "b d"] | None = None
     rule: Rule = "cosine"
     threshold: float = 0.5
@@ -33,15 +36,16 @@ class Question:
     refined: bool = True
     """Use refined features."""
     encoder: str | None = None
-    """Digest of the encoder that made the vectors, see `encoder_digest`; None: nobody knows."""
+    """Digest of the encoder of the embeddings, see `encoder_digest`; None if unknown."""
     suggest: bool = False
-    """Take the threshold that the histogram of all relevancies suggests, in place of this one, as soon as the question
-    is answered; the question of an answer has its threshold."""
+    """Replace the threshold with the one that the histogram of all relevancies suggests, when the query runs. The query
+    stored in the result has that threshold.
+    """
 
     def __post_init__(self) -> None:
         for name in ("vectors", "negative_vectors"):
             value = getattr(self, name)
-            if value is not None and not isinstance(value, np.ndarray):  # a tensor, on any device
+            if value is not None and not isinstance(value, np.ndarray):  # a tensor on any device
                 object.__setattr__(self, name, value.detach().cpu().numpy())
 
 
@@ -56,23 +60,27 @@ def make_question(
     min_reliability: float = 0.0,
     refined: bool = True,
 ) -> Question:
-    """Texts as a question to a field.
+    """Encode prompts as a query for a field.
 
     Args:
-        read: makes one vector per text, of an encoder that fits the field.
-        negatives: what the texts are compared with; None: as the encoder says, see `default_rule`.
-        rule: "auto": as the encoder says; lerf where other negatives are given, cosine where none are.
-        threshold: "auto": what the histogram suggests. None: that of the encoder for its rule, else that of
-            `RULES`; but "auto" for bare cosines, of which no number is known that selects something.
+        read: encodes prompts as one embedding each, with an encoder that fits the field.
+        texts: the prompts.
+        negatives: negative prompts (default: those of the encoder, see `default_rule`).
+        rule: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
+        threshold: "auto" is the threshold that the histogram suggests. None is the threshold of the encoder for its own
+            rule, and otherwise that of `RULES`. For the rule cosine with an encoder of another rule, None is "auto",
+            because no threshold suits all encoders.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         refined: use refined features.
     Raises:
-        ValueError: a text that is empty or that the encoder does not understand.
+        ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
     if negatives is not None and not isinstance(negatives, Sequence):
-        raise InputError(f"negatives must be a list of texts, got {shown(negatives)}")
+        raise InputError(f"negatives must be a list of strings, got {shown(negatives)}")
     if isinstance(negatives, str):
-        raise InputError(f"negatives must be a list of texts, got the single text {negatives!r}; write [{negatives!r}]")
+        raise InputError(
+            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
+        )
     if rule not in ("auto", *RULES):
         raise InputError(f"rule must be auto, {', '.join(RULES)}; got {rule!r}")
     min_reliability = check_number("min_reliability", min_reliability)
@@ -86,8 +94,8 @@ def make_question(
     if rule == "auto":
         rule = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
     if threshold is None:
-        known = RULES[rule].threshold if RULES[rule].compares else "auto"
-        threshold = default.threshold if rule == default.rule else known
+        general = RULES[rule].threshold if RULES[rule].compares else "auto"
+        threshold = default.threshold if rule == default.rule else general
     negatives = tuple(default.negatives if negatives is None else negatives)
     return Question(
         texts=tuple(texts),

@@ -1,12 +1,16 @@
-"""Masks of texts in some views, lifted: every text is one region against the rest.
+"""Lifting of SAM 3 masks: each prompt is one region per view, against the rest of the image.
 
-A Gaussian's relevancy for a text is the share of its weight that lies in the masks: sum_v E_in / sum_v (E_in + E_out),
-with the weights of the rasterizer that trained the scene, over the views that vote. At first these are the views in
-which the text was found. Then those whose mask shares more than half of what either covers with the answer so far,
-drawn there: to miss a thing, or to take another for it, is what such masks do wrong, whole views at a time. A view that
-does not vote is unlabelled, and dilutes: it counts against reliability, so that what was found in one view of eight has
-the reliability of one view in eight. Agreement and reliability are those of `core.lift` for two regions per view, "in"
-and "out", with the features (1, 0) and (0, 1).
+A Gaussian's relevancy for a prompt is the fraction of its weight inside the masks of the voting views,
+sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
+
+Voting views are chosen in two rounds, because such masks fail for whole views, by missing an object or by confusing it
+with another. In the first round, the views in which the prompt was found vote. In the second round, a view votes if its
+mask agrees with the Gaussians that the first round selected: their weighted intersection over union exceeds one half.
+If this leaves no view in which the prompt was found, the first round counts.
+
+A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
+eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
+two regions per view, "in" and "out", with the features (1, 0) and (0, 1).
 """
 
 from __future__ import annotations
@@ -32,34 +36,34 @@ from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.selection import Selection
 
 SHARE = 0.5
-"""Relevancy above which a Gaussian is in what a text names: more of it is in the masks than outside."""
+"""Relevancy above which a Gaussian is selected: more of its weight is inside the masks than outside."""
 
 
 @dataclass(frozen=True)
 class MaskAnswer:
-    """What the masks of one text say of every Gaussian."""
+    """Result of lifting the masks of one prompt."""
 
     relevancy: Float[Tensor, " n"]
-    """Share of its weight that lies in the masks, in 0..1; 0 where no view that votes sees it."""
+    """Fraction of each Gaussian's weight inside the masks, in 0..1; 0 for Gaussians that no voting view sees."""
     scalars: Scalars
-    """Of the lift of two regions. c_inter: how far the views that vote agree; reliability: R."""
+    """Numbers of the lift with two regions per view: c_inter is the agreement of the voting views, reliability is R."""
     voted: Bool[Tensor, " v"]
-    """Views with a mask that agrees with the answer."""
+    """Views in which the prompt was found and that vote."""
 
     @property
     def seen(self) -> Bool[Tensor, " n"]:
-        """Gaussians that a view sees."""
+        """Gaussians that have weight in at least one view."""
         return self.scalars.weight > 0
 
     @property
     def mask(self) -> Bool[Tensor, " n"]:
-        """Gaussians of which more than half lies in the masks."""
+        """Gaussians with more than half of their weight inside the masks."""
         return self.relevancy > SHARE
 
 
 @dataclass(frozen=True)
 class MaskEvidence:
-    """Masks of Q texts in V views, as weights of Gaussians.
+    """Evidence of the masks of Q prompts in V views.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene
@@ -75,15 +79,16 @@ class MaskEvidence:
     """
 
     evidence: Evidence
-    """Of the pieces that all masks of a view have in common."""
+    """Evidence whose regions are the cells into which all masks of a view together partition it."""
     inside: Bool[Tensor, "q s"]
-    """Which pieces are in the masks of each text."""
+    """True for the cells inside the masks of each prompt."""
 
     def answer(self, text: int, views: Sequence[int] | None = None, *, beta: float = 1.0) -> MaskAnswer:
-        """What the masks of one text say, in all views or some.
+        """Lift the masks of one prompt.
 
         Args:
-            text: its number.
+            text: index of the prompt.
+            views: indices of the views to use (default: all).
             beta: as in `lift`.
         """
         evidence, inside = self.evidence, self.inside[text]
@@ -95,25 +100,25 @@ class MaskEvidence:
         within = inside[column]
 
         def share(votes: Bool[Tensor, " v"]) -> Float[Tensor, " n"]:
-            held, total = weight.new_zeros(2, evidence.num_gaussians)
+            in_masks, total = weight.new_zeros(2, evidence.num_gaussians)
             total.index_add_(0, row, weight * votes[view])
-            held.index_add_(0, row, weight * (votes[view] & within))
-            return torch.where(total > 0, held / total, 0.0)
+            in_masks.index_add_(0, row, weight * (votes[view] & within))
+            return torch.where(total > 0, in_masks / total, 0.0)
 
-        found = torch.zeros(evidence.num_views, dtype=torch.bool, device=inside.device)
-        found[evidence.region_view[inside].long()] = True
-        drawn = share(found)[row] > SHARE
-        both, either = weight.new_zeros(2, evidence.num_views)
-        both.index_add_(0, view, weight * (within & drawn))
-        either.index_add_(0, view, weight * (within | drawn))
-        votes = (both > 0.5 * either) | (either == 0)
-        votes = votes if bool((votes & found).any()) else found
+        has_mask = torch.zeros(evidence.num_views, dtype=torch.bool, device=inside.device)
+        has_mask[evidence.region_view[inside].long()] = True
+        selected = share(has_mask)[row] > SHARE
+        intersection, union = weight.new_zeros(2, evidence.num_views)
+        intersection.index_add_(0, view, weight * (within & selected))
+        union.index_add_(0, view, weight * (within | selected))
+        votes = (intersection > 0.5 * union) | (union == 0)
+        votes = votes if bool((votes & has_mask).any()) else has_mask
         sides = torch.where(votes[evidence.region_view.long()], 2 * evidence.region_view + (~inside).int(), -1)
-        of_side = torch.arange(evidence.num_views, dtype=torch.int32, device=inside.device).repeat_interleave(2)
+        side_view = torch.arange(evidence.num_views, dtype=torch.int32, device=inside.device).repeat_interleave(2)
         table = torch.eye(2, device=inside.device, dtype=evidence.rows.weight.dtype).repeat(evidence.num_views, 1)
-        scalars = lift(evidence.regroup(sides[None], of_side), table, beta=beta, unlabeled="dilute").scalars
+        scalars = lift(evidence.regroup(sides[None], side_view), table, beta=beta, unlabeled="dilute").scalars
         relevancy = torch.where(scalars.norm > 0, share(votes), 0.0).to(scalars.norm.dtype)
-        return MaskAnswer(relevancy, scalars, votes & found)
+        return MaskAnswer(relevancy, scalars, votes & has_mask)
 
 
 def mask_evidence(
@@ -127,33 +132,34 @@ def mask_evidence(
     backend: BackendName = "auto",
     done: Callable[[], None] = lambda: None,
 ) -> MaskEvidence:
-    """The evidence of masks of Q texts, rasterized once for all of them.
+    """Rasterize the evidence of the masks of Q prompts, once for all prompts.
 
     Args:
         cameras: one per view.
-        masks: per view the pixels that are what each text names; of a text that was not found, none.
-        counted: per view where pixels count at all; None: everywhere.
+        masks: for each view, one mask per prompt; empty if the prompt was not found.
+        counted: for each view, the pixels to use; None for all.
         rasterize_mode, settings, backend: as in `rasterize_evidence`.
-        done: called after every view.
+        done: called after each view.
     Raises:
-        ValueError: no view, or masks of another number or size than their cameras.
+        ValueError: there are no views, or the masks do not match the number or size of the cameras.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"masks are needed of at least one view, one set per camera; got {len(masks)} of {len(cameras)}"
+            f"expected masks for at least one camera, one set per camera; got {len(masks)} sets for {len(cameras)} "
+            "cameras"
         )
     labels: list[Int32[Tensor, "h w"]] = []
     inside: list[Bool[Tensor, "q c"]] = []
-    for index, (camera, found) in enumerate(zip(cameras, masks)):
-        if found.shape != (len(masks[0]), camera.height, camera.width) or len(found) == 0:
+    for index, (camera, view_masks) in enumerate(zip(cameras, masks)):
+        if view_masks.shape != (len(masks[0]), camera.height, camera.width) or len(view_masks) == 0:
             raise InputError(
-                f"masks of view {index} are {tuple(found.shape)}, expected [{max(1, len(masks[0]))}, {camera.height}, "
-                f"{camera.width}]: one per text, of the size of the camera"
+                f"masks of view {index} have shape {tuple(view_masks.shape)}, expected [{max(1, len(masks[0]))}, "
+                f"{camera.height}, {camera.width}]: one per prompt, of the size of the camera"
             )
-        cells, of_cell = joint_partition(found.int())
-        where = None if counted is None else counted[index]
-        labels.append(cells if where is None else cells.where(where.to(cells.device), MASKED))
-        inside.append(of_cell == 1)
+        cells, cell_values = joint_partition(view_masks.int())
+        pixels = None if counted is None else counted[index]
+        labels.append(cells if pixels is None else cells.where(pixels.to(cells.device), MASKED))
+        inside.append(cell_values == 1)
     evidence = rasterize_evidence(
         scene,
         list(cameras),
@@ -168,28 +174,28 @@ def mask_evidence(
 
 
 class Segmented(NamedTuple):
-    """What SAM 3 answers to Q texts."""
+    """Result of a SAM 3 query with Q prompts."""
 
     answers: list[MaskAnswer]
-    """One per text."""
+    """One result per prompt."""
     views: list[str]
-    """The photographs that it was asked in."""
+    """Names of the images that SAM 3 segmented."""
     found: Bool[Tensor, "q v"]
-    """In which of them it found the text."""
+    """True if SAM 3 found the prompt in the image."""
     min_reliability: float = 0.0
-    """R below which a Gaussian is not selected."""
+    """Minimum R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
-        """Gaussians of which more than half lies in the masks, of enough reliability."""
+        """Return the Gaussians with more than half of their weight inside the masks and enough reliability."""
         answer = self.answers[text]
         return answer.mask & (answer.scalars.reliability >= self.min_reliability)
 
     def summarize(self, means: Float[Tensor, "n 3"], selected: Bool[Tensor, "n q"]) -> list[dict[str, Any]]:
-        """The numbers of every text, ready for JSON.
+        """Return the numbers of every prompt as plain Python types.
 
         Args:
-            means: centres of the Gaussians.
-            selected: what the other answer selects for each text, to compare with.
+            means: centers of the Gaussians.
+            selected: selection of each prompt by another query, to compare with.
         """
         return [self._row(text, means, selected[:, text]) for text in range(len(self.answers))]
 
@@ -197,22 +203,22 @@ class Segmented(NamedTuple):
         answer = self.answers[text]
         mask, scalars = self.selected(text).cpu(), answer.scalars
         arrays = (means, scalars.reliability, scalars.weight)
-        numbers = Selection(len(mask), *(x.detach().cpu()[mask].numpy() for x in arrays))
-        either = int((mask | other).sum())
+        selection = Selection(len(mask), *(x.detach().cpu()[mask].numpy() for x in arrays))
+        union = int((mask | other).sum())
         weight = scalars.weight.cpu()[mask].double()
         agreement = float((weight * scalars.c_inter.cpu()[mask]).sum() / weight.sum()) if bool(mask.any()) else None
         return {
-            "fraction": numbers.fraction,
-            "centroid": numbers.centroid,
-            "extent": numbers.extent,
+            "fraction": selection.fraction,
+            "centroid": selection.centroid,
+            "extent": selection.extent,
             "peak": float(answer.relevancy.max()) if bool(answer.seen.any()) else None,
             "agreement": agreement,
-            "mean_reliability": numbers.mean_reliability,
+            "mean_reliability": selection.mean_reliability,
             "min_reliability": self.min_reliability,
             "views": self.views,
-            "agree": [name for name, there in zip(self.views, answer.voted.tolist()) if there],
-            "found_in": [name for name, there in zip(self.views, self.found[text].tolist()) if there],
-            "iou": int((mask & other).sum()) / either if either > 0 else None,
+            "agree": [name for name, voted in zip(self.views, answer.voted.tolist()) if voted],
+            "found_in": [name for name, found in zip(self.views, self.found[text].tolist()) if found],
+            "iou": int((mask & other).sum()) / union if union > 0 else None,
         }
 
 
@@ -227,28 +233,31 @@ def segment(
     device: str = "cpu",
     done: Callable[[], None] = lambda: None,
 ) -> Segmented:
-    """Asks SAM 3 for texts in some training views, evenly spread, and lifts its masks.
+    """Segment evenly spaced training views with SAM 3, and lift the masks.
 
     Args:
-        find: what SAM 3 finds of each text in a photograph.
-        views: how many, at most.
-        min_reliability: R below which a Gaussian is not selected, in 0..1.
+        find: returns SAM 3's mask of each prompt in an image.
+        texts: the prompts.
+        views: maximum number of views.
+        min_reliability: minimum R of a selected Gaussian, in 0..1.
         settings: constants of the rasterizer.
-        device: where to rasterize.
-        done: called after every view.
+        device: device to rasterize on.
+        done: called after each view.
     Raises:
-        FileNotFoundError, ValueError: a photograph that is missing or damaged; a text that is too long.
+        FileNotFoundError: an image does not exist.
+        ValueError: an image is damaged, or a prompt is too long.
     """
-    chosen, masks, cameras, counted = spread(len(scene.train), views), [], [], []
-    for index in chosen:
+    indices, masks, cameras, counted = spread(len(scene.train), views), [], [], []
+    for index in indices:
         view = scene.train[index]
         masks.append(find(view.image, texts).cpu())
         cameras.append(view.camera)
         counted.append(view.mask)
         done()
     gaussians = scene.gaussians.to(device)
-    how = {"rasterize_mode": scene.rasterize_mode, "settings": settings}
-    evidence = mask_evidence(gaussians, cameras, masks, counted=counted, **how)
+    evidence = mask_evidence(
+        gaussians, cameras, masks, counted=counted, rasterize_mode=scene.rasterize_mode, settings=settings
+    )
     answers = [evidence.answer(text) for text in range(len(texts))]
-    found = torch.stack([part.flatten(1).any(dim=1) for part in masks], dim=1)
-    return Segmented(answers, [scene.train.names[index] for index in chosen], found, min_reliability)
+    found = torch.stack([view_masks.flatten(1).any(dim=1) for view_masks in masks], dim=1)
+    return Segmented(answers, [scene.train.names[index] for index in indices], found, min_reliability)

@@ -1,4 +1,4 @@
-"""A few numbers about the Gaussians that a text selects."""
+"""Summary numbers of the Gaussians that a prompt selects."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ _CENTRAL = (0.05, 0.95)
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """M selected Gaussians of N. Places are in the scene's own units; None where nothing is selected.
+    """M selected Gaussians of N.
 
-    Means are weighted by W_j, what the views saw of each Gaussian.
+    Positions are in units of the scene, and None if nothing is selected. Means are weighted by W_j, the total weight of
+    Gaussian j over all views.
     """
 
     total: int
-    """N."""
+    """N, the number of Gaussians of the scene."""
     means: Float[np.ndarray, "m 3"]
     reliability: Float[np.ndarray, " m"]
     weight: Float[np.ndarray, " m"]
-    """W_j."""
+    """W_j of the selected Gaussians."""
 
     @property
     def fraction(self) -> float:
-        """Share of all Gaussians that is selected."""
+        """Fraction of all Gaussians that is selected, in 0..1."""
         return len(self.means) / self.total
 
     @property
     def centroid(self) -> list[float] | None:
-        """Weighted mean of the selected centres, x, y, z."""
-        return (self._share @ self.means.astype(np.float64)).tolist() if len(self.means) > 0 else None
+        """Weighted mean of the selected centers, [x, y, z]."""
+        return (self._normalized_weight @ self.means.astype(np.float64)).tolist() if len(self.means) > 0 else None
 
     @property
     def extent(self) -> list[float] | None:
-        """Size of the box that holds the central 90 % of the selected centres along each axis."""
+        """Size of the box that holds the central 90 % of the selected centers along each axis."""
         if len(self.means) == 0:
             return None
         low, high = np.quantile(self.means.astype(np.float64), _CENTRAL, axis=0)
@@ -45,10 +46,10 @@ class Selection:
 
     @property
     def mean_reliability(self) -> float | None:
-        """Weighted mean of R of the selected Gaussians."""
-        return float(self._share @ self.reliability.astype(np.float64)) if len(self.means) > 0 else None
+        """Weighted mean of R over the selected Gaussians."""
+        return float(self._normalized_weight @ self.reliability.astype(np.float64)) if len(self.means) > 0 else None
 
     @cached_property
-    def _share(self) -> Float[np.ndarray, " m"]:
+    def _normalized_weight(self) -> Float[np.ndarray, " m"]:
         weight = self.weight.astype(np.float64) + 1e-12
         return weight / weight.sum()

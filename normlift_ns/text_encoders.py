@@ -1,5 +1,6 @@
-"""Who reads the texts of a lifted run: the encoder that its manifest names. Needs torch for texts that are new to a
-network, and for nothing else.
+"""Text encoders for a lifted run, chosen by its manifest.
+
+This module needs torch only to encode prompts that are not in the cache.
 """
 
 from __future__ import annotations
@@ -19,30 +20,30 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import Rule, SourceOptions
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
-"""Options that say which encoder made a field, or knows the texts; they stand in its manifest."""
+"""Options that determine the encoder or the text embeddings of a field; its manifest records them."""
 GIVEN = "given"
-"""In the manifest in place of an encoder: features of the user's own."""
+"""Value in the manifest instead of an encoder name, for features provided by the user."""
 _CHOSEN = "texts_chosen"
-"""Key in the manifest of an opened run: texts are looked up in a file that the user named, whatever the lift had."""
+"""Key in the manifest of an opened run if the user chose a file of text embeddings that replaces those of the lift."""
 
 
 class DefaultRule(NamedTuple):
-    """A rule of relevancy, what it compares with, and its threshold; "auto": what the histogram suggests."""
+    """Default relevancy rule of an encoder, with negatives and threshold; "auto" is the suggested threshold."""
 
     rule: Rule
     negatives: tuple[str, ...]
     threshold: float | Literal["auto"]
 
 
-_COSINES = DefaultRule("cosine", (), "auto")
+_PLAIN_COSINE = DefaultRule("cosine", (), "auto")
 
 
 class Field(Protocol):
-    """A semantic field, in tensors or in arrays."""
+    """A semantic field, as tensors or NumPy arrays."""
 
     @property
     def manifest(self) -> Mapping[str, Any]:
-        """What is known of it."""
+        """The metadata of the field."""
         ...
 
 
@@ -50,43 +51,47 @@ FieldT = TypeVar("FieldT", bound=Any)
 
 
 def encoder_settings(options: SourceOptions) -> dict[str, Any]:
-    """What `encoder_of` needs to know, ready for JSON; paths of files absolute, so that they mean the same anywhere."""
+    """Return the settings that `encoder_of` needs, as JSON types, with absolute paths."""
     settings = {key: getattr(options, key) for key in ENCODER_KEYS} | absolute_paths(options)
     vectors = options.text_vectors
     return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
 
 
 def given_settings(text_vectors: str | None) -> dict[str, Any]:
-    """What `encoder_of` needs to know of features of the user's own.
+    """Return the settings that `encoder_of` needs for features provided by the user.
 
     Args:
-        text_vectors: name of a file of texts in the folder of the field; None: there is none.
+        text_vectors: name of a file of text embeddings in the folder of the field; None if there is none.
     """
     return {**encoder_settings(SourceOptions()), "encoder": GIVEN, "text_vectors": text_vectors}
 
 
 def with_texts(field: FieldT, *, vectors: Path | None = None, template: str | None = None) -> FieldT:
-    """The field, with texts looked up in another file, or read in another template; None: as it was lifted."""
+    """Return the field with a different source of text embeddings.
+
+    Args:
+        vectors: file of text embeddings (default: that of the lift).
+        template: prompt template (default: that of the lift).
+    """
     changes = {
         "text_vectors": None if vectors is None else os.path.abspath(vectors),
         "text_template": template,
     }
-    given = {key: value for key, value in changes.items() if value is not None}
-    encoder = {**(field.manifest.get("encoder") or {}), **given}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    encoder = {**(field.manifest.get("encoder") or {}), **changes}
     chosen = {} if vectors is None else {_CHOSEN: True}
     return replace(field, manifest={**field.manifest, "encoder": encoder, **chosen})
 
 
 def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> Texts:
-    """The encoder of texts that fits the field.
+    """Return the text encoder that fits a field.
 
     Args:
-        device: where a network runs, as `choose_device` takes it; "auto": on the CPU where it is a plain text tower.
-        cache: folder in which to keep vectors of texts that a network has read.
+        device: device of the network, as in `choose_device`; "auto" runs a plain text tower on the CPU.
+        cache: folder that caches embeddings computed by a network.
     Raises:
-        ValueError: the manifest names none that this version knows, or other files of weights or text vectors are in
-            the place of those of the lift.
-        FileNotFoundError: its weights, or its text vectors, are not there any more.
+        ValueError: the manifest names no known encoder, or the weights or text embeddings are not those of the lift.
+        FileNotFoundError: the weights or text embeddings do not exist any more.
     """
     options = _options(field)
     if options.text_vectors is not None:
@@ -95,15 +100,16 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
         vectors = TextVectors(options.text_vectors)
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
-                f"the vectors in {vectors.file} have {vectors.dimension} numbers, the features of the run "
-                f"{field.manifest['dimension']}; give texts with vectors of the network that made them (--text-vectors)"
+                f"the vectors in {vectors.file} have dimension {vectors.dimension}, the features of the run "
+                f"{field.manifest['dimension']}; give a file of text vectors from the encoder of these features "
+                "(--text-vectors)"
             )
         return vectors
     kind = _kind(options.encoder)
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
         return kind.texts(options, device, cache, recorded)
-    return _read_and_kept(kind, options, device, cache, recorded)
+    return _cached_texts(kind, options, device, cache, recorded)
 
 
 def _kind(name: str) -> EncoderKind:
@@ -111,15 +117,15 @@ def _kind(name: str) -> EncoderKind:
         return encoder_kind(name)
     except InputError as error:
         raise InputError(
-            f"the run was lifted with an encoder that is not to be had here: {error}. Install its package, or give "
-            "texts with vectors of it (--text-vectors)"
+            f"the run was lifted with an encoder that is not available here: {error}. Install its package, or give "
+            "a file of text vectors from that encoder (--text-vectors)"
         ) from None
 
 
-def _read_and_kept(
+def _cached_texts(
     kind: EncoderKind, options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> KeptTexts:
-    """The texts of an encoder, which is made where a text is new; it must be that of the lift."""
+    """Return a cached text encoder, which loads the network for new prompts and checks that it is that of the lift."""
 
     def network() -> Any:
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (needs torch)
@@ -128,9 +134,9 @@ def _read_and_kept(
         encoder = make_encoder(options, choose_device(device))
         if len(recorded) > 0 and json.dumps(encoder.identity, sort_keys=True) != json.dumps(recorded, sort_keys=True):
             raise InputError(
-                f"the encoder {options.encoder} is not what the run was lifted with, and would give other answers: it "
-                f"is {encoder.identity}, expected {dict(recorded)}. Put its files of the lift back; or give texts with "
-                "vectors of the same network, --text-vectors; or lift again with: ns-normlift"
+                f"the encoder {options.encoder} is not the one that the run was lifted with, so results would differ: "
+                f"it is {encoder.identity}, expected {dict(recorded)}. Restore its files; or give a file of text "
+                "vectors from the same network with --text-vectors; or lift again with: ns-normlift"
             )
         return encoder
 
@@ -142,13 +148,13 @@ def _read_and_kept(
 
 
 def _identity(features: object) -> Mapping[str, Any]:
-    """What the manifest says of the encoder that made features; nothing where it does not."""
-    found = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
-    return found if isinstance(found, Mapping) else {}
+    """Return the identity of the encoder that a manifest records with its features; an empty dict if there is none."""
+    identity = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
+    return identity if isinstance(identity, Mapping) else {}
 
 
 def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
-    """Tells the encoder of one field from that of another; None where the manifest does not name it."""
+    """Return a digest that identifies the encoder of a field; None if the manifest does not record the encoder."""
     features = manifest.get("features")
     if not isinstance(features, Mapping) or len(features) == 0:
         return None
@@ -156,18 +162,18 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
 
 
 def _check_vectors(path: Path, expected: object) -> None:
-    """Makes sure that a file of text vectors has the content that it had in the lift. It is read whole at every use."""
+    """Raise if the content of a file of text embeddings has changed since the lift; this reads the whole file."""
     remedy = (
-        "put the file of the lift back there; or give texts with vectors of the same network, --text-vectors; or lift "
-        "again with: ns-normlift"
+        "restore the file; or give a file of text vectors from the same network with --text-vectors; or lift again "
+        "with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
-        raise InputError(f"the run's file of text vectors {path} is no file any more; {remedy}")
+        raise InputError(f"the run's file of text vectors {path} is not a regular file any more; {remedy}")
     if not path.is_file():
         raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
-    if isinstance(expected, str) and (found := TextVectors(path).identity["content"]) != expected:
+    if isinstance(expected, str) and (actual := TextVectors(path).identity["content"]) != expected:
         raise InputError(
-            f"{path} is not what the run was lifted with, and would give other answers: its content is {found}, "
+            f"{path} is not the file that the run was lifted with, so results would differ: its content is {actual}, "
             f"expected {expected}. {remedy[0].upper()}{remedy[1:]}"
         )
 
@@ -179,32 +185,34 @@ def _options(field: Field) -> SourceOptions:
     vectors = stored["text_vectors"]
     if stored["encoder"] == GIVEN and vectors is None:
         raise InputError(
-            "this run was lifted from features of your own, without texts; name a file of texts and their vectors "
-            "(--text-vectors), or lift again and give texts"
+            "this run was lifted from features of your own, without texts; give a file of texts and their vectors "
+            "(--text-vectors), or lift again with texts"
         )
-    encoder = "open_clip" if stored["encoder"] == GIVEN else stored["encoder"]  # which the texts do without
+    encoder = "open_clip" if stored["encoder"] == GIVEN else stored["encoder"]  # a placeholder that is never loaded
     return SourceOptions(**{**stored, "encoder": encoder})
 
 
 def encoder_name(field: Field) -> str | None:
-    """The name of the encoder that made a field; None where the manifest does not name it."""
+    """Return the name of the encoder of a field; None if the manifest does not record it."""
     stored = field.manifest.get("encoder")
     name = stored.get("encoder") if isinstance(stored, Mapping) else None
     return name if isinstance(name, str) else None
 
 
 def default_rule(field: Field) -> DefaultRule:
-    """How the encoder of a field is asked unless a question says otherwise. A file of text vectors may not know its
-    negatives; then cosines are left, as of an encoder that is not known here."""
+    """Return the default rule, negatives and threshold of a field's encoder.
+
+    For an unknown encoder, or a file of text embeddings without the default negatives, the rule is plain cosine.
+    """
     stored = field.manifest.get("encoder")
     if not isinstance(stored, Mapping):
-        return _COSINES
+        return _PLAIN_COSINE
     name, vectors = stored.get("encoder"), stored.get("text_vectors")
     kind = known_kind("open_clip" if name == GIVEN else name)
     if kind is None:
-        return _COSINES
-    if vectors is not None:  # it may be written later, with the run
-        known = TextVectors(Path(vectors)).names if Path(vectors).is_file() else ()
-        if not set(kind.negatives) <= set(known):
-            return _COSINES
+        return _PLAIN_COSINE
+    if vectors is not None:  # the file may not exist yet, if it is written together with the run
+        names = TextVectors(Path(vectors)).names if Path(vectors).is_file() else ()
+        if not set(kind.negatives) <= set(names):
+            return _PLAIN_COSINE
     return DefaultRule(kind.rule, kind.negatives, kind.threshold)

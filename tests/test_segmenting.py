@@ -53,7 +53,7 @@ def test_shares_agreement_and_reliability_are_their_formulas():
         torch.testing.assert_close(again.relevancy[known], share[known], **close)
         assert bool((again.scalars.reliability >= answer.scalars.reliability)[known].all())
     mask = torch.zeros(1, 24, 40, dtype=torch.bool)
-    with pytest.raises(ValueError, match="2 of 3"):
+    with pytest.raises(ValueError, match="2 sets for 3 cameras"):
         mask_evidence(scene, cameras, [mask, mask])
     with pytest.raises(ValueError, match=r"view 1 .*\(1, 24, 39\), .*\[1, 24, 40\]"):
         mask_evidence(scene, cameras, [mask, mask[:, :, 1:], mask])

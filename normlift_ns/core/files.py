@@ -1,7 +1,7 @@
-"""The one way to write: completely or not at all, and over nothing that is there unless asked.
+"""Atomic file writes, which replace existing files only if asked to.
 
-Everything is made in a temporary folder beside its place, flushed to the disk and renamed. A process keeps the lock of
-its temporary folder as long as it lives, so that the next one can tell what is left over, and removes it.
+New files are written into a temporary folder next to their destination, flushed to the disk and renamed. A process
+holds the lock of its temporary folder for as long as it runs; later processes remove folders that are not locked.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from normlift_ns.core.disk.atomic import exchange, held, hold, release, rename_n
 from normlift_ns.core.disk.journal import complete, write_journal
 from normlift_ns.errors import InputError
 
-_TEMPORARY = ".normlift-"
-_OURS = re.compile(r"\.normlift-[0-9a-f]{16}")
-"""Names of temporary folders."""
+_TEMPORARY_PREFIX = ".normlift-"
+_TEMPORARY_NAME = re.compile(r"\.normlift-[0-9a-f]{16}")
 _RUN_FILES = {"config.yml", "dataparser_transforms.json", "splat.json", "transforms.json"}
 _RUN_FILES |= {"nerfstudio_models", "normlift"}
-_AGE = 86400
-"""Seconds after which a temporary folder counts as left over where the system has no locks."""
+_MAX_AGE = 86400
+"""Seconds after which a temporary folder counts as left over on systems without locks."""
 
 
 class NotWrittenError(OSError):
-    """Something cannot be written: the message names it as it would be called, and says why."""
+    """Failure to write a file or folder; the message has its final path and the reason."""
 
 
 @contextmanager
 def new_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] = ()) -> Iterator[tuple[Path, ...]]:
-    """Yields a draft of every path, all of one folder; when they are written, they take their places together.
+    """Yield a temporary path for each path; when the block ends, rename all of them to their final paths together.
 
-    Two processes that write the same paths at once never mix their files. If this one dies between the first rename and
-    the last, the next that writes there completes them.
+    If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
+    first rename and the last, the next process that writes to the folder completes the renames.
 
     Args:
-        overwrite: replace what is there.
-        remove: files that must not outlive those that are replaced.
+        paths: the final paths, all in one folder.
+        overwrite: replace existing files.
+        remove: existing files to delete in the same step.
     Raises:
-        FileExistsError: something is there, and `overwrite` is False.
-        NotWrittenError: the disk is full, or the like; nothing has changed then.
+        FileExistsError: a path exists, and `overwrite` is False.
+        NotWrittenError: writing failed, for instance because the disk is full; nothing has changed then.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "new folder" / "a.txt"
@@ -56,40 +56,40 @@ def new_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] = ()
     >>> path.read_text()
     'text'
     """
-    folder, taken = paths[0].parent, None
+    folder, existing = paths[0].parent, None
     with _draft_folder(*paths) as temporary:
         drafts = tuple(temporary / path.name for path in paths)
         yield drafts
         _flush(temporary)
         with held(folder):
             if not overwrite:
-                taken = next((path for path in paths if os.path.lexists(path)), None)
-            if taken is None:
-                taken = _take_places(temporary, drafts, overwrite, remove)
+                existing = next((path for path in paths if os.path.lexists(path)), None)
+            if existing is None:
+                existing = _rename_drafts(temporary, drafts, overwrite, remove)
         _flush_names(folder)
-    if taken is not None:
-        raise FileExistsError(f"{taken} exists; give another name, or allow to overwrite it")
+    if existing is not None:
+        raise FileExistsError(f"{existing} exists; give another name, or allow overwriting it")
 
 
 @contextmanager
 def new_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """`new_files` for one."""
+    """Yield a temporary path for a single file; see `new_files`."""
     with new_files(path, overwrite=overwrite) as (draft,):
         yield draft
 
 
 def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
-    """A text file in UTF-8; raises as `new_files`."""
+    """Write a UTF-8 text file atomically; raises the errors of `new_files`."""
     with new_file(path, overwrite=overwrite) as draft:
         draft.write_text(text, "utf8")
 
 
 @contextmanager
 def draft_directory(path: Path) -> Iterator[Path]:
-    """Yields an empty folder, for `publish` to put in the place of `path` or of another name beside it.
+    """Yield an empty temporary folder, which `publish` can rename to `path` or to another name next to it.
 
     Raises:
-        NotWrittenError: the disk is full, or the like.
+        NotWrittenError: writing failed, for instance because the disk is full.
     """
     with _draft_folder(path) as temporary:
         draft = temporary / path.name
@@ -98,10 +98,10 @@ def draft_directory(path: Path) -> Iterator[Path]:
 
 
 def publish(draft: Path, path: Path, *, overwrite: bool = False) -> bool:
-    """Renames a folder of `draft_directory` to its name; False if something is there and may not be replaced.
+    """Rename a folder of `draft_directory` to its final path; return False if that exists and `overwrite` is False.
 
-    What is replaced is there, old or new, at every instant: the two are exchanged. Where the system cannot, a journal
-    says what is under way, so that the next command that opens or writes the run completes it.
+    A replaced folder exists at every instant, old or new, because the two are exchanged. If the system cannot exchange
+    folders, a journal records the steps, and the next command that opens or writes the run completes them.
     """
     _flush(draft)
     with held(path.parent):
@@ -114,18 +114,18 @@ def publish(draft: Path, path: Path, *, overwrite: bool = False) -> bool:
     return True
 
 
-def _take_places(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
-    """Renames drafts to their places; returns one that somebody else has taken meanwhile, if there is one."""
+def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
+    """Rename drafts to their final paths; return a path that another program has created meanwhile, if any."""
     journal, folder = None, temporary.parent
     if len(drafts) + len(remove) > 1:
-        clean(folder)  # an older export that was never completed must not be completed after this one
+        clean(folder)  # complete an older interrupted export now: completing it later would overwrite this one
         names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
         journal = write_journal(temporary, names | {"overwrite": overwrite})
         _flush_names(temporary)
     for draft in drafts:
         if overwrite:
             os.replace(draft, folder / draft.name)
-        elif not rename_new(draft, folder / draft.name):  # no process of ours put that there just now
+        elif not rename_new(draft, folder / draft.name):  # created just now by a program that ignores our lock
             if journal is not None:
                 journal.unlink()
             return folder / draft.name
@@ -146,18 +146,18 @@ def _replace_in_steps(draft: Path, path: Path) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Removes what processes that ended half-way have left in a folder, and completes what they were replacing.
+    """Complete the interrupted replacements in a folder, and remove temporary folders that were left behind.
 
-    What a running process writes is left alone.
+    Temporary folders of running processes are left unchanged.
     """
-    for temporary in folder.glob(f"{_TEMPORARY}*"):
-        if _OURS.fullmatch(temporary.name) is None or temporary.is_symlink():
+    for temporary in folder.glob(f"{_TEMPORARY_PREFIX}*"):
+        if _TEMPORARY_NAME.fullmatch(temporary.name) is None or temporary.is_symlink():
             continue
-        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):  # a process holds it, or no journal
+        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):  # locked, or an invalid journal
             descriptor = hold(temporary)
             try:
-                ours = complete(temporary)
-                if ours and (descriptor is not None or time.time() - temporary.stat().st_mtime > _AGE):
+                removable = complete(temporary)
+                if removable and (descriptor is not None or time.time() - temporary.stat().st_mtime > _MAX_AGE):
                     shutil.rmtree(temporary, ignore_errors=True)
             finally:
                 release(descriptor)
@@ -165,7 +165,7 @@ def clean(folder: Path) -> None:
 
 @contextmanager
 def _draft_folder(*paths: Path) -> Iterator[Path]:
-    """A temporary folder beside the paths; errors name the paths, not what is in it."""
+    """Yield a temporary folder next to the paths; error messages name these paths, not the temporary ones."""
     folder, temporary = paths[0].parent, None
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -179,24 +179,28 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
                 shutil.rmtree(temporary, ignore_errors=True)
             finally:
                 release(descriptor)
-    except (OSError, RuntimeError, SafetensorError) as error:  # what torch and safetensors make of a full disk
+    except (
+        OSError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:  # torch and safetensors raise the latter if a disk is full
         reason = str(error)
         if temporary is not None:
             reason = reason.replace(f"{temporary}{os.sep}", f"{folder}{os.sep}")
         if not isinstance(error, NotWrittenError):
             names = ", ".join(map(str, paths))
             blocked = isinstance(error, IsADirectoryError | NotADirectoryError | FileExistsError)
-            remedy = "delete what is in its place" if blocked else "free disk space or choose another folder"
+            remedy = "delete what blocks this path" if blocked else "free disk space or choose another folder"
             reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
         raise NotWrittenError(reason) from error
 
 
 def _temporary_folder(folder: Path) -> tuple[Path, int | None]:
-    """A new folder and its lock. It is made as any other folder, because mkdtemp's would hide it from the group."""
+    """Create and lock a temporary folder. Unlike a folder of mkdtemp, it has the default permissions of new folders."""
     while True:
-        temporary = folder / f"{_TEMPORARY}{secrets.token_hex(8)}"
+        temporary = folder / f"{_TEMPORARY_PREFIX}{secrets.token_hex(8)}"
         temporary.mkdir()
-        with suppress(BlockingIOError, FileNotFoundError):  # a process that cleans was faster
+        with suppress(BlockingIOError, FileNotFoundError):  # another process is in `clean`
             descriptor = hold(temporary)
             if temporary.exists():
                 return temporary, descriptor
@@ -204,13 +208,13 @@ def _temporary_folder(folder: Path) -> tuple[Path, int | None]:
 
 
 def _flush(folder: Path) -> None:
-    """Everything in a temporary folder reaches the disk, with the rights that new files have."""
-    rights = folder.stat().st_mode & 0o666  # safetensors gives its files to their owner alone
+    """Flush a temporary folder with all its files to the disk, and give the files default permissions."""
+    mode = folder.stat().st_mode & 0o666  # safetensors writes files that only their owner can read
     for parent, _, files in os.walk(folder):
         for name in files:
             path = os.path.join(parent, name)
-            with suppress(OSError):  # a file system without rights
-                os.chmod(path, rights)
+            with suppress(OSError):  # a file system without permissions
+                os.chmod(path, mode)
             descriptor = os.open(path, os.O_RDWR)
             try:
                 os.fsync(descriptor)
@@ -220,7 +224,7 @@ def _flush(folder: Path) -> None:
 
 
 def _flush_names(folder: Path) -> None:
-    """The names in a folder reach the disk, where the system can do that."""
+    """Flush the entries of a folder to the disk, if the system supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -230,13 +234,13 @@ def _flush_names(folder: Path) -> None:
 
 
 def refuse_existing(*paths: Path, overwrite: bool, instead: str) -> None:
-    """Says, before anything is computed, what a command would replace unasked.
+    """Raise, before anything is computed, if a command would overwrite an existing file without being asked to.
 
     Args:
-        instead: the flags that name another place.
+        instead: flags with which the user can choose another path, for the error message.
     Raises:
-        FileExistsError: one of the paths is there and `overwrite` is False.
-        ValueError: as `refuse_run_files`.
+        FileExistsError: one of the paths exists and `overwrite` is False.
+        ValueError: as in `refuse_run_files`.
     """
     refuse_run_files(*paths, instead=instead)
     for folder in {path.parent for path in paths}:
@@ -247,7 +251,7 @@ def refuse_existing(*paths: Path, overwrite: bool, instead: str) -> None:
 
 
 def file_name(text: str) -> str:
-    """A text as part of a file name: letters and digits stay, 40 characters at most.
+    """Return a string as part of a file name: at most 40 characters, with `_` for all but letters and digits.
 
     >>> file_name("../tea pot")
     '___tea_pot'
@@ -256,7 +260,7 @@ def file_name(text: str) -> str:
 
 
 def numbered(path: Path) -> Iterator[Path]:
-    """The path, then path_2, path_3, …
+    """Yield the path, then path_2, path_3, …
 
     >>> names = numbered(Path("red.ply"))
     >>> next(names).name, next(names).name
@@ -267,23 +271,23 @@ def numbered(path: Path) -> Iterator[Path]:
 
 
 def refuse_run_files(*paths: Path, instead: str) -> None:
-    """Says, before anything is computed, that an output would take the place of a part of a run, asked or not.
+    """Raise, before anything is computed, if an output would replace a part of a run, even with --overwrite.
 
-    A run is a folder with config.yml and nerfstudio_models/ in it; pictures, tables and exports beside these are fine.
+    A run is a folder that has config.yml and nerfstudio_models/. Figures, tables and exports next to these are allowed.
 
     Args:
-        instead: the flags that name another place.
+        instead: flags with which the user can choose another path, for the error message.
     Raises:
-        ValueError: one of the paths, followed through links, is that of a run's file, or in a folder of its files.
+        ValueError: a path, with links resolved, is a file of a run or inside one of its folders.
 
     >>> refuse_run_files(Path("answers.json"), instead="--json")
     """
     for path in paths:
-        place = path.resolve()
-        for run in place.parents:
-            inside = place.relative_to(run).parts[0]
-            if inside in _RUN_FILES and (run / "config.yml").is_file() and (run / "nerfstudio_models").is_dir():
+        resolved = path.resolve()
+        for run in resolved.parents:
+            entry = resolved.relative_to(run).parts[0]
+            if entry in _RUN_FILES and (run / "config.yml").is_file() and (run / "nerfstudio_models").is_dir():
                 raise InputError(
-                    f"{path} is part of the run {run}, which it would destroy; give another {instead}, with or without "
-                    "--overwrite True"
+                    f"{path} is part of the run {run}, and replacing it would destroy the run; give another {instead} "
+                    "(--overwrite True does not allow this)"
                 )

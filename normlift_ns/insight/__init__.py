@@ -1,1 +1,1 @@
-"""What an answer rests on: how relevancies are spread, which photographs voted, which Gaussians belong to nothing."""
+"""Diagnostics of a query: relevancy histograms, votes of images, and floaters."""

@@ -1,12 +1,13 @@
-"""How the relevancies of one text are spread over a scene: where to cut, and whether anything stands out at all.
+"""Histogram of the relevancies of one prompt, with a suggested threshold and a test for absence from the scene.
 
-With m the median relevancy of the Gaussians that have a direction, and t the top, which one in a thousand exceeds (m is
-the least relevancy where more than half of them are at the top, so that a threshold is left to tell them by):
+Let m be the median relevancy of the Gaussians that have a direction, and t their top: the relevancy that one in a
+thousand exceeds. If more than half of them are at the top, m is the minimum instead, so that a threshold can still
+separate them.
 
-* The suggested threshold is m + 0.6 (t - m). It has no unit, so that it serves any encoder and any rule.
-* A text is probably not in the scene where t is below a limit, which depends on the rule: see `top_limit`.
+* The suggested threshold is m + 0.6 (t - m). It adapts to the range of relevancies, so it suits any encoder and rule.
+* The prompt is probably not in the scene if t is below a limit that depends on the rule; see `top_limit`.
 
-docs/honest_answers.md has the error rates of both, and what did worse. Needs no torch.
+docs/honest_answers.md has the error rates of both, and of alternatives that did worse. This module does not need torch.
 """
 
 from __future__ import annotations
@@ -22,33 +23,33 @@ from jaxtyping import Bool, Float, Int64
 from normlift_ns.options import RULES, Rule
 
 BINS = 32
-_TOP = 0.999
-"""Quantile of relevancies that is the top: a single stray Gaussian is none."""
-_PART = 0.6
-"""Of the way from the median to the top, where the suggested threshold is."""
-_ALIKE = 1e-3
-"""Share of the range of relevancies within which the median is at the top."""
-_SAME = 1e-6
-"""Relevancies that differ by less are the same; where all are, and above 0, this far below them is suggested."""
-_LEAST_COLOUR = 0.9
-"""Top of bare cosines of the colour encoder below which a text is probably not in the scene."""
+_TOP_QUANTILE = 0.999
+"""Quantile of relevancies that defines the top; a single stray Gaussian does not affect it."""
+_SUGGESTED_FRACTION = 0.6
+"""Position of the suggested threshold between the median (0) and the top (1)."""
+_AT_TOP = 1e-3
+"""The median counts as being at the top if it is closer than this fraction of the range of relevancies."""
+_EPSILON = 1e-6
+"""Relevancies that differ by less count as equal; if all are equal and positive, the threshold is this far below."""
+_COLOR_LIMIT = 0.9
+"""Limit of the top for plain cosines of the color encoder."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Relevancies of one text in equal bins, with the threshold among them.
+    """Relevancies of one prompt in bins of equal width, with the threshold within their range.
 
     >>> import numpy as np
     >>> from normlift_ns.insight.histogram import histogram
     >>> values = np.array([0.1] * 60 + [0.2] * 30 + [0.9] * 10)
-    >>> found = histogram(values, np.ones(100, bool), threshold=0.5, limit=0.62)
-    >>> int(found.counts.sum()), round(found.suggested, 6), found.stands_out
+    >>> hist = histogram(values, np.ones(100, bool), threshold=0.5, limit=0.62)
+    >>> int(hist.counts.sum()), round(hist.suggested, 6), hist.stands_out
     (100, 0.58, True)
     """
 
     edges: Float[np.ndarray, " bins_plus_1"]
-    """They hold every relevancy of a Gaussian that has a direction, and the threshold."""
+    """Bin edges; their range includes the threshold and the relevancy of every Gaussian that has a direction."""
     counts: Int64[np.ndarray, " bins"]
     threshold: float
     """Relevancy above which a Gaussian is selected."""
@@ -56,20 +57,20 @@ class Histogram:
     top: float
     """Relevancy that one Gaussian in a thousand exceeds."""
     limit: float | None
-    """A text whose top is lower is probably not in the scene; None: with this encoder and rule, nobody can tell."""
+    """A prompt with a lower top is probably not in the scene; None if this encoder and rule have no such limit."""
 
     @property
     def suggested(self) -> float:
-        """The threshold that the relevancies suggest."""
-        return _between(self.median, self.top)
+        """Suggested threshold for this prompt."""
+        return _suggest(self.median, self.top)
 
     @property
     def stands_out(self) -> bool | None:
-        """False where the text is probably not in the scene; None where nobody can tell."""
+        """False if the prompt is probably not in the scene; None if there is no limit to decide by."""
         return None if self.limit is None else self.top >= self.limit
 
     def to_json(self) -> dict[str, Any]:
-        """The same as plain types, with what follows from it."""
+        """Return the range, counts and statistics as plain Python types."""
         return {
             "low": float(self.edges[0]),
             "high": float(self.edges[-1]),
@@ -83,24 +84,26 @@ class Histogram:
 def histogram(
     relevancy: Float[np.ndarray, " n"], valid: Bool[np.ndarray, " n"], *, threshold: float, limit: float | None
 ) -> Histogram | None:
-    """The histogram of one text; None where no Gaussian has a direction.
+    """Return the histogram of one prompt; None if no Gaussian has a direction.
 
     Args:
-        limit: as `top_limit` gives it.
+        valid: True for Gaussians that have a direction.
+        threshold: relevancy above which a Gaussian is selected.
+        limit: result of `top_limit`.
     """
     values = relevancy[valid].astype(np.float64)
     if len(values) == 0:
         return None
     low, high = min(float(values.min()), threshold), max(float(values.max()), threshold)
-    if high - low < _SAME:
-        low, high = low - _SAME / 2, high + _SAME / 2
+    if high - low < _EPSILON:
+        low, high = low - _EPSILON / 2, high + _EPSILON / 2
     counts, edges = np.histogram(values, BINS, (low, high))
     median, top = _median_and_top(values)
     return Histogram(edges, counts.astype(np.int64), threshold, median, top, limit)
 
 
 def bars(counts: Sequence[int] | Int64[np.ndarray, " bins"], low: float, high: float, threshold: float) -> str:
-    """One line of text: a bar for two bins, the higher the more Gaussians (logarithmic), and | at the threshold.
+    """Draw a histogram as one line of text, with one bar per two bins, a logarithmic scale, and | at the threshold.
 
     >>> bars([500, 0, 50, 0, 0, 0, 0, 5], 0.0, 1.0, 0.5)
     '█▆| ▃'
@@ -108,12 +111,12 @@ def bars(counts: Sequence[int] | Int64[np.ndarray, " bins"], low: float, high: f
     pairs = np.asarray(counts).reshape(-1, 2).sum(axis=1)
     heights = np.log1p(pairs) / np.log1p(pairs.max()) * (len(_BARS) - 1)
     line = "".join(_BARS[math.ceil(height - 1e-9)] for height in heights)
-    place = round((threshold - low) / (high - low) * len(line))
-    return f"{line[:place]}|{line[place:]}"
+    position = round((threshold - low) / (high - low) * len(line))
+    return f"{line[:position]}|{line[position:]}"
 
 
 def suggested_threshold(relevancy: Float[np.ndarray, "n q"], valid: Bool[np.ndarray, " n"]) -> float | None:
-    """One threshold for all texts of a question, from all their relevancies; None where no Gaussian has a direction.
+    """Suggest one threshold for all prompts of a query; return None if no Gaussian has a direction.
 
     >>> suggested_threshold(np.array([[0.0, 0.0], [0.0, 0.1], [0.0, 1.0]]), np.ones(3, bool)) > 0.5
     True
@@ -123,28 +126,29 @@ def suggested_threshold(relevancy: Float[np.ndarray, "n q"], valid: Bool[np.ndar
     values = relevancy[valid].astype(np.float64).ravel()
     if len(values) == 0:
         return None
-    return _between(*_median_and_top(values))
+    return _suggest(*_median_and_top(values))
 
 
 def top_limit(rule: Rule, encoder: str | None) -> float | None:
-    """The least top of a text that is in the scene; None where there is no such number.
+    """Return the limit of the top below which a prompt is probably not in the scene; None if there is no such limit.
 
-    Relevancies of rules lerf and margin say by how much a text leads the negatives, whatever the encoder; bare cosines
-    mean something where it is known how they are spread, which is so of the colour encoder: 0.9 is a neighbouring
-    shade. Those of CLIP lie between 0.1 and 0.4, higher for some texts than for others, in the scene or not.
+    Relevancies of the rules lerf and margin measure the lead over the negatives, which has a meaning with any encoder.
+    Plain cosines have a meaning only if their distribution is known, as it is for the color encoder, where 0.9 is a
+    neighboring shade. Cosines of CLIP lie between 0.1 and 0.4, and vary by prompt, in the scene or not.
 
     >>> top_limit("lerf", "open_clip"), top_limit("cosine", "colour"), top_limit("cosine", "open_clip")
     (0.62, 0.9, None)
     """
-    return _LEAST_COLOUR if rule == "cosine" and encoder == "colour" else RULES[rule].present
+    return _COLOR_LIMIT if rule == "cosine" and encoder == "colour" else RULES[rule].present
 
 
-def _between(median: float, top: float) -> float:
-    found = median + _PART * (top - median)
-    return min(found, top - _SAME) if top > 0 else found  # where nothing is relevant, nothing is selected
+def _suggest(median: float, top: float) -> float:
+    threshold = median + _SUGGESTED_FRACTION * (top - median)
+    return min(threshold, top - _EPSILON) if top > 0 else threshold  # if nothing is relevant, select nothing
 
 
 def _median_and_top(values: np.ndarray) -> tuple[float, float]:
-    median, top = np.quantile(values, (0.5, _TOP)).tolist()
+    """Return the median and the top; the minimum in place of the median if that is at the top."""
+    median, top = np.quantile(values, (0.5, _TOP_QUANTILE)).tolist()
     least = float(values.min())
-    return (least if top - median < _ALIKE * (top - least) else median), top
+    return (least if top - median < _AT_TOP * (top - least) else median), top

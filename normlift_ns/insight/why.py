@@ -1,15 +1,15 @@
-"""Why a selection of Gaussians means what it means: the photographs and regions that voted for it.
+"""Explanation of a selection of Gaussians by the images and regions that voted for it.
 
-A selection is read as one large Gaussian, whose evidence is the sum of that of its members. With E_s = sum_j E_js and
-F_s the unit feature of region s::
+The selection is treated as one large Gaussian whose evidence is the sum over its members. With E_s = sum_j E_js and F_s
+the unit feature of region s::
 
-    W_v  = sum_{s in v} E_s                    what photograph v weighs
-    S_v  = sum_{s in v} E_s F_s                what it says
-    a_v  = cos(S_v, sum_v S_v)                 how far it agrees with all of them together
+    W_v  = sum_{s in v} E_s                    weight of image v
+    S_v  = sum_{s in v} E_s F_s                vote of image v
+    a_v  = cos(S_v, sum_v S_v)                 agreement of image v with the sum of all votes
     C_inter = ||sum_v S_v|| / sum_v ||S_v||    and norm, C_intra, N_eff, R as in `core.lift`
 
-The disagreement 1 - C_inter is a sum over photographs, of ||S_v|| (1 - a_v) / sum_v ||S_v||: those that disagree most
-have the largest terms. A Gaussian that has copied the direction of a neighbour brings the evidence of that neighbour.
+The disagreement 1 - C_inter is the sum over images of ||S_v|| (1 - a_v) / sum_v ||S_v||. The images that disagree most
+have the largest terms. A Gaussian that copied the direction of a neighbor counts with that neighbor's evidence.
 """
 
 from __future__ import annotations
@@ -27,51 +27,51 @@ from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from normlift_ns.options import Unlabeled
 
-_REST = 0.1
-"""Share of a photograph's weight that regions which are not listed may have together."""
+_UNLISTED_SHARE = 0.1
+"""Maximum fraction of an image's weight in regions that are not listed."""
 
 
 class RegionVote(NamedTuple):
-    """One region of a photograph."""
+    """Vote of one region of an image."""
 
     region: int
-    """Number within its photograph."""
+    """Index of the region within its image."""
     weight: float
     """E_s, in pixels."""
     share: float
-    """Of its photograph's weight, in 0..1."""
+    """Fraction of the image's weight, in 0..1."""
     agreement: float
-    """Cosine of its feature to the selection's direction."""
+    """Cosine between the region's feature and the direction of the selection."""
 
 
 @dataclass(frozen=True)
 class ViewVote:
-    """What one photograph says of a selection."""
+    """Vote of one image for a selection."""
 
     view: int
-    """Number in the order of the lift."""
+    """Index of the image in the order of the lift."""
     weight: float
     """W_v, in pixels."""
     share: float
-    """Of the weight of all photographs, in 0..1."""
+    """Fraction of the weight of all images, in 0..1."""
     agreement: float
     """a_v, in -1..1."""
     disagreement: float
-    """Its share of all disagreement, in 0..1; 0 where all agree."""
+    """Fraction of the total disagreement, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
-    """The heaviest first, until a tenth of the weight is left."""
+    """Regions by descending weight, until at most a tenth of the image's weight is left."""
 
 
 @dataclass(frozen=True)
 class Why:
-    """What photographs say of a selection.
+    """Explanation of a selection: the votes of all images, and how well they agree.
 
     >>> import torch
     >>> from normlift_ns import Evidence
     >>> from normlift_ns.core.evidence import Entries
     >>> from normlift_ns.insight.why import explain_selection
-    >>> seen = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3]), torch.tensor([3.0, 1, 3, 1]), (1, 1))
-    >>> evidence = Evidence.from_entries([seen], 3)
+    >>> entries = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3]), torch.tensor([3.0, 1, 3, 1]), (1, 1))
+    >>> evidence = Evidence.from_entries([entries], 3)
     >>> why = explain_selection(evidence, torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([True, True, False]))
     >>> [(vote.view, vote.weight, round(vote.agreement, 3)) for vote in why.views]
     [(0, 6.0, 0.949), (1, 2.0, 0.316)]
@@ -80,48 +80,48 @@ class Why:
     """
 
     gaussians: int
-    """Of the selection."""
+    """Number of selected Gaussians."""
     copied: int
-    """Those that have copied a neighbour's direction, and brought its evidence."""
+    """Number of those that copied a neighbor's direction, and count with its evidence."""
     norm: float
     c_intra: float
     c_inter: float
     n_eff: float
     reliability: float
-    """Of the selection as one Gaussian."""
+    """R of the selection, treated as one Gaussian like the four numbers above."""
     views: tuple[ViewVote, ...]
-    """The heaviest first; photographs without weight are left out."""
+    """Votes by descending weight; images without weight are left out."""
 
     @property
     def most_different(self) -> tuple[ViewVote, ...]:
-        """Photographs in which the disagreement lies, the most of it first; none where all agree."""
-        found = [vote for vote in self.views if vote.disagreement > 0]
-        return tuple(sorted(found, key=lambda vote: -vote.disagreement))
+        """Votes of the images that disagree, by descending disagreement; empty if all images agree."""
+        votes = [vote for vote in self.views if vote.disagreement > 0]
+        return tuple(sorted(votes, key=lambda vote: -vote.disagreement))
 
     @property
     def words(self) -> str:
-        """How far the photographs agree, and on how many that rests.
+        """How well the images agree, and the effective number of images, as English sentences.
 
         >>> Why(5, 0, 0.9, 1.0, 0.97, 3.2, 0.7, ()).words
-        'The photographs agree (C_inter 0.97). It rests on as much as 3.2 photographs of equal weight (N_eff).'
+        'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'
         """
         if len(self.views) == 0 and self.n_eff == 0:
-            return "No photograph says anything of it."
+            return "No image shows the selection."
         if len(self.views) == 1:
-            return "Only one photograph shows it, so that nothing tells whether others would agree."
+            return "Only one image shows the selection, so there is no other image to confirm it."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
-        count = "a single photograph" if self.n_eff < 1.05 else f"{self.n_eff:.1f} photographs of equal weight"
-        return f"The photographs {level} (C_inter {self.c_inter:.2f}). It rests on as much as {count} (N_eff)."
+        count = "a single image" if self.n_eff < 1.05 else f"{self.n_eff:.1f} images of equal weight"
+        return f"The images {level} (C_inter {self.c_inter:.2f}). Their weights are equivalent to {count} (N_eff)."
 
     @property
     def sentence(self) -> str:
-        """The words, and how much of the selection has copied the direction of a neighbour."""
+        """The words, and the fraction of the selection that copied the direction of a neighbor."""
         if self.copied == 0:
             return self.words
-        return f"{self.words} {self.copied / self.gaussians:.0%} of it has copied the direction of a neighbour."
+        return f"{self.words} {self.copied / self.gaussians:.0%} of the selection copied the direction of a neighbor."
 
     def to_json(self) -> dict[str, Any]:
-        """The same as plain types, with the words."""
+        """Return all fields and the words as plain Python types."""
         plain = asdict(self)
         for view in plain["views"]:
             view["regions"] = [region._asdict() for region in view["regions"]]
@@ -130,11 +130,11 @@ class Why:
 
 _LEVELS = (
     (0.95, "agree"),
-    (0.85, "agree but for a few"),
-    (0.6, "agree in part"),
+    (0.85, "agree with few exceptions"),
+    (0.6, "agree partly"),
     (0.0, "contradict each other"),
 )
-"""C_inter in words."""
+"""Minimum C_inter of each description."""
 
 
 def explain_selection(
@@ -146,23 +146,25 @@ def explain_selection(
     beta: float = 1.0,
     unlabeled: Unlabeled = "ignore",
 ) -> Why:
-    """What photographs say of a selection.
+    """Explain a selection by the votes of the images.
 
     Args:
-        features: unit rows, one per column of the evidence.
-        source: the Gaussian whose direction each one has, as `refine` gives it; None: its own.
+        features: one unit row per column (region) of the evidence.
+        selected: True for the selected Gaussians.
+        source: for each Gaussian, the index of the one whose direction it has, from `refine`; None if all have their
+            own.
         beta, unlabeled: as in `lift`.
     Raises:
-        ValueError: nothing is selected, or arrays of another number of Gaussians or regions.
+        ValueError: nothing is selected, or the numbers of Gaussians or regions differ.
     """
     n = evidence.num_gaussians
     if selected.dtype != torch.bool or selected.shape != (n,):
         raise InputError(f"the selection must be {n:,} booleans, got {selected.dtype} {tuple(selected.shape)}")
     rows = selected.to(evidence.rows.offsets.device).nonzero().squeeze(1)
     if len(rows) == 0:
-        raise InputError("nothing is selected, so that nothing has voted for it; select at least one Gaussian")
+        raise InputError("nothing is selected; select at least one Gaussian")
     origin = rows if source is None else source.to(rows.device).long()[rows]
-    joined = _joined(evidence, origin)
+    joined = _summed(evidence, origin)
     lifted = lift(joined, features, beta=beta, unlabeled=unlabeled)
     scalars = {
         name: float(getattr(lifted.scalars, name)[0]) for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability")
@@ -172,30 +174,30 @@ def explain_selection(
     return Why(len(rows), int((origin != rows).sum()), **scalars, views=views)
 
 
-def _joined(evidence: Evidence, rows: Tensor) -> Evidence:
-    """The evidence of some Gaussians, each as often as it is named, as that of one."""
+def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
+    """Return the sum of the evidence of some Gaussians as one row; repeated Gaussians count repeatedly."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
-        some = matrix.select_rows(rows)
+        selected = matrix.select_rows(rows)
         weight = torch.zeros(columns, dtype=torch.float64, device=rows.device)
-        weight.index_add_(0, some.column.long(), some.weight.double())
-        place = weight.nonzero().squeeze(1)
-        offsets = torch.tensor([0, len(place)], device=rows.device)
-        parts.append(SparseRows(offsets, place.int(), weight[place]))
+        weight.index_add_(0, selected.column.long(), selected.weight.double())
+        column = weight.nonzero().squeeze(1)
+        offsets = torch.tensor([0, len(column)], device=rows.device)
+        parts.append(SparseRows(offsets, column.int(), weight[column]))
     return Evidence(parts[0], evidence.region_view, parts[1], evidence.num_views, evidence.weight_power)
 
 
 def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, ...]:
-    """One vote per photograph, from evidence of one row and the features of its entries."""
+    """Return one vote per image, from evidence with a single row and the features of its entries."""
     column, weight = joined.rows.column.long(), joined.rows.weight
     view = joined.region_view[column].long()
     total = torch.zeros(joined.num_views, dtype=torch.float64, device=weight.device).index_add_(0, view, weight)
-    says = table.new_zeros(joined.num_views, table.shape[1]).index_add_(0, view, weight[:, None] * table)
-    direction = torch.nn.functional.normalize(says.sum(0), dim=0)
-    length, along = says.norm(dim=1), says @ direction
-    differs = (length - along).clamp(min=0)
-    differs = torch.where(differs > 1e-12 * length, differs, 0.0)  # rounding
-    share = differs / differs.sum() if float(differs.sum()) > 0 else differs
+    vectors = table.new_zeros(joined.num_views, table.shape[1]).index_add_(0, view, weight[:, None] * table)
+    direction = torch.nn.functional.normalize(vectors.sum(0), dim=0)
+    length, along = vectors.norm(dim=1), vectors @ direction
+    gap = (length - along).clamp(min=0)
+    gap = torch.where(gap > 1e-12 * length, gap, 0.0)  # ignore rounding errors
+    disagreement = gap / gap.sum() if float(gap.sum()) > 0 else gap
     agreement = torch.where(length > 0, along / length.clamp(min=1e-300), 0.0).clamp(-1, 1)
     cosine, first = table @ direction, _first_columns(joined)
     votes = []
@@ -205,19 +207,19 @@ def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, .
         entries = (view == v).nonzero().squeeze(1)
         entries = entries[weight[entries].argsort(descending=True, stable=True)]
         before = weight[entries].cumsum(0) - weight[entries]
-        entries = entries[before <= (1 - _REST) * total[v]]
+        entries = entries[before <= (1 - _UNLISTED_SHARE) * total[v]]
         regions = tuple(
             RegionVote(
                 int(column[i] - first[v]), float(weight[i]), float(weight[i] / total[v]), float(cosine[i].clamp(-1, 1))
             )
             for i in entries.tolist()
         )
-        of_all = float(total[v] / total.sum())
-        votes.append(ViewVote(v, float(total[v]), of_all, float(agreement[v]), float(share[v]), regions))
+        share = float(total[v] / total.sum())
+        votes.append(ViewVote(v, float(total[v]), share, float(agreement[v]), float(disagreement[v]), regions))
     return tuple(votes)
 
 
 def _first_columns(joined: Evidence) -> Tensor:
-    """The first column of every photograph."""
+    """Return the index of the first column of each image."""
     views = torch.arange(joined.num_views, dtype=torch.int32, device=joined.region_view.device)
     return torch.searchsorted(joined.region_view.contiguous(), views)

@@ -1,4 +1,4 @@
-"""Objects in a selection: its parts, their oriented boxes, and a catalogue of them for other programs."""
+"""Objects in a selection: connected components, oriented boxes, and a catalogue for other programs."""
 
 from normlift_ns.objects.parts import Objects, SceneObject, connected_components, find_objects
 

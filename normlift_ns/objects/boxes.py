@@ -1,4 +1,4 @@
-"""Oriented boxes of centres, in which a stray Gaussian decides nothing."""
+"""Oriented bounding boxes of Gaussian centers that are robust to outliers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from normlift_ns.errors import InputError
 
 CENTRAL = (0.01, 0.99)
-"""Percentiles along the axes of a box between which it reaches."""
+"""Quantiles of the points along each axis that bound a box."""
 _FLAT = 1e-14
-"""Of variances: what is thinner is taken for flat."""
+"""Ratio of the smallest to the largest variance below which points count as flat."""
 _DIRECTIONS = np.array([
     direction for direction in product((-1, 0, 1), repeat=3) if direction > (0, 0, 0)
 ], dtype=np.float64)  # fmt: skip
@@ -24,7 +24,7 @@ _DIRECTIONS = np.array([
 
 @dataclass(frozen=True, eq=False)
 class OrientedBox:
-    """A box that may be turned.
+    """A box with arbitrary orientation.
 
     >>> box = oriented_box(np.array([[x, y, z] for x in (0, 8) for y in (0, 4) for z in (0, 2)], float))
     >>> box.size.round(2).tolist(), box.center.round(2).tolist(), abs(box.axes).round(2).tolist()[0]
@@ -33,37 +33,35 @@ class OrientedBox:
 
     center: Float64[np.ndarray, " 3"]
     size: Float64[np.ndarray, " 3"]
-    """Lengths of the edges, the longest first."""
+    """Edge lengths in descending order."""
     axes: Float64[np.ndarray, "3 3"]
-    """Unit vectors along these edges, one per row; right-handed."""
+    """Unit vectors along these edges, one per row, as a right-handed system."""
 
     @property
     def corners(self) -> Float64[np.ndarray, "8 3"]:
-        """Corner 4 a + 2 b + c lies at the far end of axis 0 where a is 1, of axis 1 where b is, of axis 2 where c is
-        1.
-        """
+        """The eight corners. Bits a, b, c of index 4 a + 2 b + c select the far end of axes 0, 1 and 2."""
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         return self.center + (signs * self.size) @ self.axes
 
     def moved(
         self, rotation: Float64[np.ndarray, "3 3"], scale: float, shift: Float64[np.ndarray, " 3"]
     ) -> OrientedBox:
-        """The box after p -> scale * rotation @ p + shift."""
+        """Return the box transformed by p -> scale * rotation @ p + shift."""
         return OrientedBox(scale * rotation @ self.center + shift, scale * self.size, self.axes @ rotation.T)
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
-    """The box of the middle of some points.
+    """Return the oriented box of the central points.
 
-    Its axes are those of the smallest box (trimesh) around the points that lie between the 1st and the 99th percentile
-    along each of 13 directions, so that a few far points cannot turn it. Along these axes it reaches from the 1st to
-    the 99th percentile of all points.
+    The axes are those of the smallest box (trimesh) around the points between the 1st and the 99th percentile along
+    each of 13 directions. A few distant points therefore cannot rotate the box. Along each axis, the box extends from
+    the 1st to the 99th percentile of all points.
 
     Raises:
-        ValueError: no points, or some that are not finite.
+        ValueError: there are no points, or some are not finite.
     """
     if len(points) == 0 or not np.isfinite(points).all():
-        raise InputError(f"a box needs points that are finite, got {len(points)} of them")
+        raise InputError(f"a box needs at least one point, all of them finite; got {len(points)} points")
     axes = _axes(points[_central(points)])
     low, high = np.quantile(points @ axes.T, CENTRAL, axis=0)
     order = np.argsort(low - high, kind="stable")
@@ -75,7 +73,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
 
 
 def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
-    """Which points no direction finds far out; all, where that leaves none."""
+    """Return a mask of the points that are not an outlier along any direction; of all points if that leaves none."""
     along = points @ _DIRECTIONS.T
     low, high = np.quantile(along, CENTRAL, axis=0)
     inside = ((along >= low) & (along <= high)).all(axis=1)
@@ -83,13 +81,13 @@ def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
 
 
 def _axes(points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Axes of the smallest box around some points, one per row."""
-    from scipy.spatial import QhullError  # noqa: PLC0415 (a question does without)
+    """Return the axes of the smallest box around some points, one per row."""
+    from scipy.spatial import QhullError  # noqa: PLC0415 (queries do not need it)
     from trimesh.bounds import oriented_bounds  # noqa: PLC0415
 
-    apart = points - points.mean(axis=0)
-    spread, principal = np.linalg.eigh(apart.T @ apart)
-    if spread[0] > _FLAT * spread[2]:  # a point, a line or a plane has no hull in space
+    centered = points - points.mean(axis=0)
+    variances, principal = np.linalg.eigh(centered.T @ centered)
+    if variances[0] > _FLAT * variances[2]:  # a point, line or plane has no 3D hull
         with suppress(QhullError):
-            return cast(np.ndarray, oriented_bounds(apart)[0])[:3, :3].copy()
+            return cast(np.ndarray, oriented_bounds(centered)[0])[:3, :3].copy()
     return principal.T.copy()

@@ -1,4 +1,4 @@
-"""A catalogue of objects: where each is, how large, how reliable, and which photographs show it."""
+"""Catalogue of objects: position, size and reliability of each, and the images that show it."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ from normlift_ns.raster.rasterize import rasterize_evidence
 from normlift_ns.raster.settings import RasterSettings
 
 SEEN = 0.1
-"""A photograph shows an object if it shows at least this share of what the best photograph of the object does."""
+"""An image shows an object if the object's share of the image is at least this times its largest share of any image."""
 WHOLE = 0.95
-"""An object lies wholly within a picture if this share does of what lies in the picture that has most of it."""
+"""An image shows the whole object if the fraction of the object inside its frame is at least this times the largest
+such fraction.
+"""
 BEST = 3
-_LONGEST_SIDE = 256
-"""Pixels of the pictures in which objects are looked for: the order of photographs needs no more."""
+_RENDER_SIZE = 256
+"""Longer side, in pixels, of the renders that rank images by object; more resolution does not change the order."""
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """p -> scale * rotation @ p + shift."""
+    """Similarity transform p -> scale * rotation @ p + shift."""
 
     rotation: Float64[np.ndarray, "3 3"]
     scale: float
@@ -37,37 +39,37 @@ class Similarity:
 
     @classmethod
     def undoing(cls, transform: Float64[np.ndarray, "3 4"], scale: float) -> Similarity:
-        """What leads back from the world that p -> scale * (transform @ p) leads to."""
+        """Return the inverse of p -> scale * (transform @ p)."""
         rotation = transform[:, :3].T
         return cls(rotation, 1 / scale, -rotation @ transform[:, 3])
 
     @classmethod
     def identity(cls) -> Similarity:
-        """Which moves nothing."""
+        """Return the identity transform."""
         return cls(np.eye(3), 1.0, np.zeros(3))
 
     def then(self, other: Similarity) -> Similarity:
-        """This one, and then another."""
+        """Return the composition that applies this transform first and `other` second."""
         shift = other.points(self.shift[None])[0]
         return Similarity(other.rotation @ self.rotation, other.scale * self.scale, shift)
 
     def times(self, factor: float) -> Similarity:
-        """The same with another unit."""
+        """Return this transform followed by scaling with `factor`."""
         return Similarity(self.rotation, factor * self.scale, factor * self.shift)
 
     def points(self, points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m 3"]:
-        """Points [M, 3] moved."""
+        """Transform points [M, 3]."""
         return self.scale * points @ self.rotation.T + self.shift
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where an object is, in one set of coordinates."""
+    """Position and size of an object in one coordinate system."""
 
     centroid: Float64[np.ndarray, " 3"]
-    """Mean of the centres, weighted by W_j, what the views saw of each Gaussian."""
+    """Mean of the Gaussian centers, weighted by W_j, the total weight of Gaussian j over all views."""
     extent: Float64[np.ndarray, " 3"]
-    """From the 1st to the 99th percentile of the centres along x, y and z."""
+    """Distance from the 1st to the 99th percentile of the centers along x, y and z."""
     box: OrientedBox
 
 
@@ -83,28 +85,28 @@ class CatalogueObject:
     reliability: float
     """Mean of R, weighted by W_j, in 0..1."""
     views: int
-    """Training photographs that show it."""
+    """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of at most three: those in which it lies wholly within the picture first, the largest share first."""
+    """Names of at most three images, those with the whole object first, then by the share of the image it covers."""
     capture: Place
-    """In the coordinates of the capture."""
+    """Position in the coordinates of the capture."""
     scene: Place
-    """In the coordinates of the Gaussians, as nerfstudio and exported files have them."""
+    """Position in the coordinates of the Gaussians, which nerfstudio and exported files use."""
 
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """Objects by text, for each text the largest first."""
+    """Objects by prompt, and by descending size within each prompt."""
 
     objects: tuple[CatalogueObject, ...]
     in_smaller_parts: int
-    """Selected Gaussians of parts too small to be listed."""
+    """Number of selected Gaussians in components that are too small to be listed."""
     metres_per_unit: float | None
-    """Of the capture; None: `capture` of the objects is in its units, else in metres."""
+    """Meters per unit of the capture. If it is given, `capture` positions are in meters, otherwise in capture units."""
 
     @property
     def unit(self) -> str:
-        """Of what `capture` of the objects says."""
+        """Unit of the `capture` positions."""
         return "capture unit" if self.metres_per_unit is None else "metre"
 
 
@@ -117,12 +119,12 @@ def make_catalogue(
     metres_per_unit: float | None = None,
     device: str = "cpu",
 ) -> Catalogue:
-    """What is known of every object.
+    """Summarize every object in a catalogue.
 
     Args:
-        capture: from the scene's world to the capture's.
-        metres_per_unit: length of a unit of the capture, > 0.
-        device: where objects are looked for in the photographs.
+        capture: transform from the coordinates of the scene to those of the capture.
+        metres_per_unit: length of a capture unit in meters, > 0; None if unknown.
+        device: device that renders the objects, to rank images.
     """
     to_capture = capture if metres_per_unit is None else capture.times(metres_per_unit)
     means, ids = scene.gaussians.means.double().cpu().numpy(), instances.instance_id.cpu().numpy()
@@ -130,18 +132,18 @@ def make_catalogue(
     count, names, cameras = len(instances.classes), scene.train.names, scene.train.cameras
     settings = RasterSettings.recorded(field.manifest)
     gaussians, mode = scene.gaussians.to(device), scene.rasterize_mode
-    shown = view_shares(gaussians, cameras, instances, rasterize_mode=mode, settings=settings).cpu().numpy()
+    shares = view_shares(gaussians, cameras, instances, rasterize_mode=mode, settings=settings).cpu().numpy()
     objects = []
     for number in range(1, count + 1):
         rows = np.flatnonzero(ids == number)
-        share = shown[number - 1]
+        share = shares[number - 1]
         shows = (share > 0) & (share >= SEEN * share.max(initial=0))
         inside = _inside(means[rows], cameras)
         whole = shows & (inside >= WHOLE * inside[shows].max(initial=0))
-        order, seen = np.lexsort((-share, ~whole, ~shows)), int(shows.sum())
-        here = _place(means[rows], weight[rows])
+        order, num_views = np.lexsort((-share, ~whole, ~shows)), int(shows.sum())
+        scene_place = _place(means[rows], weight[rows])
         points = to_capture.points(means[rows])
-        box = here.box.moved(to_capture.rotation, to_capture.scale, to_capture.shift)
+        box = scene_place.box.moved(to_capture.rotation, to_capture.scale, to_capture.shift)
         objects.append(
             CatalogueObject(
                 id=number,
@@ -149,10 +151,10 @@ def make_catalogue(
                 class_id=instances.classes[number - 1],
                 gaussians=len(rows),
                 reliability=float(np.average(reliability[rows], weights=weight[rows])),
-                views=seen,
-                best_views=tuple(str(names[i]) for i in order[: min(BEST, seen)]),
+                views=num_views,
+                best_views=tuple(str(names[i]) for i in order[: min(BEST, num_views)]),
                 capture=_place(points, weight[rows], box),
-                scene=here,
+                scene=scene_place,
             )
         )
     small = int(((instances.class_id > 0) & (instances.instance_id == 0)).sum())
@@ -167,17 +169,17 @@ def view_shares(
     rasterize_mode: str = "classic",
     settings: RasterSettings | None = None,
 ) -> Float[Tensor, "m v"]:
-    """The share of each picture that each object takes up, what hides it counted: the compositing weight of its
-    Gaussians per pixel.
+    """Return the share of each image that each object covers, with occlusion.
+
+    The share is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
     count = len(instances.classes)
-    shares = torch.zeros(count, len(cameras))
     if count == 0:
-        return shares
-    small = [_smaller(camera) for camera in cameras]
+        return torch.zeros(count, len(cameras))
+    small = [_downscaled(camera) for camera in cameras]
     maps = [torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small]
-    how = {"rasterize_mode": rasterize_mode, "settings": settings, "num_regions": [1] * len(small)}
-    rows = rasterize_evidence(gaussians, small, maps, **how).rows  # pyright: ignore[reportArgumentType]
+    options = {"rasterize_mode": rasterize_mode, "settings": settings, "num_regions": [1] * len(small)}
+    rows = rasterize_evidence(gaussians, small, maps, **options).rows  # pyright: ignore[reportArgumentType]
     ids = instances.instance_id.to(rows.weight.device).long()[rows.row_index()]
     flat = torch.zeros((count + 1) * len(small), dtype=torch.float64, device=rows.weight.device)
     flat.index_add_(0, ids * len(small) + rows.column.long(), rows.weight.double())
@@ -186,19 +188,19 @@ def view_shares(
 
 
 def _inside(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """[views], the share of the points that lies within each picture."""
-    shares = []
+    """Return the fraction of the points inside the frame of each camera, [views]."""
+    fractions = []
     for camera in cameras:
-        pose, K = camera.world_to_camera.double().cpu().numpy(), camera.K.double().cpu().numpy()
-        pixels = (points @ pose[:3, :3].T + pose[:3, 3]) @ K.T
-        depth = np.where(pixels[:, 2] > 0, pixels[:, 2], np.nan)[:, None]  # nothing is inside that lies behind
+        world_to_camera, K = camera.world_to_camera.double().cpu().numpy(), camera.K.double().cpu().numpy()
+        pixels = (points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]) @ K.T
+        depth = np.where(pixels[:, 2] > 0, pixels[:, 2], np.nan)[:, None]  # NaN: points behind the camera are outside
         pixels = pixels[:, :2] / depth
-        shares.append(((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1).mean())
-    return np.array(shares)
+        fractions.append(((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1).mean())
+    return np.array(fractions)
 
 
-def _smaller(camera: Camera) -> Camera:
-    factor = min(1.0, _LONGEST_SIDE / max(camera.width, camera.height))
+def _downscaled(camera: Camera) -> Camera:
+    factor = min(1.0, _RENDER_SIZE / max(camera.width, camera.height))
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
     scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
     return Camera(camera.K * scale, camera.world_to_camera, width, height)

@@ -1,4 +1,4 @@
-"""Objects: the parts of a selection that hang together in space, and what is known of each."""
+"""Objects: the connected components of a selection, and a summary of each."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ _NEIGHBORS = 8
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One object, in the scene's own units. Means are weighted by W_j, what the views saw of each Gaussian."""
+    """One object, in units of the scene; means are weighted by W_j, the total weight of Gaussian j over all views."""
 
     size: int
     """Number of Gaussians."""
     centroid: list[float]
     box: dict[str, list[float]]
-    """The corners "min" and "max" of the box that holds the centres."""
+    """Corners "min" and "max" of the axis-aligned box of the centers."""
     mean_reliability: float
 
 
 @dataclass(frozen=True)
 class Objects:
-    """A selection as objects."""
+    """A selection, divided into objects."""
 
     gaussians: int
-    """Size of the selection."""
+    """Number of selected Gaussians."""
     in_smaller_parts: int
-    """Gaussians of parts too small to be listed."""
+    """Number of those in components that are too small to be listed."""
     objects: list[SceneObject]
-    """The largest first."""
+    """Objects by descending size."""
 
     def to_json(self) -> dict[str, Any]:
-        """The same as plain types."""
+        """Return all fields as plain Python types."""
         return asdict(self)
 
 
@@ -54,18 +54,18 @@ def find_objects(
     reach: float = REACH,
     min_size: int = MIN_SIZE,
 ) -> Objects:
-    """The connected components of a selection.
+    """Divide a selection into objects, its connected components.
 
     Args:
         reach: as in `connected_components`.
-        min_size: Gaussians of smaller components are only counted.
+        min_size: components with fewer Gaussians are counted but not listed.
     Raises:
-        ValueError: as `connected_components`; `min_size` < 1.
+        ValueError: `min_size` is less than 1, or as in `connected_components`.
     """
     check_number("min_size", min_size, int)
     labels = connected_components(means, selected, reach=reach)
     sizes = torch.bincount(labels[labels >= 0].long())
-    count = int((sizes >= min_size).sum())  # the largest come first
+    count = int((sizes >= min_size).sum())  # sizes are in descending order
     return Objects(
         gaussians=int(selected.sum()),
         in_smaller_parts=int(selected.sum() - sizes[:count].sum()),
@@ -74,14 +74,14 @@ def find_objects(
 
 
 def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"]) -> SceneObject:
-    """What is known of some Gaussians as one object."""
-    places = means[rows].double().cpu().numpy()
+    """Summarize some Gaussians as one object."""
+    centers = means[rows].double().cpu().numpy()
     weight = field.scalars.weight[rows].double().cpu().numpy() + 1e-12
     reliability = field.scalars.reliability[rows].double().cpu().numpy()
     return SceneObject(
         size=int(rows.sum()),
-        centroid=np.average(places, axis=0, weights=weight).tolist(),
-        box={"min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()},
+        centroid=np.average(centers, axis=0, weights=weight).tolist(),
+        box={"min": centers.min(axis=0).tolist(), "max": centers.max(axis=0).tolist()},
         mean_reliability=float(np.average(reliability, weights=weight)),
     )
 
@@ -89,19 +89,19 @@ def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"
 def connected_components(
     means: Float[Tensor, "n 3"], selected: Bool[Tensor, " n"], *, reach: float = REACH
 ) -> Int32[Tensor, " n"]:
-    """Number of the component of every selected Gaussian, 0 for the largest; -1 where not selected.
+    """Label each selected Gaussian with its connected component, 0 for the largest; label the others -1.
 
-    Two selected Gaussians hang together where one is among the 8 nearest selected neighbours of the other and not
-    farther than `reach` times the median distance, over the selection, to the nearest selected one at another place.
-    Components of the same size are numbered by their first Gaussian.
+    Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, within `reach`
+    times the median spacing. The spacing of a selected Gaussian is its distance to the nearest selected one at a
+    different position. Components of equal size are ordered by their first Gaussian.
 
     Args:
-        reach: > 0, in units of that median.
+        reach: maximum distance in units of the median spacing, > 0.
     Raises:
-        ValueError: a reach that is not positive and finite.
+        ValueError: `reach` is not positive and finite.
     """
     check_number("reach", reach)
-    from scipy.sparse import coo_array  # noqa: PLC0415 (a lift does without)
+    from scipy.sparse import coo_array  # noqa: PLC0415 (a lift does not need it)
     from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415
 
     labels = torch.full((len(means),), -1, dtype=torch.int32)
@@ -115,9 +115,9 @@ def connected_components(
     first, slot = np.nonzero(near)
     second = neighbors.index.numpy()[first, slot]
     graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(len(rows), len(rows)))
-    count, found = components_of_graph(graph, directed=False)
-    size, start = np.bincount(found, minlength=count), np.unique(found, return_index=True)[1]
+    count, component = components_of_graph(graph, directed=False)
+    size, start = np.bincount(component, minlength=count), np.unique(component, return_index=True)[1]
     rank = np.empty(count, np.int32)
     rank[np.lexsort((start, -size))] = np.arange(count)
-    labels[rows] = torch.from_numpy(rank[found])
+    labels[rows] = torch.from_numpy(rank[component])
     return labels.to(means.device)

@@ -1,4 +1,4 @@
-"""A catalogue as JSON, as a table and as boxes that mesh viewers draw."""
+"""Export of a catalogue as JSON, as a CSV table, and as box meshes for mesh viewers."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ from normlift_ns.objects.catalogue import BEST, Catalogue, CatalogueObject, Plac
 from normlift_ns.options import OBJECT_FILES
 
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-"""Corners of a box around each of its faces, counter-clockwise from outside."""
-_GOLDEN = 0.618033988749895
+"""Corner indices of each face of a box, counterclockwise as seen from outside."""
+_GOLDEN_RATIO = 0.618033988749895
 
 
 def write_catalogue(
     catalogue: Catalogue, folder: Path, *, question: Mapping[str, Any] | None = None, overwrite: bool = False
 ) -> tuple[Path, ...]:
-    """Writes objects.json, objects.csv, objects.ply (boxes in the coordinates of the capture) and objects_scene.ply
-    (boxes in those of the Gaussians), all or none; returns their paths. docs/objects.md explains them.
+    """Write the files of a catalogue, all or none, and return their paths.
+
+    The files are objects.json, objects.csv, objects.ply (boxes in the coordinates of the capture) and
+    objects_scene.ply (boxes in the coordinates of the Gaussians). docs/objects.md explains them.
 
     Args:
-        question: how objects were found, for objects.json.
+        question: the query that found the objects, for objects.json.
     Raises:
-        FileExistsError: one is there, and `overwrite` is False.
-        OSError: it cannot be written.
+        FileExistsError: a file exists, and `overwrite` is False.
+        OSError: a file cannot be written.
     """
     files = tuple(folder / name for name in OBJECT_FILES)
     document = {**to_json(catalogue), **(question or {})}
@@ -40,35 +42,35 @@ def write_catalogue(
             table = csv.writer(file)
             table.writerow(columns())
             table.writerows(row.values() for row in rows(catalogue))
-        write_boxes(drafts[2], catalogue.objects, [found.capture.box for found in catalogue.objects])
-        write_boxes(drafts[3], catalogue.objects, [found.scene.box for found in catalogue.objects])
+        write_boxes(drafts[2], catalogue.objects, [item.capture.box for item in catalogue.objects])
+        write_boxes(drafts[3], catalogue.objects, [item.scene.box for item in catalogue.objects])
     return files
 
 
 def to_json(catalogue: Catalogue) -> dict[str, Any]:
-    """The catalogue as plain types."""
+    """Return a catalogue as plain Python types."""
     return {
         "unit": catalogue.unit,
         "metres_per_unit": catalogue.metres_per_unit,
         "in_smaller_parts": catalogue.in_smaller_parts,
         "objects": [
             {
-                "id": found.id,
-                "text": found.text,
-                "class_id": found.class_id,
-                "gaussians": found.gaussians,
-                "reliability": found.reliability,
-                "views": found.views,
-                "best_views": list(found.best_views),
-                "capture": _place(found.capture),
-                "scene": _place(found.scene),
+                "id": item.id,
+                "text": item.text,
+                "class_id": item.class_id,
+                "gaussians": item.gaussians,
+                "reliability": item.reliability,
+                "views": item.views,
+                "best_views": list(item.best_views),
+                "capture": _place_json(item.capture),
+                "scene": _place_json(item.scene),
             }
-            for found in catalogue.objects
+            for item in catalogue.objects
         ],
     }
 
 
-def _place(place: Place) -> dict[str, Any]:
+def _place_json(place: Place) -> dict[str, Any]:
     box = place.box
     return {
         "centroid": place.centroid.tolist(),
@@ -78,7 +80,7 @@ def _place(place: Place) -> dict[str, Any]:
 
 
 def columns() -> list[str]:
-    """The header of the table.
+    """Return the column names of the CSV table.
 
     >>> columns()[:10]
     ['id', 'text', 'class_id', 'gaussians', 'reliability', 'views', 'best_view_1', 'best_view_2', 'best_view_3', 'x']
@@ -98,12 +100,12 @@ _PLACE_COLUMNS = (
 
 
 def rows(catalogue: Catalogue) -> Iterator[dict[str, Any]]:
-    """The rows of the table, by the names of its columns."""
-    for found in catalogue.objects:
-        best = [*found.best_views, *[""] * (BEST - len(found.best_views))]
-        numbers = (number for place in (found.capture, found.scene) for number in _numbers(place))
-        facts = (found.id, found.text, found.class_id, found.gaussians, found.reliability, found.views)
-        yield dict(zip(columns(), (*facts, *best, *numbers)))
+    """Yield the rows of the CSV table as dicts by column name."""
+    for item in catalogue.objects:
+        best = [*item.best_views, *[""] * (BEST - len(item.best_views))]
+        numbers = (number for place in (item.capture, item.scene) for number in _numbers(place))
+        summary = (item.id, item.text, item.class_id, item.gaussians, item.reliability, item.views)
+        yield dict(zip(columns(), (*summary, *best, *numbers)))
 
 
 def _numbers(place: Place) -> list[float]:
@@ -112,18 +114,18 @@ def _numbers(place: Place) -> list[float]:
 
 
 def write_boxes(path: Path, objects: Sequence[CatalogueObject], boxes: Iterable[OrientedBox]) -> None:
-    """A mesh of eight corners and six faces per box, each corner with the numbers of its object and a colour."""
-    from plyfile import PlyData, PlyElement  # noqa: PLC0415 (--help does without)
+    """Write a PLY mesh with eight corners and six faces per box; each corner has the ids and color of its object."""
+    from plyfile import PlyData, PlyElement  # noqa: PLC0415 (--help does not need it)
 
-    kinds = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    kinds += [("class_id", "<u4"), ("instance_id", "<u4")]
-    corners = np.zeros(8 * len(objects), kinds)
-    for i, (found, box) in enumerate(zip(objects, boxes)):
-        rows_ = slice(8 * i, 8 * i + 8)
+    dtype = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    dtype += [("class_id", "<u4"), ("instance_id", "<u4")]
+    corners = np.zeros(8 * len(objects), dtype)
+    for i, (item, box) in enumerate(zip(objects, boxes)):
+        block = slice(8 * i, 8 * i + 8)
         for k, axis in enumerate("xyz"):
-            corners[axis][rows_] = box.corners[:, k]
-        corners["red"][rows_], corners["green"][rows_], corners["blue"][rows_] = _colour(found.id)
-        corners["class_id"][rows_], corners["instance_id"][rows_] = found.class_id, found.id
+            corners[axis][block] = box.corners[:, k]
+        corners["red"][block], corners["green"][block], corners["blue"][block] = _color(item.id)
+        corners["class_id"][block], corners["instance_id"][block] = item.class_id, item.id
     faces = np.empty(6 * len(objects), [("vertex_indices", "<i4", (4,))])
     faces["vertex_indices"] = (8 * np.arange(len(objects))[:, None, None] + np.array(_FACES)).reshape(-1, 4)
     elements = [PlyElement.describe(corners, "vertex"), PlyElement.describe(faces, "face")]
@@ -131,8 +133,8 @@ def write_boxes(path: Path, objects: Sequence[CatalogueObject], boxes: Iterable[
         PlyData(elements, byte_order="<", comments=["Boxes of objects, written by normlift_ns"]).write(file)
 
 
-def _colour(number: int) -> tuple[int, int, int]:
-    """Colours that differ from object to object."""
-    turn = 2 * np.pi * _GOLDEN * number
-    red, green, blue = (round(150 + 100 * float(np.cos(turn - shift))) for shift in (0, 2.094, 4.189))
+def _color(number: int) -> tuple[int, int, int]:
+    """Return an RGB color in 0..255 that differs from object to object."""
+    angle = 2 * np.pi * _GOLDEN_RATIO * number
+    red, green, blue = (round(150 + 100 * float(np.cos(angle - shift))) for shift in (0, 2.094, 4.189))
     return red, green, blue

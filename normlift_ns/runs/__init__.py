@@ -1,1 +1,1 @@
-"""Files of a lifted run."""
+"""Reading and writing the files of a lifted run."""

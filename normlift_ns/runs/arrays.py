@@ -1,4 +1,4 @@
-"""Labels of Gaussians as arrays, as point cloud networks (Pointcept) and SceneSplat's benchmark read them."""
+"""Export of Gaussian labels as NPY arrays, in the layout of Pointcept and of SceneSplat's benchmark."""
 
 from __future__ import annotations
 
@@ -22,22 +22,24 @@ def write_arrays(
     *,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
-    """Writes coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, all or none.
+    """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, all or none.
 
-    Here classes and objects are counted from 0, class_id - 1 and instance_id - 1, and -1 is what evaluations ignore.
+    Classes and objects are numbered from 0 here, as class_id - 1 and instance_id - 1; evaluations ignore -1.
 
     Args:
-        rows: the Gaussians to write.
-        overwrite: replace files of these names.
+        rows: indices of the Gaussians to write.
+        overwrite: replace existing files.
+    Returns:
+        Paths of the four files.
     Raises:
-        FileExistsError: there is one, and `overwrite` is False.
-        OSError: it cannot be written.
+        FileExistsError: a file exists, and `overwrite` is False.
+        OSError: a file cannot be written.
     """
     files = tuple(folder / name for name in ARRAY_FILES)
     names = {
         "ignored": -1,
         "segment": {str(i): text for i, text in enumerate(instances.texts)},
-        "instance": {str(i): {"segment": of - 1} for i, of in enumerate(instances.classes)},
+        "instance": {str(i): {"segment": class_id - 1} for i, class_id in enumerate(instances.classes)},
     }
     with new_files(*files, overwrite=overwrite) as drafts:
         np.save(drafts[0], means.detach().cpu().numpy()[rows].astype(np.float32))

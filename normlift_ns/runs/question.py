@@ -1,6 +1,6 @@
-"""How a run stores a question: texts as vectors, with the rule by which they select.
+"""Storage of a query in a run: prompts with their embeddings, and the rule that selects Gaussians.
 
-A run with a stored question is rendered by stock nerfstudio without a text encoder.
+Stock nerfstudio renders a run with a stored query without a text encoder.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from normlift_ns.question import Question
 from normlift_ns.text_encoders import encoder_digest
 
 QUERIES_FILE = "queries.safetensors"
-"""In the folder of the field: vectors, and everything else as JSON in the file's metadata."""
-_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
+"""File in the folder of the field, with embeddings as tensors and everything else as JSON in its metadata."""
+_METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save True"
 
 Text = Annotated[str, msgspec.Meta(pattern=r"\S")]
 
 
-class _Facts(msgspec.Struct, forbid_unknown_fields=True):
-    """The JSON in the metadata."""
+class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
+    """The JSON in the file's metadata."""
 
     texts: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)]
     negatives: tuple[Text, ...]
@@ -42,99 +42,99 @@ class _Facts(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def save_question(folder: Path, question: Question) -> Path:
-    """Writes queries.safetensors beside the field, in place of an earlier one; returns its path.
+    """Write queries.safetensors next to the field, replacing an earlier one, and return its path.
 
     Raises:
-        ValueError: what `load_question` would refuse.
-        FileNotFoundError: the folder is gone.
+        ValueError: `load_question` would raise an error for this query.
+        FileNotFoundError: the folder does not exist any more.
         OSError: the file cannot be written.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"{folder} is gone: the run was moved or deleted after it was opened, and nothing was stored. Open the run "
-            "where it is now"
+            f"{folder} does not exist any more, so nothing was stored: the run was moved or deleted while it was open. "
+            "Open it again at its new path"
         )
     if question.suggest:
         raise InputError(
-            "the question cannot be stored: its threshold is to be suggested; ask it, and store the answer's"
+            'the query cannot be stored: its threshold is "auto"; run the query, and store that of its answer'
         )
-    facts = _Facts(
+    metadata = _Metadata(
         question.texts, question.negatives, question.refined, question.rule, question.threshold,
         question.min_reliability, question.encoder,
     )  # fmt: skip
-    given = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
-    arrays = {name: value.astype(np.float32) for name, value in given.items()}
+    vectors = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
+    arrays = {name: value.astype(np.float32) for name, value in vectors.items()}
     try:
-        stored = _encoded(facts)
-        checked = _question(stored, arrays)
+        encoded = msgspec.json.encode(metadata).decode()
+        decoded = _decode(encoded, arrays)
         if (folder / MANIFEST).exists():
-            _check_belongs(checked, read_manifest(folder)[0])
+            _check_encoder(decoded, read_manifest(folder)[0])
     except (ValueError, TypeError) as error:
-        raise InputError(f"the question cannot be stored: {error}") from error
-    save_arrays(folder / QUERIES_FILE, arrays, {_KEY: stored}, overwrite=True)
+        raise InputError(f"the query cannot be stored: {error}") from error
+    save_arrays(folder / QUERIES_FILE, arrays, {_METADATA_KEY: encoded}, overwrite=True)
     return folder / QUERIES_FILE
 
 
 def load_question(folder: Path) -> Question | None:
-    """The question stored in the folder of a field; None if there is none.
+    """Load the query stored in the folder of a field; return None if there is none.
 
     Raises:
-        ValueError: a damaged file, or one that holds no question.
+        ValueError: the file is damaged, or does not hold a query.
     """
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
         return None
     try:
         if not os.path.isfile(path):
-            raise InputError("it is no file")
-        arrays, stored, _ = load_arrays(path, undigested=(_KEY,), remedy=_REMEDY)
-        if set(stored) != {_KEY}:
-            raise InputError(f"its metadata has {sorted(stored)}, expected {_KEY}")
-        question = _question(stored[_KEY], arrays)
+            raise InputError("it is not a regular file")
+        arrays, metadata, _ = load_arrays(path, undigested=(_METADATA_KEY,), remedy=_REMEDY)
+        if set(metadata) != {_METADATA_KEY}:
+            raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")
+        question = _decode(metadata[_METADATA_KEY], arrays)
         if (folder / MANIFEST).exists():
-            _check_belongs(question, read_manifest(folder)[0])
+            _check_encoder(question, read_manifest(folder)[0])
         return question
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
 
 
-def _encoded(facts: _Facts) -> str:
-    return msgspec.json.encode(facts).decode()
-
-
-def _question(stored: str, arrays: dict[str, np.ndarray]) -> Question:
-    """What the file says.
+def _decode(encoded: str, arrays: dict[str, np.ndarray]) -> Question:
+    """Return the query with this metadata and these embeddings.
 
     Raises:
-        ValueError: facts or vectors that are none, or that do not belong together.
+        ValueError: the metadata or an embedding is not valid, or they do not fit together.
     """
-    facts = msgspec.json.decode(stored, type=_Facts)
-    if not math.isfinite(facts.threshold):
-        raise InputError(f"the threshold is {facts.threshold}, expected a finite number")
+    metadata = msgspec.json.decode(encoded, type=_Metadata)
+    if not math.isfinite(metadata.threshold):
+        raise InputError(f"the threshold is {metadata.threshold}, expected a finite number")
     if not {"vectors"} <= set(arrays) <= set(_VECTORS):
         raise InputError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
     negative = arrays.get("negative_vectors")
-    if (negative is None) != (len(facts.negatives) == 0):
-        raise InputError(f"{len(facts.negatives)} negatives, {'no' if negative is None else 'some'} vectors of them")
-    if RULES[facts.form].compares and negative is None:
-        raise InputError(f"rule {facts.form!r} compares with negatives, and there are none")
+    if (negative is None) != (len(metadata.negatives) == 0):
+        raise InputError(
+            f"it has {len(metadata.negatives)} negatives, but {'no' if negative is None else 'also'} negative_vectors"
+        )
+    if RULES[metadata.form].compares and negative is None:
+        raise InputError(f"rule {metadata.form!r} needs negatives, but it has none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
-    _check_vectors("vectors", arrays["vectors"], facts.texts, size)
+    _check_vectors("vectors", arrays["vectors"], metadata.texts, size)
     if negative is not None:
-        _check_vectors("negative_vectors", negative, facts.negatives, size)
+        _check_vectors("negative_vectors", negative, metadata.negatives, size)
     return Question(
-        facts.texts, arrays["vectors"], facts.negatives, negative, facts.form, facts.threshold,
-        facts.min_reliability, facts.refined, facts.encoder,
+        metadata.texts, arrays["vectors"], metadata.negatives, negative, metadata.form, metadata.threshold,
+        metadata.min_reliability, metadata.refined, metadata.encoder,
     )  # fmt: skip
 
 
-def _check_belongs(question: Question, manifest: Mapping[str, Any]) -> None:
-    """Raises ValueError where the vectors are of another encoder than the field beside them."""
-    size, known = question.vectors.shape[1], encoder_digest(manifest)
+def _check_encoder(question: Question, manifest: Mapping[str, Any]) -> None:
+    """Raise ValueError if the embeddings are from a different encoder than the field."""
+    size, field_encoder = question.vectors.shape[1], encoder_digest(manifest)
     if size != manifest["dimension"]:
-        raise InputError(f"its vectors have {size} numbers, the features of the run {manifest['dimension']}")
-    if question.encoder is not None and known is not None and question.encoder != known:
-        raise InputError(f"its texts were read by another encoder ({question.encoder}) than that of the run ({known})")
+        raise InputError(f"its vectors have dimension {size}, the features of the run {manifest['dimension']}")
+    if question.encoder is not None and field_encoder is not None and question.encoder != field_encoder:
+        raise InputError(
+            f"its prompts were encoded by another encoder ({question.encoder}) than that of the run ({field_encoder})"
+        )
 
 
 def _check_vectors(name: str, vectors: np.ndarray, texts: Sequence[str], size: int) -> None:

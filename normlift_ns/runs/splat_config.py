@@ -1,4 +1,4 @@
-"""config.yml of a lifted run that came from a splat, for which nerfstudio has none."""
+"""The config.yml of a run lifted from a PLY file or gsplat checkpoint, for which nerfstudio has written none."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from normlift_ns.scenes.saved import CHECKPOINT_FOLDER, TRANSFORMS_FILE
 
 
 def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
-    """A config by which stock nerfstudio finds the cameras in the directory of the run, and leaves them as they are.
+    """Return a config with which stock nerfstudio loads the cameras in the run directory without transforming them.
 
-    Paths but that of the field are absolute: there is no directory of a training that they could be relative to.
+    All paths except that of the field are absolute, because there is no training directory for relative paths.
     """
     cameras = run_dir / TRANSFORMS_FILE
     dataparser = NerfstudioDataParserConfig(
@@ -40,7 +40,7 @@ def splat_config(scene: SplatScene, run_dir: Path) -> TrainerConfig:
     datamanager = FullImageDatamanagerConfig(
         data=cameras,
         dataparser=dataparser,
-        cache_images="gpu",  # that is, on the pipeline's device; "cpu" pins memory, which needs CUDA
+        cache_images="gpu",  # means the pipeline's device; "cpu" would pin memory, which needs CUDA
         cache_images_type="uint8",
     )
     return TrainerConfig(

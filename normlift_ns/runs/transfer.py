@@ -1,4 +1,4 @@
-"""Labels of any point cloud, from the nearest Gaussians."""
+"""Transfer of labels from Gaussians to the points of a point cloud or mesh."""
 
 from __future__ import annotations
 
@@ -23,70 +23,70 @@ class Nearest(NamedTuple):
 
     row: Int64[np.ndarray, " p"]
     near: Bool[np.ndarray, " p"]
-    """Whether it is near enough to count."""
+    """Whether that Gaussian is within the maximum distance."""
 
 
 class Labelled(NamedTuple):
-    """What became of a cloud."""
+    """Summary of a label transfer."""
 
     points: int
     share: float
-    """Of them near enough to a Gaussian, in 0..1."""
+    """Fraction of points with a Gaussian within `limit`, in 0..1."""
     limit: float
-    """How near that is, in the coordinates of the cloud."""
+    """Maximum distance from a point to its Gaussian, in the coordinates of the cloud."""
 
 
 def nearest_rows(points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], most: float) -> Nearest:
-    """The Gaussian whose centre is nearest to every point, by a k-d tree.
+    """Find the Gaussian whose center is nearest to each point, with a k-d tree.
 
     Args:
-        means: of at least one Gaussian.
-        most: distance beyond which none counts; it does at exactly that distance.
+        means: centers of at least one Gaussian.
+        most: maximum distance, inclusive.
 
     >>> nearest_rows(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), most=2.0)
     Nearest(row=array([1, 0]), near=array([ True, False]))
     """
     finite = np.asarray(np.isfinite(points).all(axis=1))
-    distance, row = (np.asarray(found) for found in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
-    reached = np.isfinite(distance)  # from further away than squares of distances can say, there is no row
-    return Nearest(np.where(reached, row, 0), finite & (distance <= most))
+    distance, row = (np.asarray(x) for x in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
+    has_row = np.isfinite(distance)  # the tree returns no row if the squared distance overflows
+    return Nearest(np.where(has_row, row, 0), finite & (distance <= most))
 
 
 def read_cloud(path: Path) -> PlyData:
-    """A PLY file with x, y, z of its vertices.
+    """Read a PLY file whose vertices have x, y and z.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no PLY file, a truncated one, vertices without places.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is truncated or not a PLY file, or its vertices have no positions.
     """
-    expected = "Expected a point cloud or a mesh in the PLY format, with x, y, z of its vertices."
+    expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
         raise FileNotFoundError(f"There is no point cloud at {path}, given with --transfer. {expected}")
     check_header(path)
     try:
-        found = PlyData.read(str(path), mmap="c")
+        cloud = PlyData.read(str(path), mmap="c")
     except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
         raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}). {expected}") from error
-    vertex = next((element for element in found.elements if element.name == "vertex"), None)
+    vertex = next((element for element in cloud.elements if element.name == "vertex"), None)
     names = {} if vertex is None else {item.name: item for item in vertex.properties}
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
         raise InputError(f"{path} has {0 if vertex is None else vertex.count:,} vertices with "
                          f"{', '.join(names) or 'no properties'}. {expected}")  # fmt: skip
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
-        raise InputError(f"{path} has lists at its vertices ({', '.join(lists)}); remove them. {expected}")
-    return found
+        raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")
+    return cloud
 
 
 def check_free(cloud: PlyData, names: Iterable[str]) -> None:
-    """Raises ValueError where vertices of a cloud have properties of these names."""
-    taken = sorted(set(cloud["vertex"].data.dtype.names or ()) & set(names))
-    if len(taken) > 0:
-        raise InputError(f"the vertices of the cloud have {', '.join(taken)} already; remove that from it first")
+    """Raise ValueError if the vertices of a cloud already have properties of these names."""
+    existing = sorted(set(cloud["vertex"].data.dtype.names or ()) & set(names))
+    if len(existing) > 0:
+        raise InputError(f"the vertices of the cloud already have {', '.join(existing)}; remove these properties first")
 
 
 def places(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
-    """x, y, z of its vertices."""
+    """Return x, y, z of the vertices of a cloud."""
     return np.stack([np.asarray(cloud["vertex"][axis], np.float64) for axis in "xyz"], axis=1)
 
 
@@ -99,43 +99,44 @@ def label_cloud(
     *,
     overwrite: bool = False,
 ) -> Labelled:
-    """Writes a cloud with the labels of the nearest Gaussians, zeros where none is near.
+    """Write a cloud with the labels of the nearest Gaussians, and with zeros for points that are too far from any.
 
     Args:
-        means: centres of the Gaussians that count, in the coordinates of the cloud.
-        columns: what each of them is labelled with, by name.
-        most: how far a point may be from its Gaussian, in units of their median spacing.
+        path: path of the new PLY file.
+        means: centers of the Gaussians to take labels from, in the coordinates of the cloud.
+        columns: labels of these Gaussians, by property name.
+        most: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
     Raises:
-        ValueError: there is no Gaussian; as `write_cloud`.
-        OSError: as `write_cloud`.
+        ValueError: there are no Gaussians, or as in `write_cloud`.
+        FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:
-        raise InputError("none of the Gaussians is ever drawn, so that nothing can label the cloud")
+        raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
     limit = most * float(spacing[spacing.isfinite()].median())
-    found = nearest_rows(places(cloud), means, limit)
-    values = {name: np.where(found.near, x[found.row], 0).astype(x.dtype) for name, x in columns.items()}
-    write_cloud(path, cloud, values, overwrite=overwrite)
-    return Labelled(len(found.near), float(found.near.mean()), limit)
+    nearest = nearest_rows(places(cloud), means, limit)
+    labels = {name: np.where(nearest.near, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
+    write_cloud(path, cloud, labels, overwrite=overwrite)
+    return Labelled(len(nearest.near), float(nearest.near.mean()), limit)
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
-    """Writes a cloud with further properties of its vertices after those that it has; all else stays as it is.
+    """Write a cloud with additional vertex properties, appended to the existing ones; everything else is unchanged.
 
     Raises:
-        ValueError: it has a property of one of these names.
-        FileExistsError: the file is there, and `overwrite` is False.
-        OSError: it cannot be written.
+        ValueError: the vertices already have a property of one of these names.
+        FileExistsError: the file exists, and `overwrite` is False.
+        OSError: the file cannot be written.
     """
     check_free(cloud, columns)
     vertex = cloud["vertex"].data
-    kinds = [(name, vertex.dtype[name].newbyteorder("<")) for name in vertex.dtype.names or ()]
-    table = np.empty(len(vertex), [*kinds, *((name, column.dtype) for name, column in columns.items())])
-    for name, _ in kinds:
+    existing = [(name, vertex.dtype[name].newbyteorder("<")) for name in vertex.dtype.names or ()]
+    table = np.empty(len(vertex), [*existing, *((name, column.dtype) for name, column in columns.items())])
+    for name, _ in existing:
         table[name] = vertex[name]
     for name, column in columns.items():
         table[name] = column
     elements = [PlyElement.describe(table, "vertex") if e.name == "vertex" else e for e in cloud.elements]
-    written = PlyData(elements, byte_order="<", comments=cloud.comments, obj_info=cloud.obj_info)
+    labeled = PlyData(elements, byte_order="<", comments=cloud.comments, obj_info=cloud.obj_info)
     with new_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
-        written.write(file)
+        labeled.write(file)

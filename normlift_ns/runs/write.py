@@ -1,4 +1,4 @@
-"""Writing the directory of a lifted run: what stock nerfstudio loads, and the semantic field beside it."""
+"""Writing the directory of a lifted run: the files that stock nerfstudio loads, and the semantic field."""
 
 from __future__ import annotations
 
@@ -40,23 +40,25 @@ def write_run(
     overwrite: bool = False,
     exact: bool = True,
 ) -> Path:
-    """Writes a lifted run, complete or not at all; returns its directory.
+    """Write a lifted run, completely or not at all, and return its directory.
 
-    It holds config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model, without
-    optimizers), dataparser_transforms.json and the field in normlift/. Relative paths of the source's config stay
-    relative, so stock ns-* commands run from where the source run was trained, ours from anywhere. A run of a splat
-    holds its cameras too, as transforms.json, and what else opens it again, as splat.json.
+    The directory holds config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
+    without optimizers), dataparser_transforms.json, and the field in normlift/. A run lifted from a PLY file or gsplat
+    checkpoint also has its cameras in transforms.json, and other settings for reopening it in splat.json.
+
+    Relative paths in the config of the source run stay relative. Stock ns-* commands therefore run from the directory
+    that the source run was trained in; ns-normlift commands run from any directory.
 
     Args:
-        run_dir: as `run_directory` names it, output_dir/experiment/normlift/timestamp.
-        question: what to draw as relevancy_0, relevancy_1, …
-        texts: vectors of the user's own, by text.
-        overwrite: replace a directory of that name.
-        exact: False: where something has that name, the run is called <name>_2, <name>_3, …
+        run_dir: directory from `run_directory`, output_dir/experiment/normlift/timestamp.
+        question: query to render as relevancy_0, relevancy_1, …
+        texts: embeddings provided by the user, by prompt.
+        overwrite: replace an existing directory.
+        exact: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
     Raises:
-        FileExistsError: the directory exists, `exact` is True and `overwrite` False.
-        ValueError: a field of other Gaussians.
-        OSError: it cannot be written, for instance because the disk is full; nothing is left then.
+        FileExistsError: the directory exists, `exact` is True and `overwrite` is False.
+        ValueError: the field was lifted from other Gaussians.
+        OSError: writing failed, for instance because the disk is full; no files are left then.
     """
     tidy(run_dir)
     if exact:
@@ -64,7 +66,7 @@ def write_run(
     if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
         raise InputError(
             f"The semantic field has {len(field)} Gaussians and was not lifted from the {len(source.gaussians)} of "
-            f"{source.checkpoint_path}; lift that again."
+            f"{source.checkpoint_path}; lift that checkpoint again."
         )
     with draft_directory(run_dir) as folder:
         if isinstance(source, SplatScene):
@@ -76,14 +78,14 @@ def write_run(
             transform = {"transform": source.dataparser_transform.tolist(), "scale": source.dataparser_scale}
         write_text(folder / "dataparser_transforms.json", json.dumps(transform, indent=4))
         _write_tensors(folder, source, field, question, texts)
-        for place in (run_dir,) if exact else numbered(run_dir):
-            of_splat = isinstance(source, SplatScene)
-            config = splat_config(source, place) if of_splat else _lifted_config(source, place)
+        for path in (run_dir,) if exact else numbered(run_dir):
+            is_splat = isinstance(source, SplatScene)
+            config = splat_config(source, path) if is_splat else _lifted_config(source, path)
             write_text(folder / "config.yml", sealed(dump_config(config)), overwrite=True)
-            if publish(folder, place, overwrite=overwrite and exact):
-                return place
-    refuse_existing_run(run_dir, overwrite=False)  # another process was faster
-    raise FileExistsError(f"{run_dir} was there a moment ago; lift again")
+            if publish(folder, path, overwrite=overwrite and exact):
+                return path
+    refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
+    raise FileExistsError(f"another process created and removed {run_dir} during the lift; lift again")
 
 
 def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
@@ -95,11 +97,10 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> TrainerConfig:
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
     config.pipeline.model = NormLiftModelConfig.upgrade(source.model_config, semantics=Path(FIELD_FOLDER))
     if location.moved_data or config.output_dir.is_absolute():
-        set_data(config, location.data)  # a relative one would not be found
+        set_data(config, location.data)  # a relative path would not be found
     skip_seed_points(config)
-    config.pipeline.datamanager.cache_images = (
-        "gpu"  # that is, on the pipeline's device; "cpu" pins memory, which needs CUDA
-    )
+    # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
+    config.pipeline.datamanager.cache_images = "gpu"
     return config
 
 
@@ -110,18 +111,19 @@ def _write_tensors(
     question: Question | None,
     texts: Mapping[str, Tensor] | None,
 ) -> None:
-    checkpoint = checkpoint_of(source) if isinstance(source, SplatScene) else _slim(source.checkpoint)
+    checkpoint = checkpoint_of(source) if isinstance(source, SplatScene) else _model_checkpoint(source.checkpoint)
     path = folder / CHECKPOINT_FOLDER / f"step-{checkpoint['step']:09d}.ckpt"
     with new_file(path) as draft:
         torch.save(checkpoint, draft)
-    inside = folder / FIELD_FOLDER
+    field_dir = folder / FIELD_FOLDER
     if texts:
-        write_text_vectors(inside / TEXTS_FILE, texts)
-    field.save(inside, beside=digests_beside(inside, [path, inside / TEXTS_FILE, *folder.glob("*.json")]))
+        write_text_vectors(field_dir / TEXTS_FILE, texts)
+    field.save(field_dir, beside=digests_beside(field_dir, [path, field_dir / TEXTS_FILE, *folder.glob("*.json")]))
     if question is not None:
-        save_question(inside, question)
+        save_question(field_dir, question)
 
 
-def _slim(checkpoint: Checkpoint) -> dict[str, Any]:
+def _model_checkpoint(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Return the step and the model of a checkpoint, without optimizers."""
     pipeline = {f"_model.{name}": tensor for name, tensor in checkpoint.model.items()}
     return {"step": checkpoint.step, "pipeline": pipeline}

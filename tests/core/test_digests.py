@@ -255,7 +255,7 @@ def test_evidence_without_digest_opens_where_it_has_no_key(tmp_path: Path) -> No
     evidence.save(path)
     save_file(load_file(path), path, metadata={k: v for k, v in load_tensors(path).facts.items() if k != "digest"})
     assert torch.equal(Evidence.load(path).rows.weight, evidence.rows.weight)
-    with pytest.raises(ValueError, match="names none"):
+    with pytest.raises(ValueError, match="does not record one"):
         Evidence.load(path, key="a")
 
 

@@ -317,8 +317,8 @@ def test_without_locks_only_old_leftovers_are_removed(tmp_path: Path, monkeypatc
 
 
 def test_a_folder_that_another_program_has_locked_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert atomic._PATIENCE == 10
-    monkeypatch.setattr(atomic, "_PATIENCE", 0.02)
+    assert atomic._LOCK_TIMEOUT == 10
+    monkeypatch.setattr(atomic, "_LOCK_TIMEOUT", 0.02)
     descriptor = atomic.hold(tmp_path)
     write_text(tmp_path / "a.txt", "text")
     atomic.release(descriptor)

@@ -117,7 +117,7 @@ def test_agreement_in_words():
     entries = Entries(torch.tensor([0, 0]), torch.tensor([1, 2]), torch.tensor([0.3, 0.7]), (2,))
     evidence = Evidence.from_entries([entries], 1)
     alone = explain_selection(evidence, torch.tensor([[0.6, 0.8], [1.0, 0.0]]), torch.ones(1, dtype=torch.bool))
-    assert "one photograph" in alone.words and "1.00" not in alone.words  # it agrees with nobody
+    assert "one image" in alone.words and "1.00" not in alone.words  # it agrees with nobody
 
 
 @pytest.mark.usefixtures("unchecked")

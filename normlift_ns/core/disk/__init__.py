@@ -1,1 +1,1 @@
-"""Files on a disk: in one step, with digests."""
+"""Atomic file operations and checksummed data files."""

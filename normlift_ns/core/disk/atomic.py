@@ -1,6 +1,7 @@
-"""What the system does in one step: locks that end with their process, renames that replace nothing, exchanges.
+"""Atomic system calls: locks that end with their process, renames that never overwrite, and exchanges of two paths.
 
-Where a system has none of it (Windows, some network drives), the functions say so and the caller makes do.
+Some systems do not support them (Windows, some network drives). The functions then return None or False, and the caller
+uses a fallback.
 """
 
 from __future__ import annotations
@@ -15,26 +16,28 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _NO_REPLACE, _EXCHANGE = 1, 2
-_HERE = -100
-"""AT_FDCWD: relative paths start at the working directory."""
-_PATIENCE = 10.0
-"""Seconds; no process of ours needs more than a moment."""
-_UNKNOWN = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
-"""What kernels, file systems and containers answer that know no such rename."""
+_AT_FDCWD = -100
+"""Relative paths start at the working directory."""
+_LOCK_TIMEOUT = 10.0
+"""Seconds to wait for a lock; normlift_ns itself holds one only briefly."""
+_UNSUPPORTED = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
+"""Errors of kernels, file systems and containers that do not support renameat2."""
 
 
 def hold(folder: Path) -> int | None:
-    """Locks a folder until `release`, or until the process ends, however it does; None where there are no locks.
+    """Lock a folder until `release` or until the process ends, even if it is killed.
 
+    Returns:
+        A file descriptor for `release`; None if the system does not support locks.
     Raises:
-        BlockingIOError: another process holds it.
-        OSError: no such folder.
+        BlockingIOError: another process holds the lock.
+        OSError: the folder does not exist.
     """
     if sys.platform == "win32":
         return None
-    import fcntl  # noqa: PLC0415 (Windows has none)
+    import fcntl  # noqa: PLC0415 (not available on Windows)
 
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # a pipe would make it wait for ever
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # opening a pipe would block forever
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -47,16 +50,19 @@ def hold(folder: Path) -> int | None:
 
 
 def release(descriptor: int | None) -> None:
-    """Gives back what `hold` returned."""
+    """Release a lock of `hold`."""
     if descriptor is not None:
         os.close(descriptor)
 
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Waits for the lock of a folder, but not for ever: another program may have locked it for all of its work."""
-    descriptor, end = None, time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
+    """Hold the lock of a folder, after waiting for it for at most 10 seconds.
+
+    If the lock is still taken then, continue without it: another program may hold it for as long as it runs.
+    """
+    descriptor, deadline = None, time.monotonic() + _LOCK_TIMEOUT
+    while time.monotonic() < deadline:
         try:
             descriptor = hold(folder)
             break
@@ -69,7 +75,7 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def rename_new(source: Path, target: Path) -> bool:
-    """Renames a file or a folder, unless something of the new name is there: False then.
+    """Rename a file or a folder and return True; return False if the new name already exists.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -88,12 +94,12 @@ def rename_new(source: Path, target: Path) -> bool:
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Exchanges two files or folders, so that both names exist at all times; False where the system cannot."""
+    """Exchange two files or folders, with both names existing at all times; return False if that is not supported."""
     return _rename(first, second, _EXCHANGE)
 
 
 def _rename(source: Path, target: Path, flag: int) -> bool:
-    """Linux's renameat2; False where there is none."""
+    """Call Linux's renameat2; return False if it is not supported."""
     if sys.platform != "linux":
         return False
     try:
@@ -101,9 +107,9 @@ def _rename(source: Path, target: Path, flag: int) -> bool:
     except AttributeError:  # a C library without it
         return False
     function.argtypes = [ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint]
-    if function(_HERE, os.fsencode(source), _HERE, os.fsencode(target), flag) == 0:
+    if function(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
         return True
     error = ctypes.get_errno()
-    if error in _UNKNOWN:
+    if error in _UNSUPPORTED:
         return False
     raise OSError(error, os.strerror(error), str(source), None, str(target))

@@ -1,10 +1,10 @@
-"""Who works on what, where several processes share a folder: claims, by files that one process alone can create.
+"""Work claims for processes that share a folder, without locks.
 
-A claim is the file KEY.NUMBER, which O_EXCL gives to one process, also on network drives; there are no locks. NUMBER
-counts the attempts at a piece of work, and the highest is the one that counts. Its owner writes a heartbeat into it,
-and KEY.NUMBER.OUTCOME beside it at its end. Whoever sees no heartbeat for some time takes the work over by claiming
-the next number, which again only one process gets. Nothing is ever removed, so that no one can remove another's claim.
-Watchers measure the time between two heartbeats by their own clocks: those of other machines need not agree.
+A claim is the file KEY.NUMBER, created with O_EXCL, so that only one process gets it, also on network drives. NUMBER
+counts the attempts at a task; only the latest attempt counts. Its owner writes a heartbeat into the file, and creates
+KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process takes the task over by claiming the
+next number, which again only one process gets. Claim files are never deleted, so no process can delete the claim of
+another. Each process times heartbeats with its own clock; clocks of different machines need not agree.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 LEFT = "left"
-"""The outcome of work that was given up before its end, and that anybody may take at once."""
+"""Outcome of an abandoned attempt; any process may claim the task again immediately."""
 BEATS = 6
-"""Heartbeats in the time after which an owner counts as dead."""
-_NAME = re.compile(r"([0-9a-z_-]+)\.([1-9][0-9]*)(?:\.([a-z]+))?")
-_DIGITS = 12
-_LONGEST_NAP = 5.0
-"""Seconds between two looks at what others do."""
+"""Heartbeats per timeout: after one timeout without a heartbeat, an owner counts as dead."""
+_CLAIM_NAME = re.compile(r"([0-9a-z_-]+)\.([1-9][0-9]*)(?:\.([a-z]+))?")
+_PULSE_DIGITS = 12
+_MAX_POLL_INTERVAL = 5.0
+"""Seconds between two looks at the claims of other processes."""
 
 
 class State(NamedTuple):
-    """How far a piece of work is."""
+    """State of a task."""
 
     number: int
-    """Of its last attempt; 0: nobody has claimed it yet."""
+    """Number of the latest attempt; 0 if the task was never claimed."""
     outcome: str | None
-    """Of that attempt; None: it is under way, or its owner is dead."""
+    """Outcome of that attempt; None while it runs, or if its owner died."""
 
 
 NEW = State(0, None)
@@ -43,7 +43,7 @@ NEW = State(0, None)
 
 @dataclass(frozen=True)
 class Claim:
-    """An attempt at a piece of work, which is this process's alone."""
+    """An attempt at a task, owned by one process."""
 
     folder: Path
     key: str
@@ -51,37 +51,42 @@ class Claim:
 
     @property
     def path(self) -> Path:
-        """The file of the claim."""
+        """Path of the claim file."""
         return self.folder / f"{self.key}.{self.number}"
 
 
 class Seen(NamedTuple):
-    """The heartbeat of a claim, and since when it is the same, in seconds of the watcher's own clock."""
+    """Latest known heartbeat of a claim."""
 
     pulse: bytes
     since: float
+    """Time at which this process first read this pulse, in seconds of its own clock."""
 
 
 def states(names: Iterable[str]) -> dict[str, State]:
-    """The states of all work that was ever claimed, from the names of the files.
+    """Return the state of every task that was ever claimed, by key.
+
+    Args:
+        names: names of the files in the folder.
 
     >>> states(["a.1", "a.1.left", "a.2", "b.1", "b.1.done", "notes.txt"])
     {'a': State(number=2, outcome=None), 'b': State(number=1, outcome='done')}
     """
-    found: dict[str, State] = {}
+    latest: dict[str, State] = {}
     for name in names:
-        match = _NAME.fullmatch(name)
+        match = _CLAIM_NAME.fullmatch(name)
         if match is not None:
             key, state = match[1], State(int(match[2]), match[3])
-            before = found.get(key, NEW)
-            if (state.number, state.outcome or "") > (before.number, before.outcome or ""):
-                found[key] = state
-    return found
+            previous = latest.get(key, NEW)
+            if (state.number, state.outcome or "") > (previous.number, previous.outcome or ""):
+                latest[key] = state
+    return latest
 
 
 def free(state: State, at_start: State) -> bool:
-    """Whether work may be claimed without waiting: nobody has it, it was given up, or its last attempt had ended
-    before this process looked for the first time.
+    """Return whether a task may be claimed immediately.
+
+    It may if it was never claimed, if it was abandoned, or if its latest attempt ended before this process started.
 
     >>> free(State(1, "failed"), at_start=State(1, "failed")), free(State(1, "failed"), at_start=NEW)
     (True, False)
@@ -90,7 +95,7 @@ def free(state: State, at_start: State) -> bool:
 
 
 def watched(before: Seen | None, pulse: bytes, now: float) -> Seen:
-    """What is known of a heartbeat after another look at it.
+    """Return the updated heartbeat record after reading `pulse` at time `now`.
 
     >>> watched(Seen(b"7", since=10.0), b"7", now=15.0), watched(Seen(b"7", since=10.0), b"8", now=15.0)
     (Seen(pulse=b'7', since=10.0), Seen(pulse=b'8', since=15.0))
@@ -99,7 +104,7 @@ def watched(before: Seen | None, pulse: bytes, now: float) -> Seen:
 
 
 def is_dead(seen: Seen, now: float, patience: float) -> bool:
-    """Whether a heartbeat was the same for so many seconds.
+    """Return whether a heartbeat has not changed for `patience` seconds.
 
     >>> is_dead(Seen(b"7", since=10.0), 69.0, 60.0), is_dead(Seen(b"7", since=10.0), 70.0, 60.0)
     (False, True)
@@ -108,7 +113,7 @@ def is_dead(seen: Seen, now: float, patience: float) -> bool:
 
 
 def read_states(folder: Path) -> dict[str, State]:
-    """`states` of a folder; nothing where it is not there yet."""
+    """Return the `states` of a folder; an empty dict if the folder does not exist yet."""
     try:
         return states(os.listdir(folder))
     except FileNotFoundError:
@@ -116,10 +121,11 @@ def read_states(folder: Path) -> dict[str, State]:
 
 
 def claim(folder: Path, key: str, after: int) -> Claim | None:
-    """Claims the attempt after the one of that number; None where another process was faster.
+    """Claim the next attempt at a task; return None if another process claimed it first.
 
     Args:
-        key: of lower case letters, digits, - and _.
+        key: name of the task, of lower-case letters, digits, - and _.
+        after: number of the latest attempt.
     Raises:
         OSError: the folder cannot be written.
 
@@ -129,47 +135,47 @@ def claim(folder: Path, key: str, after: int) -> Claim | None:
     >>> mine.path.name, claim(folder, "fox", after=0)
     ('fox.1', None)
     """
-    taken = Claim(folder, key, after + 1)
-    assert _NAME.fullmatch(taken.path.name), key
+    attempt = Claim(folder, key, after + 1)
+    assert _CLAIM_NAME.fullmatch(attempt.path.name), key
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with taken.path.open("xb") as file:
-            file.write(f"{0:0{_DIGITS}d} {socket.gethostname()} {os.getpid()}\n".encode())  # the rest is for people
+        with attempt.path.open("xb") as file:  # host name and process id are for human readers
+            file.write(f"{0:0{_PULSE_DIGITS}d} {socket.gethostname()} {os.getpid()}\n".encode())
     except FileExistsError:
         return None
-    return taken
+    return attempt
 
 
 def beat(claim: Claim, count: int) -> bool:
-    """Writes the heartbeat of a claim; False if another process has taken the work over.
+    """Write the heartbeat of a claim; return False if another process has taken the task over.
 
-    A heartbeat that cannot be written is one that is missing, and no error.
+    Failing to write the heartbeat is not an error; other processes then see it stop.
 
     Args:
-        count: another one than the last time, at least 0.
+        count: a non-negative number that differs from the previous one.
     """
     with suppress(OSError), claim.path.open("r+b", buffering=0) as file:
-        file.write(f"{count:0{_DIGITS}d}".encode())
+        file.write(f"{count:0{_PULSE_DIGITS}d}".encode())
     return not os.path.lexists(Claim(claim.folder, claim.key, claim.number + 1).path)
 
 
 def read_pulse(claim: Claim) -> bytes:
-    """The heartbeat of a claim, whoever has it; what cannot be read is none."""
+    """Read the heartbeat of a claim; return an empty string if it cannot be read."""
     with suppress(OSError):
-        return claim.path.read_bytes()[:_DIGITS]
+        return claim.path.read_bytes()[:_PULSE_DIGITS]
     return b""
 
 
 def end(claim: Claim, outcome: str) -> None:
-    """Writes down how an attempt ended, so that nobody waits for it any more.
+    """Record the outcome of an attempt, so that other processes stop waiting for it.
 
     Args:
-        outcome: a word of lower case letters. `LEFT`: others may take the work at once.
+        outcome: a word of lower-case letters; `LEFT` lets other processes claim the task immediately.
     Raises:
         OSError: the folder cannot be written.
     """
     path = claim.path.with_name(f"{claim.path.name}.{outcome}")
-    assert _NAME.fullmatch(path.name), outcome
+    assert _CLAIM_NAME.fullmatch(path.name), outcome
     path.touch()
 
 
@@ -182,16 +188,17 @@ def claims(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Claim]:
-    """Claims one piece of work after the other, until others have ended all the rest.
+    """Yield claims of this process until every task has ended, in this process or another.
 
-    What another process works on is waited for, and taken over where its heartbeat stops. The caller does the work of
-    every claim, beats meanwhile (`BEATS` times in `patience`), and ends it before it asks for the next.
+    The generator waits for tasks of other processes, and claims them if their heartbeat stops. The caller must work on
+    each claim, call `beat` (`BEATS` times per `patience`), and call `end` before it takes the next claim.
 
     Args:
-        keys: of the work that is to be done.
-        at_start: `read_states` from before the caller found out what is to be done: an attempt that ended later
-            is not repeated, one that ended before is.
-        patience: seconds without a heartbeat after which its owner counts as dead.
+        keys: names of the tasks.
+        at_start: result of `read_states` before the caller listed its tasks. Attempts that had ended by then are
+            repeated; attempts that end later are not.
+        patience: seconds without a heartbeat after which an owner counts as dead.
+        clock, sleep: replacements for tests.
     Raises:
         OSError: the folder cannot be written.
 
@@ -202,22 +209,22 @@ def claims(
     >>> read_states(folder)["a"], list(claims(folder, ["a", "b"], {}, patience=60.0))
     (State(number=1, outcome='done'), [])
     """
-    seen: dict[Claim, Seen] = {}
+    heartbeats: dict[Claim, Seen] = {}
     while True:
-        now, found, waiting, mine = clock(), read_states(folder), False, None
+        now, current, waiting, mine = clock(), read_states(folder), False, None
         for key in keys:
-            state = found.get(key, NEW)
-            ours = free(state, at_start.get(key, NEW))
-            if not ours and state.outcome is None:
+            state = current.get(key, NEW)
+            available = free(state, at_start.get(key, NEW))
+            if not available and state.outcome is None:
                 other = Claim(folder, key, state.number)
-                seen[other] = watched(seen.get(other), read_pulse(other), now)
-                ours, waiting = is_dead(seen[other], now, patience), True
-            if ours and (mine := claim(folder, key, state.number)) is not None:
+                heartbeats[other] = watched(heartbeats.get(other), read_pulse(other), now)
+                available, waiting = is_dead(heartbeats[other], now, patience), True
+            if available and (mine := claim(folder, key, state.number)) is not None:
                 break
-            waiting |= ours  # somebody was faster, and may die
+            waiting |= available  # another process claimed it first, and may die
         if mine is not None:
             yield mine
         elif not waiting:
             return
         else:
-            sleep(min(patience / BEATS, _LONGEST_NAP))
+            sleep(min(patience / BEATS, _MAX_POLL_INTERVAL))

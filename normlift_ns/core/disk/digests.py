@@ -1,4 +1,4 @@
-"""Digests of texts and of whole files: XXH3 with 128 bits, which finds damage and not forgery."""
+"""Digests of strings and files: the 128-bit XXH3, which detects damage but not forgery."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 from xxhash import xxh3_128
 
-_BLOCK = 2**20
-_OLD = "blake2b:"
-"""How digests of weight files begin that version 0.1 took."""
+_BLOCK_SIZE = 2**20
+_LEGACY_PREFIX = "blake2b:"
+"""Prefix of the digests that version 0.1 computed of weight files."""
 
 
 def text_digest(text: str) -> str:
-    """Digest of a text.
+    """Return the digest of a string.
 
     >>> text_digest("fox")
     'xxh3_128:2acc0017ba959fe5c1cfee97854b92cf'
@@ -25,10 +25,13 @@ def text_digest(text: str) -> str:
 
 
 def file_digest(*files: Path, like: str = "") -> str:
-    """Digest of the content of files, one after the other, wherever they lie. A core reads some 10 GB/s.
+    """Return the digest of the concatenated content of files, regardless of their paths.
+
+    One core reads about 10 GB/s.
 
     Args:
-        like: a digest to compare with; one of version 0.1 is taken with the hash of that version, a tenth as fast.
+        like: digest to compare the result with. For one of version 0.1, the result uses the hash of that version, at a
+            tenth of the speed.
     Raises:
         OSError: a file cannot be read.
 
@@ -38,10 +41,11 @@ def file_digest(*files: Path, like: str = "") -> str:
     >>> file_digest(path) == text_digest("fox"), file_digest(path, like="blake2b:0")
     (True, 'blake2b:af951fc8e5abe85ac01baf525102361b')
     """
-    make: Callable[[], Any] = partial(blake2b, digest_size=16) if like.startswith(_OLD) else xxh3_128
-    state, block = make(), bytearray(_BLOCK)
+    legacy = like.startswith(_LEGACY_PREFIX)
+    new_hash: Callable[[], Any] = partial(blake2b, digest_size=16) if legacy else xxh3_128
+    state, block = new_hash(), bytearray(_BLOCK_SIZE)
     for file in files:
         with file.open("rb", buffering=0) as stream:
             while size := stream.readinto(block):
                 state.update(memoryview(block)[:size])
-    return f"{_OLD if like.startswith(_OLD) else 'xxh3_128:'}{state.hexdigest()}"
+    return f"{_LEGACY_PREFIX if legacy else 'xxh3_128:'}{state.hexdigest()}"

@@ -1,5 +1,6 @@
-"""The files of a semantic field, read and checked: nothing in them leads anywhere else, and all numbers are numbers.
-Needs no torch.
+"""Reading the files of a semantic field, with checks of digests, shapes, index ranges and finite values.
+
+This module does not need torch.
 """
 
 from __future__ import annotations
@@ -20,35 +21,35 @@ FIELD_FILE, EVIDENCE_FILE = "field.safetensors", "evidence.safetensors"
 EVIDENCE_FORMAT = "normlift_ns.evidence/1"
 EVIDENCE_COUNTS = ("num_views", "weight_power", "num_excluded")
 SCALARS = ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight", "view_count")
-"""Numbers of every Gaussian, as `core.lift.Scalars` has them."""
-_MOST_VIEWS = 2**24
+"""Names of the per-Gaussian numbers, as in `core.lift.Scalars`."""
+_MAX_VIEWS = 2**24
 
 
 class RowArrays(NamedTuple):
-    """A sparse matrix by rows, as `core.sparse.SparseRows` has it."""
+    """A sparse matrix in CSR layout, as in `core.sparse.SparseRows`."""
 
     offsets: Int64[np.ndarray, " rows_plus_1"]
     column: Int32[np.ndarray, " nnz"]
     weight: Float[np.ndarray, " nnz"]
 
     def check(self, name: str, num_columns: int) -> None:
-        """Makes sure that the arrays describe weights in a matrix of so many columns.
+        """Raise if the arrays are not a valid weight matrix with `num_columns` columns.
 
         Args:
-            name: of the matrix, for the message.
+            name: name of the matrix, for the error message.
         Raises:
-            ValueError: another type or shape, entries outside the matrix, weights that are negative or not finite.
+            ValueError: wrong type or shape, entries outside the matrix, or weights that are negative or not finite.
         """
-        weights = "float64" if self.weight.dtype == "float64" else "float32"
+        weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"
         arrays = (("offsets", self.offsets, "int64"), ("columns", self.column, "int32"))
-        for what, array, dtype in (*arrays, ("weights", self.weight, weights)):
+        for part, array, dtype in (*arrays, ("weights", self.weight, weight_dtype)):
             if array.ndim != 1 or array.dtype != dtype:
-                raise InputError(f"{name}: {what} are {array.dtype} {array.shape}, expected one row of {dtype}")
+                raise InputError(f"{name}: {part} are {array.dtype} {array.shape}, expected one-dimensional {dtype}")
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.size > 0 else []
         size = self.column.size
         if ends != [0, size] or self.weight.size != size or bool((self.offsets[1:] < self.offsets[:-1]).any()):
             raise InputError(
-                f"{name}: offsets must rise from 0 to the number of entries, found {ends} for {size} columns and "
+                f"{name}: offsets must rise from 0 to the number of entries, got {ends} for {size} columns and "
                 f"{self.weight.size} weights"
             )
         low, high = (int(self.column.min()), int(self.column.max())) if size > 0 else (0, -1)
@@ -56,65 +57,67 @@ class RowArrays(NamedTuple):
             raise InputError(f"{name}: columns are in {low}..{high}, expected 0..{num_columns - 1}")
         least, most = (float(self.weight.min()), float(self.weight.max())) if size > 0 else (0.0, 0.0)
         if not 0 <= least <= most < math.inf:
-            raise InputError(f"{name}: weights are in {least}..{most}, expected finite ones that are not negative")
+            raise InputError(f"{name}: weights are in {least}..{most}, expected finite weights of at least 0")
 
 
 class EvidenceArrays(NamedTuple):
-    """What `Evidence.save` wrote."""
+    """Content of a file that `Evidence.save` wrote."""
 
     rows: RowArrays
     region_view: Int32[np.ndarray, " s"]
     unlabeled: RowArrays
     counts: tuple[int, int, int]
-    """Views, power of the weights, Gaussians left out."""
+    """Number of views, power of the weights, number of excluded Gaussians."""
     digest: str | None
-    """None: a file of version 0.1."""
+    """None for files of version 0.1."""
 
 
 class FieldArrays(NamedTuple):
-    """What `SemanticField.save` wrote."""
+    """Content of the files that `SemanticField.save` wrote."""
 
     manifest: dict[str, Any]
     arrays: dict[str, np.ndarray]
-    """source, the scalars, means unless version 0.1 wrote it; features, or coordinates and perhaps their basis."""
+    """`source`, the scalars, `means` (not in version 0.1), and either `features`, or `coordinates` and optionally
+    `basis`.
+    """
     evidence: EvidenceArrays | None
     digested: frozenset[str]
-    """Files whose digests the manifest has, by their paths from its folder."""
+    """Files that have a digest in the manifest, as paths relative to its folder."""
 
 
 def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again") -> EvidenceArrays:
-    """Reads what `Evidence.save` wrote.
+    """Read and check a file that `Evidence.save` wrote.
 
     Args:
-        key: as it was given then; a file with a key that has no digest, as version 0.1 wrote it, is refused.
-        remedy: what to do about a damaged file, for the message.
+        key: the key that the file was saved with. With a key, a file without a digest (version 0.1) is an error.
+        remedy: what the error message suggests if the file is missing or damaged.
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an evidence file, or a damaged one.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged or not an evidence file.
     """
-    old = None if key else ("format", *EVIDENCE_COUNTS)
-    arrays, facts, digest = load_arrays(path, key=key, undigested=old, remedy=remedy)
-    if facts.get("format") != EVIDENCE_FORMAT:
+    undigested = None if key else ("format", *EVIDENCE_COUNTS)
+    arrays, metadata, digest = load_arrays(path, key=key, undigested=undigested, remedy=remedy)
+    if metadata.get("format") != EVIDENCE_FORMAT:
         raise InputError(
-            f"{path} is not an evidence file of this version: format {facts.get('format')!r}, expected "
+            f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "
             f"{EVIDENCE_FORMAT!r}"
         )
     try:
         rows = RowArrays(*(arrays[name] for name in ("offsets", "region", "weight")))
         unlabeled = RowArrays(*(arrays[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
         region_view = arrays["region_view"]
-        views, power, excluded = (int(facts[name]) for name in EVIDENCE_COUNTS)
+        views, power, excluded = (int(metadata[name]) for name in EVIDENCE_COUNTS)
         if region_view.ndim != 1 or region_view.dtype != "int32":
             raise InputError(f"region_view is {region_view.dtype} {region_view.shape}, expected int32, [S]")
-        rows.check("weights of regions", len(region_view))
-        if not (0 <= views <= _MOST_VIEWS and power in (0, 1, 2) and 0 <= excluded <= len(rows.offsets) - 1):
-            found = ", ".join(map(str, (views, power, excluded)))
-            raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {found[:50]}, out of range")
-        unlabeled.check("weights of unlabelled pixels", views)
+        rows.check("region weights", len(region_view))
+        if not (0 <= views <= _MAX_VIEWS and power in (0, 1, 2) and 0 <= excluded <= len(rows.offsets) - 1):
+            counts = ", ".join(map(str, (views, power, excluded)))
+            raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {counts[:50]}, out of range")
+        unlabeled.check("weights of unlabeled pixels", views)
         if len(unlabeled.offsets) != len(rows.offsets):
             raise InputError(
-                f"{len(rows.offsets) - 1} Gaussians have weights of regions, {len(unlabeled.offsets) - 1} of "
-                "unlabelled pixels"
+                f"region weights are for {len(rows.offsets) - 1} Gaussians, weights of unlabeled pixels for "
+                f"{len(unlabeled.offsets) - 1}"
             )
         _check_views(region_view, views)
         return EvidenceArrays(rows, region_view, unlabeled, (views, power, excluded), digest)
@@ -125,24 +128,24 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
 def _check_views(region_view: Int32[np.ndarray, " s"], views: int) -> None:
     low, high = (int(region_view.min()), int(region_view.max())) if region_view.size > 0 else (0, -1)
     if low < 0 or high >= views or bool((region_view[1:] < region_view[:-1]).any()):
-        raise InputError(f"views of regions are in {low}..{high}, expected 0..{views - 1}, rising")
+        raise InputError(f"region_view is in {low}..{high}, expected 0..{views - 1} in ascending order")
 
 
 def read_field(folder: Path) -> FieldArrays:
-    """Reads what `SemanticField.save` wrote, with the digests of all files checked.
+    """Read the files that `SemanticField.save` wrote, and check all digests.
 
     Raises:
-        FileNotFoundError: no complete field in the folder.
-        ValueError: another schema, or a damaged file; the message names it.
+        FileNotFoundError: the folder has no complete field.
+        ValueError: unknown schema version, or a damaged file, which the message names.
     """
     manifest, digests = read_manifest(folder)
     try:
         arrays, _, digest = load_arrays(folder / FIELD_FILE, undigested=(), remedy=REMEDY)
-        found, evidence = {FIELD_FILE: digest}, None
+        actual, evidence = {FIELD_FILE: digest}, None
         if manifest["form"] == "evidence":
             evidence = read_evidence(folder / EVIDENCE_FILE, remedy=REMEDY)
-            found[EVIDENCE_FILE] = evidence.digest
-        check_digests(folder, found, digests)
+            actual[EVIDENCE_FILE] = evidence.digest
+        check_digests(folder, actual, digests)
         _check_field(folder / FIELD_FILE, arrays, manifest, evidence)
     except KeyError as error:
         raise InputError(f"the semantic field in {folder} is damaged: {error} is missing; {REMEDY}") from error
@@ -155,7 +158,7 @@ def _check_field(
     n, dimension = int(manifest["num_gaussians"]), int(manifest["dimension"])
     try:
         check_array("source", arrays["source"], "int32", (n,), 0, n - 1)
-        if "means" in arrays:  # a Gaussian that was never drawn may have any mean
+        if "means" in arrays:  # Gaussians that are never rendered may have means that are not finite
             check_array("means", np.nan_to_num(arrays["means"]), "float32", (n, 3), -LARGEST)
         for name in SCALARS:
             check_array(name, arrays[name], "int32" if name == "view_count" else "float32", (n,), 0)

@@ -1,7 +1,7 @@
-"""What is under way when several files, or a folder, take their places: a journal that completes it after a crash.
+"""Write-ahead journal for replacing several files or a folder, so that a crash in the middle can be completed.
 
-A journal moves and deletes files, so only one that this user's programs have written is followed: it is signed with a
-key that stands in the user's own state folder. Whoever sends a folder to somebody can sign none for them.
+A journal moves and deletes files, so `complete` follows only journals that the same user's programs wrote. Each is
+signed with a key in the user's state folder. A folder received from somebody else cannot contain a valid signature.
 """
 
 from __future__ import annotations
@@ -21,46 +21,51 @@ from normlift_ns.core.disk.atomic import rename_new
 from normlift_ns.crash import state_folder
 
 SUFFIX = ".journal"
-_KEY, _KEY_BYTES, _LARGEST = "key", 32, 2**20
+_KEY_FILE, _KEY_BYTES, _MAX_JOURNAL_BYTES = "key", 32, 2**20
 
 
 def write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
-    """Says what is about to happen to the folder of a temporary one; the journal is there whole, or not at all.
+    """Write the journal of the steps that are about to move files from a temporary folder into its parent.
+
+    The journal itself is written atomically.
 
     Args:
-        steps: `files`, `remove` and `overwrite`; or `place`, `new` and `old`. Names, without folders.
+        steps: `files`, `remove` and `overwrite`; or `place`, `new` and `old`. All names are without folders.
     """
-    unfinished, journal = temporary / "steps.json", temporary / f"steps{SUFFIX}"
+    draft, journal = temporary / "steps.json", temporary / f"steps{SUFFIX}"
     text = json.dumps(steps)
-    unfinished.write_text(f"{_signature(temporary, text)}\n{text}", "utf8")
-    descriptor = os.open(unfinished, os.O_RDWR)
+    draft.write_text(f"{_signature(temporary, text)}\n{text}", "utf8")
+    descriptor = os.open(draft, os.O_RDWR)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-    os.rename(unfinished, journal)
+    os.rename(draft, journal)
     return journal
 
 
 def complete(temporary: Path) -> bool:
-    """Completes, or undoes, what a journal says is under way; False where there is one that this user did not begin."""
+    """Complete or undo the steps of a journal; return False if this user did not write it.
+
+    Without a journal, do nothing and return True.
+    """
     journal = temporary / f"steps{SUFFIX}"
     if not os.path.lexists(journal):
         return True
     steps = _read(journal)
     if steps is None:
         warnings.warn(
-            f"{temporary} holds files that another user, or another machine, was putting into {temporary.parent} when "
-            "it was stopped. They are left alone; run the same command there again, or delete that folder",
+            f"{temporary} holds files that another user or another machine was moving into {temporary.parent} when it "
+            "was stopped. They are left unchanged; run that command there again, or delete the folder",
             stacklevel=2,
         )
         return False
     folder = temporary.parent
     if "place" in steps:
-        place = folder / Path(steps["place"]).name
+        target = folder / Path(steps["place"]).name
         for name in (steps["new"], steps["old"]):
-            if not os.path.lexists(place) and (temporary / Path(name).name).exists():
-                os.rename(temporary / Path(name).name, place)
+            if not os.path.lexists(target) and (temporary / Path(name).name).exists():
+                os.rename(temporary / Path(name).name, target)
         return True
     for name in (Path(name).name for name in steps["files"]):
         if (temporary / name).exists() and (steps["overwrite"] or not os.path.lexists(folder / name)):
@@ -72,36 +77,36 @@ def complete(temporary: Path) -> bool:
 
 
 def _read(journal: Path) -> dict[str, Any] | None:
-    """The steps of a journal of ours."""
-    if journal.is_symlink() or not journal.is_file() or journal.stat().st_size > _LARGEST:
+    """Return the steps of a journal; None if its signature is not valid."""
+    if journal.is_symlink() or not journal.is_file() or journal.stat().st_size > _MAX_JOURNAL_BYTES:
         return None
     signature, _, text = journal.read_bytes().decode("utf8", "replace").partition("\n")
-    same = hmac.compare_digest(signature.encode(), _signature(journal.parent, text).encode())
-    return json.loads(text) if same else None
+    valid = hmac.compare_digest(signature.encode(), _signature(journal.parent, text).encode())
+    return json.loads(text) if valid else None
 
 
 def _signature(temporary: Path, text: str) -> str:
-    """Of the steps in one place: a journal that was moved is no journal any more."""
+    """Return the signature of a journal, which includes its path: moving a journal invalidates it."""
     message = f"{temporary.resolve()}\n{text}".encode("utf8", "surrogateescape")
     return hmac.new(_key(), message, "sha256").hexdigest()
 
 
 @cache
 def _key() -> bytes:
-    """The user's key, made at its first use; where there is no place for one, a key of this process."""
+    """Return the user's key, created at its first use; a key for this process alone if it cannot be stored."""
     folder, new = state_folder(), secrets.token_bytes(_KEY_BYTES)
     if folder is None:
         return new
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        path, draft = folder / _KEY, folder / f"{_KEY}.{secrets.token_hex(8)}"
+        path, draft = folder / _KEY_FILE, folder / f"{_KEY_FILE}.{secrets.token_hex(8)}"
         if not path.exists():
             descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "wb") as file:
                 file.write(new)
             rename_new(draft, path)  # another process may have been faster
             draft.unlink(missing_ok=True)
-        found = path.read_bytes() if path.is_file() else b""
-        if len(found) == _KEY_BYTES and (os.name == "nt" or path.stat().st_uid == os.getuid()):
-            return found
+        stored = path.read_bytes() if path.is_file() else b""
+        if len(stored) == _KEY_BYTES and (os.name == "nt" or path.stat().st_uid == os.getuid()):
+            return stored
     return new

@@ -1,4 +1,4 @@
-"""Lines of JSON that several processes write, each into a file of its own, and that are read together."""
+"""JSON Lines files: each process appends to a file of its own, and readers read all files of a folder."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _Line = TypeVar("_Line")
 
 
 def append_line(path: Path, line: Any) -> None:
-    """Adds a line, in one step as far as the system can, and waits until it is on the disk.
+    """Append a line, with a single write, and wait until it is on the disk.
 
     Args:
         path: a file that no other process writes.
-        line: a dataclass, or what JSON holds.
+        line: a dataclass instance or other value that msgspec encodes as JSON.
     Raises:
         OSError: the file cannot be written.
     """
@@ -28,9 +28,9 @@ def append_line(path: Path, line: Any) -> None:
 
 
 def read_lines(folder: Path, kind: type[_Line]) -> list[_Line]:
-    """The lines of all files of a folder, file by file in the order of their names.
+    """Return the lines of all .jsonl files in a folder, file by file in the order of their names.
 
-    What is no line of that kind is left out: a process that is killed may leave the beginning of one.
+    Lines that do not decode as `kind` are skipped: a process that is killed may leave an incomplete one.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -39,11 +39,11 @@ def read_lines(folder: Path, kind: type[_Line]) -> list[_Line]:
     >>> read_lines(folder, dict)
     [{'fox': 1}, {'fox': 2}]
     """
-    found = []
+    lines = []
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         for line in path.read_bytes().splitlines():
             try:
-                found.append(msgspec.json.decode(line, type=kind))
+                lines.append(msgspec.json.decode(line, type=kind))
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
                 continue
-    return found
+    return lines

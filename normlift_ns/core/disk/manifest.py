@@ -1,4 +1,4 @@
-"""manifest.json: what is known of a semantic field, with the digests of its files and of itself."""
+"""manifest.json: metadata of a semantic field, with digests of its files and of the manifest itself."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from normlift_ns.options import Storage
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 REMEDY = "lift again with: ns-normlift --load-config ..."
-_LARGEST = 2**26
-"""Bytes of a manifest that is read; ours have some thousand."""
+_MAX_BYTES = 2**26
+"""Size limit of a manifest; normlift_ns writes a few thousand bytes."""
 BESIDE = re.compile(r"(\.\./(nerfstudio_models/)?)?\w[\w.-]*")
-"""Names of files that a manifest may have digests of: beside it, and in the run that it belongs to."""
+"""Relative paths that a manifest may have digests of: files next to it, and files of its run."""
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 
 
-class _Facts(msgspec.Struct):
-    """What every program that opens a field relies on; the rest of a manifest is for people."""
+class _Metadata(msgspec.Struct):
+    """The entries that programs rely on; the other entries of a manifest are for human readers."""
 
     num_gaussians: _Count
     dimension: _Count
@@ -40,74 +40,79 @@ class _Facts(msgspec.Struct):
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
-    """Writes facts, digests of files by their paths from the folder, and its own: of its text without that digest.
+    """Write metadata, digests of files, and the manifest's own digest, computed with that entry empty.
 
     Args:
-        facts: JSON types only.
+        facts: metadata of JSON types.
+        digests: digests by path relative to the folder.
     """
-    content = {"digest": None, **facts} | {"digest": "", "digests": dict(digests)}  # its own first
+    content = {"digest": None, **facts} | {"digest": "", "digests": dict(digests)}  # its own digest comes first
     text = json.dumps(content, indent=2) + "\n"
     write_text(folder / MANIFEST, text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1))
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """Facts and digests; None in place of these where version 0.1 wrote the manifest.
+    """Read and check a manifest.
 
+    Returns:
+        Metadata, and the digests of files by path relative to the folder; None instead of digests for version 0.1.
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: a damaged one, or one of another schema.
+        FileNotFoundError: the manifest does not exist.
+        ValueError: the manifest is damaged or has an unknown schema version.
     """
     path = folder / MANIFEST
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no complete semantic field ({MANIFEST} is missing); {REMEDY}")
     try:
-        text = _text(path)
+        text = _read_text(path)
         facts = json.loads(text)
         if not isinstance(facts, dict):
-            raise InputError(f"it holds {type(facts).__name__}, expected an object")
+            raise InputError(f"it holds a {type(facts).__name__}, expected a JSON object")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"the semantic field in {folder} is damaged ({path}: {type(error).__name__}: {error}); {REMEDY}"
         ) from error
     if facts.get("schema_version") != SCHEMA_VERSION or isinstance(facts["schema_version"], bool):
-        found = repr(facts.get("schema_version"))[:50]
-        raise InputError(f"{folder}: schema version {found}, this program reads {SCHEMA_VERSION}; lift again")
+        version = repr(facts.get("schema_version"))[:50]
+        raise InputError(f"{folder} has schema version {version}, expected {SCHEMA_VERSION}; lift again")
     expected, digests = facts.pop("digest", None), facts.pop("digests", None)
     if expected is not None or digests is not None:
-        found = text_digest(text.replace(f'"digest": {json.dumps(expected)}', '"digest": ""', 1))
-        if found != expected:
-            raise InputError(f"{path} is damaged: its text has digest {found}, expected {str(expected)[:50]}; {REMEDY}")
+        actual = text_digest(text.replace(f'"digest": {json.dumps(expected)}', '"digest": ""', 1))
+        if actual != expected:
+            raise InputError(
+                f"{path} is damaged: its text has digest {actual}, expected {str(expected)[:50]}; {REMEDY}"
+            )
     try:
-        msgspec.convert(facts, _Facts)
+        msgspec.convert(facts, _Metadata)
         digests = None if digests is None else msgspec.convert(digests, dict[str, str])
-        if strange := [name for name in digests or () if BESIDE.fullmatch(name) is None]:
-            raise InputError(f"it has a digest of {strange[0]!r}, which is no file of a run")
+        if outside := [name for name in digests or () if BESIDE.fullmatch(name) is None]:
+            raise InputError(f"it has a digest of {outside[0]!r}, which is not a file of a run")
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged ({error}); {REMEDY}") from error
     return facts, digests
 
 
-def _text(path: Path) -> str:
-    """Of a regular file: anything else might never end."""
+def _read_text(path: Path) -> str:
+    """Read a regular file of limited size; reading a pipe, say, might never end."""
     if not path.is_file():
-        raise InputError("it is no file")
-    if path.stat().st_size > _LARGEST:
-        raise InputError(f"it has {path.stat().st_size:,} bytes, expected {_LARGEST:,} at most")
-    return path.read_bytes().decode("utf8").replace("\r\n", "\n")  # a copy by way of Windows is the same text
+        raise InputError("it is not a regular file")
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f"it has {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}")
+    return path.read_bytes().decode("utf8").replace("\r\n", "\n")  # copying via Windows may change line endings
 
 
 def check_digests(folder: Path, found: Mapping[str, str | None], expected: Mapping[str, str] | None) -> None:
-    """Makes sure that the files beside a manifest are those that were written with it.
+    """Raise if the files next to a manifest were not written together with it.
 
     Args:
-        found: digests of the files, by name; None for a file that has none.
-        expected: those of the manifest; None: it has none, and neither must the files.
+        found: actual digests of the files by name; None for files without a digest.
+        expected: digests in the manifest. None for a manifest of version 0.1; the files must then have none either.
     Raises:
-        ValueError: a file of another lift.
+        ValueError: a file is from a different lift.
     """
     if expected is None and set(found.values()) == {None}:
         warnings.warn(
-            f"{folder} was written by version 0.1, without digests: damage to its numbers would not show; {REMEDY}",
+            f"{folder} was written by version 0.1, without digests, so damage cannot be detected; {REMEDY}",
             stacklevel=2,
         )
         return
@@ -115,28 +120,29 @@ def check_digests(folder: Path, found: Mapping[str, str | None], expected: Mappi
         wanted = None if expected is None else expected.get(name)
         if digest is None or digest != wanted:
             raise InputError(
-                f"{folder / name} and the manifest beside it are of different lifts: the file has digest {digest}, the "
-                f"manifest expects {wanted}; {REMEDY}"
+                f"{folder / name} and the manifest next to it are from different lifts: the file has digest {digest}, "
+                f"the manifest expects {wanted}; {REMEDY}"
             )
 
 
 def check_files(folder: Path) -> None:
-    """Makes sure that the files of a run, as far as they are there, are those that were written with its field.
+    """Raise if an existing file of a run is not the one that was written with its semantic field.
 
-    Needs neither torch nor nerfstudio: damage shows before either is loaded.
+    This check needs neither torch nor nerfstudio, so it reports damage before either is imported.
 
     Args:
-        folder: of the manifest, which must be complete.
+        folder: folder of the manifest.
     Raises:
-        FileNotFoundError, ValueError: as `read_manifest`; a file that is damaged, or of another run.
+        FileNotFoundError: the manifest does not exist.
+        ValueError: the manifest or another file is damaged, or a file is from a different run.
     """
     for name, expected in (read_manifest(folder)[1] or {}).items():
         path = folder.parent / name.removeprefix("../") if name.startswith("../") else folder / name
-        if not path.is_file() or path.suffix == ".safetensors":  # these have digests of their own
+        if not path.is_file() or path.suffix == ".safetensors":  # safetensors files have digests of their own
             continue
-        found = file_digest(path)
-        if found != expected:
+        actual = file_digest(path)
+        if actual != expected:
             raise InputError(
-                f"{path} is damaged, or not the file that belongs to the semantic field in {folder}: its content has "
-                f"digest {found}, expected {expected}; copy it again from the whole run, or {REMEDY}"
+                f"{path} is damaged or does not belong to the semantic field in {folder}: its content has digest "
+                f"{actual}, expected {expected}; copy the whole run again, or {REMEDY}"
             )

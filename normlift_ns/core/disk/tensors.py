@@ -1,4 +1,4 @@
-"""Files of tensors with a digest of all that they hold: the face of `disk.arrays` for torch."""
+"""Safetensors files of torch tensors with a digest of their whole content; `disk.arrays` is the NumPy counterpart."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from normlift_ns.errors import InputError
 
 
 class TensorFile(NamedTuple):
-    """What a file holds."""
+    """Content of a file."""
 
     tensors: dict[str, Tensor]
     facts: dict[str, str]
+    """Metadata, without the digest."""
     digest: str | None
-    """None: a file of version 0.1."""
+    """None for files of version 0.1."""
 
 
 def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: str = "") -> str:
-    """Digest of names, types, shapes and numbers of tensors, of the facts beside them, and of a key.
+    """Return the digest of metadata, a key, and the names, types, shapes and values of tensors.
 
     >>> table = {"a": torch.eye(2)}
     >>> tensor_digest(table, {}) == tensor_digest({"a": torch.eye(2)}, {})
@@ -39,7 +40,7 @@ def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: 
 
 def _bytes(tensor: Tensor) -> memoryview:
     flat = tensor.detach().cpu().reshape(-1).contiguous()
-    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single number may have any stride
+    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single element may have any stride
 
 
 def save_tensors(
@@ -50,18 +51,20 @@ def save_tensors(
     key: str = "",
     overwrite: bool = False,
 ) -> str:
-    """Writes a safetensors file with facts and digest in its metadata; returns the digest.
+    """Write a safetensors file and return its digest, which its metadata also records.
 
     Args:
-        key: what finds the file again, for a cache: under another one the file is refused.
+        facts: further metadata.
+        key: key of the file in a cache; loading with a different key raises an error.
+        overwrite: replace an existing file.
     Raises:
-        FileExistsError, OSError: as `new_files`.
+        FileExistsError, OSError: as in `new_files`.
     """
-    given = dict(facts or {})
+    metadata = dict(facts or {})
     content = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
-    digest = tensor_digest(content, given, key)
+    digest = tensor_digest(content, metadata, key)
     with new_file(path, overwrite=overwrite) as draft:
-        save_file(content, draft, metadata={**given, DIGEST: digest})
+        save_file(content, draft, metadata={**metadata, DIGEST: digest})
         sort_facts(draft)
     return digest
 
@@ -69,15 +72,16 @@ def save_tensors(
 def load_tensors(
     path: Path, *, key: str = "", undigested: Collection[str] | None = None, remedy: str = "write it again"
 ) -> TensorFile:
-    """Reads what `save_tensors` wrote.
+    """Read a file of `save_tensors` and check its digest.
 
     Args:
-        key: as it was given then.
-        undigested: names of all facts in files of version 0.1, which have no digest; None: there are none.
-        remedy: what to do about a damaged file, for the message.
+        key: the key that the file was saved with.
+        undigested: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
+            these keys is read without a check. None: every file must have a digest.
+        remedy: what the error message suggests if the file is missing or damaged.
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: another digest than the file names, or no safetensors file.
+        FileNotFoundError: the file does not exist.
+        ValueError: the digest does not match, or the file is not a safetensors file.
     """
     return TensorFile(*read_safetensors(path, "pt", tensor_digest, key, undigested, remedy))
 
@@ -85,23 +89,24 @@ def load_tensors(
 def check_tensor(
     name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int], low: float | int, high: float | int = LARGEST
 ) -> None:
-    """Makes sure that a tensor of a file is what the program is about to take it for.
+    """Raise if the type, shape or value range of a tensor is not as expected.
 
     Args:
-        low, high: the range of its numbers, which includes both; NaN and infinity are in none.
+        name: name of the tensor, for the error message.
+        low, high: bounds of its values, both inclusive; NaN and infinity are always out of range.
     Raises:
-        ValueError: it is not; the message says what was found and expected.
+        ValueError: the tensor differs; the message has the actual and the expected properties.
     """
     if tensor.dtype != dtype or tuple(tensor.shape) != tuple(shape):
         raise InputError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {tuple(shape)}")
     least, most = (x.item() for x in _extremes(tensor)) if tensor.numel() > 0 else (low, low)
     if not low <= least <= most <= high:
-        raise InputError(f"{name} has numbers in {least}..{most}, expected {low:g}..{high:g}")
+        raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
 
 
 def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:
-    """The least and the largest number."""
+    """Return the minimum and the maximum."""
     try:
         return tensor.aminmax()
-    except RuntimeError:  # torch before 2.2 has none for half precision on the CPU
+    except RuntimeError:  # torch before 2.2 lacks aminmax for half precision on the CPU
         return tensor.float().aminmax()
