@@ -372,5 +372,5 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
         for name, other in (("fox.npy", "file.npy"), ("file.npy", "fox.npy")):
             archive.writestr(name, original.read(other))
         archive.comment = original.comment
-    with pytest.raises(ValueError, match=r"texts\.npz is damaged .*content has 'normlift_ns xxh3_128:\w+', expected"):
+    with pytest.raises(ValueError, match=r"texts\.npz is damaged .*digest is 'normlift_ns xxh3_128:\w+', expected"):
         TextVectors(file).text(["fox"])
