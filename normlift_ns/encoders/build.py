@@ -30,9 +30,9 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
     Args:
         device: As in `make_encoder`.
     Raises:
-        ValueError: As `make_regions` and `make_encoder`; or if imported features have no folder, or a folder is given
+        ValueError: As `make_regions` and `make_encoder`. Also if imported features have no folder, or a folder is given
             without imported features.
-        FileNotFoundError: As those; or if the folder of features does not exist.
+        FileNotFoundError: As those. Also if the folder of features does not exist.
     """
     if options.features not in get_args(FeaturesName):
         known = ", ".join(get_args(FeaturesName))
@@ -91,7 +91,7 @@ def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> Feature
         device: As in `make_encoder`.
     Raises:
         ValueError: If the manifest does not name the features, because they were passed in from Python or the version
-            was older; or if the recorded options give other features now.
+            was older. Also if the recorded options give other features now.
         FileNotFoundError: If a recorded file no longer exists.
     """
     settings = manifest.get("source")
@@ -133,7 +133,7 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     """Return the encoder of the options.
 
     Args:
-        device: Where a network runs, such as "cuda"; results are always on the CPU.
+        device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
         ValueError: If the encoder, the model, the weights tag or the fill is unknown, or an encoder of another package
             rejects the options.
@@ -171,10 +171,10 @@ def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
     """Return the regions of the options. Patches are not supported, because they come with features of their own.
 
     Args:
-        device: Where a network runs, such as "cuda"; results are always on the CPU.
+        device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
-        ValueError: If the regions are unknown, "files" has no folder, or a folder or a level does not apply to the
-            regions; and as `SamMasks` and `Sam3Masks`.
+        ValueError: If the regions are unknown, "files" has no folder, or a folder or level does not apply. Also as
+            `SamMasks` and `Sam3Masks`.
         FileNotFoundError: If the folder or the SAM checkpoint does not exist.
     """
     kind = resolve_regions(options, device)

@@ -23,8 +23,8 @@ class GivenFeatures:
     """A `FeatureSource` of precomputed (labels, vectors) per image, and of precomputed text embeddings.
 
     Raises:
-        ValueError: If vectors are not [regions, D], or [D] for a text, with the same D everywhere; if they are zero or
-            not finite; if labels are not an integer matrix or name a region without a vector; or if a text is empty or
+        ValueError: If vectors are zero, not finite, or not [regions, D] ([D] for a text) with the same D everywhere.
+            Also if labels are not an integer matrix, or name a region without a vector. Also if a text is empty, or
             cannot be a file name in an archive. The message names the image or the text.
     """
 
@@ -97,7 +97,7 @@ def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequen
         texts: Vectors by text.
         names: Names of all training images.
     Raises:
-        ValueError: If the list has another length, there are no pairs, or `GivenFeatures` raises.
+        ValueError: If the list has another length, it is empty, or `GivenFeatures` raises.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
         raise InputError(f"features must be a list or a dictionary of pairs, got {type(features).__name__}")

@@ -79,9 +79,9 @@ class EncoderKind:
     make: Callable[[SourceOptions, str], Encoder]
     """Makes the encoder from the options and a device such as "cuda". It should load weights at their first use."""
     rule: Rule = "lerf"
-    """How queries compute relevancy from cosines, unless they set a rule."""
+    """Relevancy rule of queries that set none."""
     negatives: tuple[str, ...] = CANONICAL_NEGATIVES
-    """Negative prompts that queries compare with, unless they set others; (): none."""
+    """Negative prompts of queries that set none; (): no negatives."""
     threshold: float | Literal["auto"] = 0.5
     """Relevancy by `rule` above which a Gaussian is selected; "auto": chosen from the histogram."""
     check: Callable[[SourceOptions], None] = _accept_all
@@ -93,7 +93,7 @@ class EncoderKind:
     has_patches: Callable[[SourceOptions], bool] = _no_patches
     """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
     learned: bool = True
-    """Whether a network processes the images, so that better regions improve its features."""
+    """True if a network processes the images, so that better regions improve its features."""
     paths: tuple[str, ...] = ()
     """Options that may be the path of a file or folder; they are stored as absolute paths."""
 

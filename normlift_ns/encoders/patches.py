@@ -24,7 +24,7 @@ class DenseEncoder(Encoder, Protocol):
 
     @property
     def why_not_dense(self) -> str | None:
-        """Why this network has no features of patches, and what to do; None if it has them."""
+        """The reason that this network has no features of patches, and what to do; None if it has them."""
         ...
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:

@@ -58,7 +58,7 @@ class Superpixels:
         return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
-        from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s, which other regions do not need)
+        from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
 
         segments = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
         return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
@@ -159,7 +159,7 @@ class LabelFiles:
         """Return the path of the label map of an image.
 
         Raises:
-            FileNotFoundError: If there is none.
+            FileNotFoundError: If the map does not exist.
             ValueError: If there are both a PNG and an NPY file.
         """
         relative = PurePath(name)
@@ -179,7 +179,7 @@ class LabelFiles:
         """Return the regions of an image; see `Regions.labels`.
 
         Raises:
-            FileNotFoundError: If there is no label map.
+            FileNotFoundError: If the label map does not exist.
             ValueError: If a map cannot be read, has color channels or fractional values, or differs in size from the
                 image while `resample` is off.
         """
@@ -207,7 +207,7 @@ class LabelFiles:
         """Return the stored maps of an image, [levels, H, W], of an integer type.
 
         Raises:
-            FileNotFoundError: If there is no label map.
+            FileNotFoundError: If the label map does not exist.
             ValueError: If a map cannot be read, or has color channels or fractional values.
         """
         path = self.path(name)

@@ -36,8 +36,7 @@ class ViewFeatures:
     cells, so its evidence is already computed.
 
     Raises:
-        ValueError: If a type or shape is wrong, a label has no cell, a cell has no feature row, or a row is not a unit
-            vector.
+        ValueError: If a type or shape is wrong, a label has no cell, a cell no feature row, or a row not unit length.
     """
 
     labels: Int32[Tensor, "h w"]
@@ -118,7 +117,7 @@ class FeatureSource(Protocol):
         """Return one unit row per prompt, on the CPU.
 
         Raises:
-            ValueError: If there is no prompt, a prompt is empty, or the encoder does not understand one.
+            ValueError: If `prompts` or a prompt is empty, or the encoder does not understand one.
         """
         ...
 

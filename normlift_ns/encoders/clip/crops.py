@@ -120,8 +120,11 @@ def masked_crops(
 def _bilinear_samples(
     side: Tensor, margin: Tensor, length: Tensor, start: Tensor, size: int
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Return the bilinear samples of each square along one axis: for each of the two pixels next to every sample, its
-    position in the image, its weight, and whether it lies in the box rather than in the margin."""
+    """Return the bilinear samples of each square along one axis.
+
+    The result has one entry for each of the two pixels next to a sample. It holds the position in the image, the
+    weight, and whether the pixel is in the box rather than in the margin.
+    """
     center = (torch.arange(size, device=side.device) + 0.5) * (side[:, None].double() / size) - 0.5
     center = center.clamp(min=0)
     low = center.long()

@@ -35,8 +35,8 @@ class OpenClipEncoder:
     precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
 
     Raises:
-        ValueError: If open_clip does not know the model or the weights tag, the installed timm does not know the model,
-            the fill is unknown, or the template has no placeholder for the text.
+        ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
+            tag. Also if the fill is unknown, or the template has no placeholder for the text.
         FileNotFoundError: If a weight file does not exist.
     """
 
@@ -47,7 +47,7 @@ class OpenClipEncoder:
     fill: Fill = "black"
     """Color of the pixels outside of a region."""
     device: str = "cpu"
-    """Where the network runs; results are always on the CPU."""
+    """Device of the network; results are always on the CPU."""
     template: str = "{}"
     """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
@@ -96,7 +96,7 @@ class OpenClipEncoder:
         return normalize(dense_tokens(visual, pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt; raises as `encode`, and ValueError if there is no prompt or one is empty."""
+        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
         check_prompts(prompts)
         templates = templates_of(self.template)
         tokens = self.network.tokenizer([template(prompt) for prompt in prompts for template in templates])

@@ -1,9 +1,9 @@
 """Patch features of OpenCLIP's vision transformers.
 
 The last layer of CLIP mixes all patches into one vector. As in MaskCLIP (Zhou, Loy and Dai, ECCV 2022), only the value
-path of that layer is used. The patch tokens of the layer before pass through the layer's first norm, its value and
-output projections, the final norm, and the projection into the joint space. The image is scaled to a whole number of
-patches, preserving its aspect ratio, and position embeddings are interpolated to that grid.
+path of that layer is used. Patch tokens of the preceding layer pass through the last layer's first norm, its value and
+output projections, the final norm, and the joint-space projection. The image is scaled to a whole number of patches,
+preserving its aspect ratio, and position embeddings are interpolated to that grid.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class TextTower:
         """Return one unit row per prompt, on the CPU.
 
         Raises:
-            ValueError: If there is no prompt, or one is empty.
+            ValueError: If `prompts` or a prompt is empty.
         """
         check_prompts(prompts)
         tokens = self.tokenizer([template(prompt) for prompt in prompts for template in self.templates])
@@ -137,11 +137,11 @@ def _shapes(
         "mlp.c_proj.weight": (width, 4 * width), "mlp.c_proj.bias": (width,),
     }  # fmt: skip
     blocks = {f"transformer.resblocks.{i}.{name}": shape for i in range(layers) for name, shape in block.items()}
-    whole = {
+    shapes = {
         "token_embedding.weight": (vocab_size, width),
         "positional_embedding": (context_length, width),
         "ln_final.weight": (width,),
         "ln_final.bias": (width,),
         "text_projection": (width, embed_dim),
     }
-    return {**whole, **blocks}
+    return {**shapes, **blocks}

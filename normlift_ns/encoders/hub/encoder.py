@@ -46,7 +46,7 @@ class HubEncoder:
     fill: Fill = "black"
     """Color of the pixels outside of a region."""
     device: str = "cpu"
-    """Where the network runs; results are always on the CPU."""
+    """Device of the network; results are always on the CPU."""
     template: str = "{}"
     """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
@@ -95,7 +95,7 @@ class HubEncoder:
         return normalize(self.network.patches(pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """Return one unit row per prompt; raises as `encode`, and ValueError if there is no prompt or one is empty."""
+        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
         check_prompts(prompts)
         templates = templates_of(self.template)
         texts = [self.family.read(template(prompt)) for prompt in prompts for template in templates]

@@ -54,7 +54,7 @@ class Tokens:
     side: str
     """left or right."""
     masked: bool
-    """Whether an attention mask hides padding from the network; SigLIP was trained without one."""
+    """True if an attention mask hides padding from the network; SigLIP was trained without one."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """Registration of `--encoder siglip`, `siglip2` and `metaclip2`, without torch.
 
-SigLIP is trained with a sigmoid: the match of a text and an image is sigmoid(scale * cosine + bias), with one scale > 0
+SigLIP is trained with a sigmoid. The match of a text and an image is sigmoid(scale * cosine + bias), with one scale > 0
 and one bias for all pairs. Of two texts, the one with the larger cosine also has the larger sigmoid, whatever scale and
 bias are. LERF's comparison with negatives therefore applies as with a softmax, and its tie, 0.5, is where the sigmoids
 of text and negative are equal. That rule and that threshold are the defaults.
 
-The sigmoid itself is not a suitable default: its 0.5 stands for one right caption among the tens of thousands of a
+The sigmoid itself is not a suitable default. Its 0.5 stands for one right caption among the tens of thousands of a
 batch, odds that crops of regions hardly ever reach.
 """
 

@@ -1,12 +1,12 @@
 """Networks of transformers with their weights on a device: embeddings of images, patches and texts in a joint space.
 
 SigLIP pools the tokens of all patches by attention with one learned query. As MaskCLIP (Zhou, Loy and Dai, ECCV 2022)
-does for the attention pooling of CLIP's ResNets, patch features replace that pooling by its value path. Every token,
-after the final norm, passes through the value and output projections of the pooling as if the query attended to it
-alone, and then through the rest of the head.
+does for the attention pooling of CLIP's ResNets, patch features replace that pooling by its value path. After the final
+norm, every token passes through the pooling's value and output projections as if the query attended to it alone. The
+rest of the head follows.
 
 MetaCLIP 2 has CLIP's class token instead. Of the last layer, only the first norm and the value and output projections
-are used (MaskCLIP's rule for vision transformers), followed by the final norm and the projection into the joint space.
+are used (MaskCLIP's rule for vision transformers). The final norm and the projection into the joint space follow.
 Position embeddings are interpolated as in transformers.
 """
 

@@ -1,9 +1,9 @@
 """A joint embedding space of image regions and text without learned weights: colors, robust to changes in lighting.
 
-A region is represented by its mean CIELAB color, a text by the colors that it names (from the 949 names of the XKCD
-color survey, in `xkcd.json`). Shade multiplies the light of a surface by a factor, which multiplies L* + 16, a* and b*
-by a common factor too. Colors are therefore compared in coordinates that discount this factor, and that are close to
-those of CIELAB at L* = 50::
+A region is represented by its mean CIELAB color, a text by the colors that it names. `xkcd.json` has the 949 names of
+the XKCD color survey. Shade multiplies the light of a surface by a factor, which multiplies L* + 16, a* and b* by a
+common factor too. Colors are therefore compared in coordinates that discount this factor, and that are close to those
+of CIELAB at L* = 50::
 
     p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
 
@@ -15,8 +15,8 @@ distance of coordinates::
 
 The cosine is 0.95 at a distance of 10 (neighboring shades), 0.61 at 30, 0.14 at 60 and 0.004 at 100. No finite number
 of dimensions reproduces this exactly. Here phi is the Nystroem approximation on 343 anchors, a lattice of 7 levels per
-sRGB channel: phi(x) = L^-1 k(anchors, x), normalized, where L L^T is the kernel matrix of the anchors. For random pairs
-of sRGB colors, the cosine is accurate to 4e-3, and to 1e-3 for 99 % of them. The encoder represents nothing but color.
+sRGB channel. With L L^T the kernel matrix of the anchors, phi(x) = L^-1 k(anchors, x), normalized. For random pairs of
+sRGB colors, the cosine is accurate to 4e-3, and to 1e-3 for 99 % of them. The encoder represents nothing but color.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class ColourTexts:
         """Return one unit row per prompt: the normalized mean of the vectors of all colors that it names.
 
         Raises:
-            ValueError: If there is no prompt, a prompt is empty, or one contains no color name.
+            ValueError: If `prompts` or a prompt is empty, or one contains no color name.
         """
         check_prompts(prompts)
         rows = []

@@ -74,7 +74,7 @@ class TextVectors:
         """Return one unit row per prompt.
 
         Raises:
-            ValueError: If there is no prompt, a prompt is empty, or one is not in the file; and as `names`.
+            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `names`.
         """
         import torch  # noqa: PLC0415 (queries can do without torch)
 
