@@ -97,7 +97,7 @@ def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequen
         texts: Vectors by text.
         names: Names of all training images.
     Raises:
-        ValueError: If the list has another length, it is empty, or `GivenFeatures` raises.
+        ValueError: If `features` is empty or a list of another length, or `GivenFeatures` raises.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
         raise InputError(f"features must be a list or a dictionary of pairs, got {type(features).__name__}")
