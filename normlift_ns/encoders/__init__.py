@@ -1,6 +1,7 @@
-"""2D semantics of images and texts in one space: `FeatureSource` is the protocol, `make_source` builds one.
+"""2D features of images and text embeddings in one space: the `FeatureSource` protocol and `make_source`, which builds
+one.
 
-Names are loaded on first use, so that `encoders.weights` can be asked without torch.
+Names are loaded on first use, so that `encoders.weights` can be imported without torch.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.source import TextEncoder as TextEncoder
     from normlift_ns.encoders.source import ViewFeatures as ViewFeatures
 
-_HOMES = {
+_EXPORTS = {
     "build": ("SourceOptions", "make_encoder", "make_regions", "make_source", "make_texts"),
     "cache": ("cached",),
     "images": ("read_image",),
@@ -34,14 +35,14 @@ _HOMES = {
     "langsplat.source": ("LangSplat", "write_langsplat"),
     "source": ("Encoder", "FeatureSource", "RegionFeatures", "Regions", "TextEncoder", "ViewFeatures"),
 }
-"""Modules by the names that they define."""
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+"""The names that each module defines."""
+_MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names}
 
-__all__ = list(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = list(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'normlift_ns.encoders' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"normlift_ns.encoders.{_HOME[name]}"), name)
+    value = globals()[name] = getattr(import_module(f"normlift_ns.encoders.{_MODULE_OF[name]}"), name)
     return value

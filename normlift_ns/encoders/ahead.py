@@ -1,4 +1,4 @@
-"""Work on the next items while the result of one is used."""
+"""A parallel `map` that prefetches the next results."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Result = TypeVar("Result")
 
 
 def ahead(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """As `map`, but as many of the next items as there are threads are worked on while a result is used.
+    """Yield `map(function, items)`, and compute up to `threads` of the next results while the caller uses one.
 
-    Items are asked for in the caller's thread. What they or the function raise is raised when its turn comes. With one
-    thread nothing is done ahead.
+    Items are requested in the caller's thread. An exception of the items or the function is raised when its turn comes.
+    With one thread, nothing is prefetched.
 
     >>> list(ahead(abs, [-1, 2, -3], 2))
     [1, 2, 3]
@@ -24,21 +24,21 @@ def ahead(function: Callable[[Item], Result], items: Iterable[Item], threads: in
     if threads == 1:
         yield from map(function, items)
         return
-    left, waiting = iter(items), deque[Future[Result]]()
+    iterator, pending = iter(items), deque[Future[Result]]()
 
-    def start(count: int) -> None:
+    def submit(count: int) -> None:
         try:
-            waiting.extend(pool.submit(function, item) for item in islice(left, count))
-        except Exception as error:  # of the items
-            waiting.append(Future())
-            waiting[-1].set_exception(error)
+            pending.extend(pool.submit(function, item) for item in islice(iterator, count))
+        except Exception as error:  # raised by the items
+            pending.append(Future())
+            pending[-1].set_exception(error)
 
     with ThreadPoolExecutor(threads) as pool:
         try:
-            start(threads)
-            while len(waiting) > 0:
-                result = waiting.popleft().result()
-                start(1)
+            submit(threads)
+            while len(pending) > 0:
+                result = pending.popleft().result()
+                submit(1)
                 yield result
         finally:
             pool.shutdown(cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Batches that fit into memory."""
+"""Batched computation that adapts to the available GPU memory."""
 
 from __future__ import annotations
 
@@ -12,26 +12,25 @@ from torch import Tensor
 from normlift_ns.core.gpu import Items, in_parts
 
 T = TypeVar("T")
-Item = TypeVar("Item")
+Element = TypeVar("Element")
 _ADVICE = (
-    "close other programs that use the GPU, take a smaller model, or images of a fraction of the size "
-    "(--lift-downscale 2), or lift on the CPU: --device cpu"
+    "close other programs that use the GPU, use a smaller model, downscale the images (--lift-downscale 2), or lift on "
+    "the CPU: --device cpu"
 )
 
 
 @dataclass
 class Batches:
-    """Cuts work into batches. Where a GPU's memory does not hold one, it goes on with smaller ones, for all that
-    follows."""
+    """Splits work into batches. If GPU memory cannot hold a batch, it is split, and all later batches are smaller."""
 
     size: int
     """Items per batch."""
 
     def __call__(self, function: Callable[[Items], T], items: Items) -> Iterator[T]:
-        """The function's results on consecutive items.
+        """Yield the results of the function on consecutive batches of items.
 
         Raises:
-            MemoryError: not even one item fits.
+            MemoryError: If not even one item fits.
         """
         start = 0
         while start < len(items):
@@ -43,29 +42,30 @@ class Batches:
             yield from results
 
     def across(
-        self, function: Callable[[Sequence[Item]], Tensor], parts: Iterable[Sequence[Item]]
+        self, function: Callable[[Sequence[Element]], Tensor], parts: Iterable[Sequence[Element]]
     ) -> Iterator[list[Tensor]]:
-        """The function's rows, one per item, of each part, where one batch may hold items of several parts.
+        """Yield the rows of each part, one per item; one batch may hold items of several parts.
 
-        The last batch is filled up with its last item, so that all have the same shape and a row does not depend on
-        what else is asked for: its rounding may.
+        Every batch has the same shape: the last one is padded with copies of its last item. A row therefore depends on
+        the rest of its batch by rounding only.
 
-        A part is asked for when those before it leave room in a batch; its rows are given as soon as they are known.
+        A part is requested when the earlier parts leave room in a batch, and its rows are yielded as soon as they are
+        computed.
 
         Raises:
-            MemoryError: not even one item fits.
+            MemoryError: If not even one item fits.
         """
-        counts, waiting, rows = deque[int](), list[Item](), deque[Tensor]()
+        counts, queue, rows = deque[int](), list[Element](), deque[Tensor]()
         for part in parts:
             counts.append(len(part))
-            waiting.extend(part)
-            while len(waiting) >= self.size:
-                batch, waiting = waiting[: self.size], waiting[self.size :]
+            queue.extend(part)
+            while len(queue) >= self.size:
+                batch, queue = queue[: self.size], queue[self.size :]
                 rows.extend(row for result in self(function, batch) for row in result)
             while len(counts) > 0 and counts[0] <= len(rows):
                 yield [rows.popleft() for _ in range(counts.popleft())]
-        if len(waiting) > 0:
-            filled = [*waiting, *[waiting[-1]] * (self.size - len(waiting))]
-            rows.extend([row for result in self(function, filled) for row in result][: len(waiting)])
+        if len(queue) > 0:
+            padded = [*queue, *[queue[-1]] * (self.size - len(queue))]
+            rows.extend([row for result in self(function, padded) for row in result][: len(queue)])
         for count in counts:
             yield [rows.popleft() for _ in range(count)]

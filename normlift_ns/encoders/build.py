@@ -1,4 +1,4 @@
-"""A feature source from `SourceOptions`."""
+"""Builders of feature sources, encoders and regions from `SourceOptions`."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, FeaturesName, Regions
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
-    """Regions and encoder of the options, joined, or the features of a folder.
+    """Return the feature source of the options: regions combined with an encoder, or features read from a folder.
 
     Args:
-        device: as in `make_encoder`.
+        device: As in `make_encoder`.
     Raises:
-        ValueError: as `make_regions` and `make_encoder`; features without a folder, or a folder without features.
-        FileNotFoundError: as those; the folder does not exist.
+        ValueError: As `make_regions` and `make_encoder`. Also if imported features have no folder, or a folder is given
+            without imported features.
+        FileNotFoundError: As those. Also if the folder of features does not exist.
     """
     if options.features not in get_args(FeaturesName):
         known = ", ".join(get_args(FeaturesName))
@@ -50,14 +51,14 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             return _make_patches(options, device)
         return RegionFeatures(make_regions(options, device), make_encoder(options, device))
     if options.features_dir is None:
-        raise InputError(f"features {options.features!r} need their folder: give it with --features-dir")
+        raise InputError(f"--features {options.features} needs the folder of the features; give it with --features-dir")
     if options.regions != "auto" or options.regions_dir is not None:
         raise InputError(
-            "--regions and --regions-dir cut images up, but --features brings regions of its own; leave one out"
+            "--regions and --regions-dir segment images, but --features imports its own regions; leave one of them out"
         )
     if not encoder_kind(options.encoder).learned and options.text_vectors is None:
         raise InputError(
-            f"encoder {options.encoder!r} did not make the features in {options.features_dir}; name the OpenCLIP model "
+            f"--encoder {options.encoder} did not make the features in {options.features_dir}; name the OpenCLIP model "
             "that did with --encoder-model and --encoder-pretrained, or give --text-vectors"
         )
     level: Any = options.level or "l"
@@ -70,70 +71,73 @@ _PATHS = ("regions_dir", "features_dir", "text_vectors")
 
 
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
-    """The options of a lift for its manifest, ready for JSON: "auto" decided, files by their absolute paths."""
+    """Return the options of a lift for its manifest, as JSON-serializable values. "auto" is resolved, and paths are
+    absolute."""
     if options.features == "none":
         options = replace(options, regions=resolve_regions(options, device))
     settings = {**asdict(options), **absolute_paths(options)}
-    settings["sam_model"] = None if options.sam_model is None else _absolute(options.sam_model)
+    settings["sam_model"] = None if options.sam_model is None else _absolute_if_exists(options.sam_model)
     return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in settings.items()}
 
 
-def _absolute(weights: str) -> str:
-    return os.path.abspath(weights) if os.path.exists(weights) else weights
+def _absolute_if_exists(name: str) -> str:
+    return os.path.abspath(name) if os.path.exists(name) else name
 
 
 def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:
-    """The features that a field was lifted from, to be made again.
+    """Recreate the feature source that a field was lifted from.
 
     Args:
-        device: as in `make_encoder`.
+        device: As in `make_encoder`.
     Raises:
-        ValueError: the manifest does not name them, because they were the user's own or the version was an earlier
-            one; or what it names gives other features now.
-        FileNotFoundError: files that it names are gone.
+        ValueError: If the manifest does not name the features, because they were passed in from Python or the version
+            was older. Also if the recorded options give other features now.
+        FileNotFoundError: If a recorded file no longer exists.
     """
     settings = manifest.get("source")
     if settings is None:
         raise InputError(
-            "the run does not say how its regions and features were made: they were given from Python, or an earlier "
-            "version lifted it; lift again with: ns-normlift"
+            "the run does not record how its regions and features were made: they were passed in from Python, or an "
+            "earlier version lifted it; lift again with: ns-normlift"
         )
     try:
-        options = SourceOptions(**_restored(settings))
+        options = SourceOptions(**_restore_settings(settings))
     except TypeError as error:
         raise InputError(
-            f"the run's manifest names options for its features that this version does not know ({error}); lift again "
+            f"the run's manifest has feature options that this version does not know ({error}); lift again "
             "with: ns-normlift"
         ) from error
     source = make_source(options, device)
-    wanted, found = (json.dumps(x, sort_keys=True) for x in (manifest.get("features"), source.identity))
-    if wanted != found:
+    recorded, current = (json.dumps(x, sort_keys=True) for x in (manifest.get("features"), source.identity))
+    if recorded != current:
         raise InputError(
-            f"the run was lifted from other features than its options give now: {wanted} then, {found} now; lift again "
-            "with: ns-normlift"
+            f"the options recorded in the run give other features now: {recorded} at the lift, {current} now; lift "
+            "again with: ns-normlift"
         )
     return source
 
 
-def _restored(settings: object) -> dict[str, Any]:
+def _restore_settings(settings: object) -> dict[str, Any]:
+    """Convert settings from a manifest back to option values."""
     if not isinstance(settings, Mapping):
         raise TypeError(f"found {type(settings).__name__}, expected an object")
     return {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
 
 
 def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
-    """The text encoder of the options; arguments and errors as in `make_encoder` and `TextVectors`."""
+    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextVectors`."""
     return make_encoder(options, device) if options.text_vectors is None else TextVectors(options.text_vectors)
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
-    """The encoder of the options.
+    """Return the encoder of the options.
 
     Args:
-        device: where a network runs, such as "cuda"; results are on the CPU anyway.
+        device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
-        ValueError: an unknown encoder, model, tag of weights or fill; what an encoder of another package refuses.
-        FileNotFoundError: a weight file that does not exist.
+        ValueError: If the encoder, the model, the weights tag or the fill is unknown, or an encoder of another package
+            rejects the options.
+        FileNotFoundError: If a weight file does not exist.
     """
     kind = encoder_kind(options.encoder)
     if is_ours(kind):
@@ -142,10 +146,10 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
-    """The regions of the options, "auto" decided.
+    """Return the regions of the options, with "auto" resolved.
 
     Raises:
-        ValueError: unknown regions.
+        ValueError: If the regions are unknown.
     """
     if options.regions not in get_args(RegionsName):
         raise InputError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionsName))}")
@@ -164,65 +168,69 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
 
 
 def make_regions(options: SourceOptions, device: str = "cpu") -> Regions:
-    """The regions of the options, but for patches, which are not to be had without their features.
+    """Return the regions of the options. Patches are not supported, because they come with features of their own.
 
     Args:
-        device: where a network runs, such as "cuda"; results are on the CPU anyway.
+        device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
-        ValueError: unknown regions, "files" without a folder, a folder or a level that the regions have no use for;
-            what `SamMasks` and `Sam3Masks` raise.
-        FileNotFoundError: the folder, or the checkpoint of sam, does not exist.
+        ValueError: If the regions are unknown, "files" has no folder, or a folder or level does not apply. Also as
+            `SamMasks` and `Sam3Masks`.
+        FileNotFoundError: If the folder or the SAM checkpoint does not exist.
     """
     kind = resolve_regions(options, device)
     if kind not in ("sam", "sam3"):
-        _refuse_sam(options, kind)
+        _reject_sam_options(options, kind)
     if kind != "sam3":
-        _refuse(" ".join(options.region_texts) or None, "--region-texts", kind, "sam3")
+        _reject(" ".join(options.region_texts) or None, "--region-texts", kind, "sam3")
     if kind == "files":
         if options.regions_dir is None:
             raise InputError(
                 'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
             )
-        level = _number(options.level)
+        level = _parse_level(options.level)
         return LabelFiles(options.regions_dir, options.regions_background, level, options.regions_resample)
-    _refuse(options.regions_dir, "--regions-dir", kind, "files")
+    _reject(options.regions_dir, "--regions-dir", kind, "files")
     if kind == "sam":
         level: Any = options.level or "l"
         return SamMasks(options.sam_model or DEFAULT_SAM, level, device, options.sam_precision)
-    _refuse(options.level, "--level", kind, "files or sam")
+    _reject(options.level, "--level", kind, "files or sam")
     if kind == "sam3":
         return Sam3Masks(options.region_texts, options.sam_model or DEFAULT_SAM3, device, options.sam_precision)
     count = 256 if options.region_count is None else options.region_count
     if kind == "patches":
-        raise InputError("patches are no regions that another encoder could look at; use make_source")
+        raise InputError("patches have features already and cannot be used as regions; use make_source")
     return Superpixels(count) if kind == "superpixel" else Grid(count)
 
 
 def _make_patches(options: SourceOptions, device: str) -> PatchFeatures:
-    _refuse_sam(options, "patches")
-    _refuse(" ".join(options.region_texts) or None, "--region-texts", "patches", "sam3")
-    _refuse(options.regions_dir, "--regions-dir", "patches", "files")
-    _refuse(options.level, "--level", "patches", "files or sam")
+    """Return the patch features of the options; raise InputError for options of other regions."""
+    _reject_sam_options(options, "patches")
+    _reject(" ".join(options.region_texts) or None, "--region-texts", "patches", "sam3")
+    _reject(options.regions_dir, "--regions-dir", "patches", "files")
+    _reject(options.level, "--level", "patches", "files or sam")
     encoder: Any = make_encoder(options, device)
     if not hasattr(encoder, "patches"):
         raise InputError(
-            f"--regions patches are for encoders that have features of patches; {options.encoder!r} has none. Take "
-            "--regions superpixel, or --encoder open_clip"
+            f"--regions patches needs an encoder with patch features; --encoder {options.encoder} has none. Use "
+            "--regions superpixel or --encoder open_clip"
         )
     return PatchFeatures(encoder, 1024 if options.region_count is None else options.region_count)
 
 
-def _refuse_sam(options: SourceOptions, kind: str) -> None:
-    _refuse(options.sam_model, "--sam-model", kind, "sam")
-    _refuse(options.sam_precision if options.sam_precision != "auto" else None, "--sam-precision", kind, "sam")
+def _reject_sam_options(options: SourceOptions, kind: str) -> None:
+    """Raise InputError if an option of SAM is set."""
+    _reject(options.sam_model, "--sam-model", kind, "sam")
+    _reject(options.sam_precision if options.sam_precision != "auto" else None, "--sam-precision", kind, "sam")
 
 
-def _refuse(value: object, flag: str, kind: str, meant: str) -> None:
+def _reject(value: object, flag: str, kind: str, intended: str) -> None:
+    """Raise InputError if an option is set that only applies to other regions."""
     if value is not None:
-        raise InputError(f'{flag} {value} is for --regions {meant}, not for "{kind}"; leave one of the two out')
+        raise InputError(f'{flag} {value} is for --regions {intended}, not for "{kind}"; leave one of them out')
 
 
-def _number(level: str | None) -> int | None:
+def _parse_level(level: str | None) -> int | None:
+    """Parse the level of label maps."""
     if level is not None and not (level.isascii() and level.isdigit()):
-        raise InputError(f"--level of --regions files is the number of a map, 0, 1, ...; got {level!r}")
+        raise InputError(f"--level must be the number of a map (0, 1, ...) with --regions files; got {level!r}")
     return None if level is None else int(level)

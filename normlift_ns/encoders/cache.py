@@ -1,7 +1,7 @@
-"""Regions and features kept on disk per image, so that an interrupted run resumes and a second one computes neither.
+"""Disk cache of regions and features per image: an interrupted run resumes, and a second run recomputes neither.
 
-An entry is found again by the content of all that it was made from. Files appear complete or not at all; one that is
-damaged, or stands under the name of another, is computed again. The folders may be deleted at any time.
+Cache keys are digests of everything that an entry depends on. Files are written atomically; a damaged file, or one
+under the wrong name, is recomputed. The folders may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -35,64 +35,64 @@ from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
 
 
 def cached(source: FeatureSource, folder: Path) -> FeatureSource:
-    """The source with everything kept in a folder that is expensive to compute again.
+    """Return a source that caches expensive results in a folder.
 
-    Raises (later, where a view is asked for):
-        OSError: the folder cannot be written to, as when the disk is full.
+    Raises (later, when a view is requested):
+        OSError: If the folder cannot be written to, as when the disk is full.
     """
     if isinstance(source, PatchFeatures):
         return CachedPatches(source, folder / "features")
     if not isinstance(source, RegionFeatures):
         return source
-    regions, encoder = (
-        CachedRegions(source.regions, folder / "regions"),
-        CachedEncoder(source.encoder, folder / "features"),
-    )
+    regions = CachedRegions(source.regions, folder / "regions")
+    encoder = CachedEncoder(source.encoder, folder / "features")
     return replace(source, regions=regions, encoder=encoder)
 
 
 class NotKeptError(Exception):
-    """What was asked for is not in the cache."""
+    """A result that is not in the cache."""
 
 
 def only_kept(source: FeatureSource, folder: Path) -> FeatureSource:
-    """The source with what is kept of it in a folder, which computes nothing that would be kept: `view` raises
-    `NotKeptError` for an image of which something is missing. Sources of which nothing is kept are as they were.
+    """Return a source that reads cached results from a folder and never computes any that would be cached.
+
+    Its `view` raises `NotKeptError` if a result for the image is missing. Sources that are not cached are returned
+    unchanged.
     """
-    found: Any = cached(source, folder)
-    if isinstance(found, CachedPatches):
-        return replace(found, source=cast(Any, _AbsentPatches(found.source)))
-    if not isinstance(found, RegionFeatures):
-        return found
-    regions, encoder = cast(Any, found.regions), cast(Any, found.encoder)
+    result: Any = cached(source, folder)
+    if isinstance(result, CachedPatches):
+        return replace(result, source=cast(Any, _NoPatches(result.source)))
+    if not isinstance(result, RegionFeatures):
+        return result
+    regions, encoder = cast(Any, result.regions), cast(Any, result.encoder)
     return replace(
-        found,
-        regions=replace(regions, regions=_AbsentRegions(regions.regions)),
-        encoder=replace(encoder, encoder=_AbsentEncoder(encoder.encoder)),
+        result,
+        regions=replace(regions, regions=_NoRegions(regions.regions)),
+        encoder=replace(encoder, encoder=_NoEncoder(encoder.encoder)),
     )
 
 
-class _Absent:
-    """Something that says what it is, and computes nothing."""
+class _Stub:
+    """A stand-in with the settings of another object, which computes nothing."""
 
-    def __init__(self, wanted: Any) -> None:
-        self._wanted = wanted
+    def __init__(self, original: Any) -> None:
+        self._original = original
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._wanted, name)
+        return getattr(self._original, name)
 
 
-class _AbsentPatches(_Absent):
+class _NoPatches(_Stub):
     def features(self, image: Tensor, name: str) -> Tensor:
         raise NotKeptError
 
 
-class _AbsentRegions(_Absent):
+class _NoRegions(_Stub):
     def labels(self, image: Tensor, name: str) -> Tensor:
         raise NotKeptError
 
 
-class _AbsentEncoder(_Absent):
+class _NoEncoder(_Stub):
     def encode_each(self, views: Iterable[Any]) -> Iterator[Tensor]:
         for _ in views:
             raise NotKeptError
@@ -101,14 +101,14 @@ class _AbsentEncoder(_Absent):
 
 @dataclass(frozen=True)
 class CachedRegions:
-    """`Regions` that keep the label maps, of all levels, of images that they have seen.
+    """`Regions` that cache the label maps of all levels.
 
-    The key: the image, its name, the files that are read for it, and the settings but the chosen level.
+    The key: the image, its name, the files that are read for it, and the settings except the selected level.
     """
 
     regions: Regions
     folder: Path
-    """Holds one safetensors file per image; made if it does not exist."""
+    """Contains one safetensors file per image; created if it does not exist."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -127,29 +127,29 @@ class CachedRegions:
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         path = self.path(image, name)
-        found = _read(path, "labels", lambda labels: _are_labels(labels, image))
-        if found is None:
-            found = self.regions.labels(image, name)
-            found = (found.to(torch.int16) if int(found.max()) < 2**15 else found).cpu()
-            _write(path, "labels", found)
-        return found.int()
+        labels = _read(path, "labels", lambda labels: _are_labels(labels, image))
+        if labels is None:
+            labels = self.regions.labels(image, name)
+            labels = (labels.to(torch.int16) if int(labels.max()) < 2**15 else labels).cpu()
+            _write(path, "labels", labels)
+        return labels.int()
 
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
-        """Where the label maps of an image are kept, whether they exist or not."""
+        """Return the cache path of the label maps of an image, whether the file exists or not."""
         files = [file.read_bytes() for file in self.files(name)]
-        return cache_path(self.folder, self.identity, name.encode(), *_parts(image), *files)
+        return cache_path(self.folder, self.identity, name.encode(), *_key_parts(image), *files)
 
 
 @dataclass(frozen=True)
 class CachedEncoder:
-    """An `Encoder` that keeps the features of regions that it has seen.
+    """An `Encoder` that caches region features.
 
     The key: the image, the labels, and the settings.
     """
 
     encoder: Encoder
     folder: Path
-    """Holds one safetensors file per image and level; made if it does not exist."""
+    """Contains one safetensors file per image and level; created if it does not exist."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -161,43 +161,43 @@ class CachedEncoder:
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        kept: deque[Tensor | None] = deque()  # of the views asked for and not given; None: the encoder has them
-        paths: deque[Path] = deque()  # of those that the encoder has
+        pending: deque[Tensor | None] = deque()  # cached features of views taken but not yielded; None: being encoded
+        paths: deque[Path] = deque()  # cache paths of the views being encoded
 
-        def new() -> Iterator[tuple[Tensor, Tensor]]:
+        def uncached() -> Iterator[tuple[Tensor, Tensor]]:
             for image, labels in views:
                 path = self.path(image, labels)
                 count = int(labels.max()) + 1 if labels.numel() > 0 else 0
-                kept.append(_read(path, "features", partial(_are_units, count=count)))
-                if kept[-1] is None:
+                pending.append(_read(path, "features", partial(_are_units, count=count)))
+                if pending[-1] is None:
                     paths.append(path)
                     yield image, labels
 
-        for features in self.encoder.encode_each(new()):
+        for features in self.encoder.encode_each(uncached()):
             _write(paths.popleft(), "features", features)
-            while (found := kept.popleft()) is not None:
-                yield found
+            while (rows := pending.popleft()) is not None:
+                yield rows
             yield features
-        yield from (found for found in kept if found is not None)
+        yield from (rows for rows in pending if rows is not None)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
 
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
-        """Where the features of an image's regions are kept, whether they exist or not."""
-        return cache_path(self.folder, self.identity, *_parts(image), *_parts(labels))
+        """Return the cache path of the features of the regions of an image, whether the file exists or not."""
+        return cache_path(self.folder, self.identity, *_key_parts(image), *_key_parts(labels))
 
 
 @dataclass(frozen=True)
 class CachedPatches:
-    """A `PatchFeatures` that keeps the features of images that it has seen.
+    """A `PatchFeatures` that caches the features of images.
 
     The key: the image, and the settings.
     """
 
     source: PatchFeatures
     folder: Path
-    """Holds one safetensors file per image; made if it does not exist."""
+    """Contains one safetensors file per image; created if it does not exist."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -207,13 +207,13 @@ class CachedPatches:
         return self.source.available(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        path = cache_path(self.folder, self.identity, *_parts(image))
+        path = cache_path(self.folder, self.identity, *_key_parts(image))
         labels = self.source.labels(image)
-        found = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
-        if found is None:
-            found = self.source.features(image, name)
-            _write(path, "features", found)
-        return ViewFeatures(labels, found)
+        features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1))
+        if features is None:
+            features = self.source.features(image, name)
+            _write(path, "features", features)
+        return ViewFeatures(labels, features)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.source.text(prompts)
@@ -221,30 +221,30 @@ class CachedPatches:
 
 @dataclass(frozen=True)
 class KeptTextMasks:
-    """What SAM 3 finds in photographs: where a text was asked before, its network is not even loaded.
+    """A cache of SAM 3 masks for prompts in images. The network is loaded only for prompts that are not cached.
 
-    The key: the image, the text, and the network. Masks are kept as bits.
+    The key: the image, the text, and the network. Masks are stored as bits.
     """
 
     checkpoint: str
     """A folder, or a name on the hub."""
     device: str
     folder: Path
-    """Holds one safetensors file per image and text; made if it does not exist. Where it cannot be written to, nothing
-    is kept."""
+    """Contains one safetensors file per image and text; created if it does not exist. If the folder cannot be written
+    to, nothing is cached."""
 
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
-        """What is in any of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.find`."""
+        """Return the union of the masks of each text; raises as `Sam3Network.load` and `Sam3Network.find`."""
         size = (image.shape[0], image.shape[1])
-        paths = {text: cache_path(self.folder, self._identity, text.encode(), *_parts(image)) for text in texts}
-        found = {text: _read(path, "bits", partial(_are_bits, size=size)) for text, path in paths.items()}
-        new = [text for text, bits in found.items() if bits is None]
+        paths = {text: cache_path(self.folder, self._identity, text.encode(), *_key_parts(image)) for text in texts}
+        packed = {text: _read(path, "bits", partial(_are_bits, size=size)) for text, path in paths.items()}
+        new = [text for text, bits in packed.items() if bits is None]
         for text, masks in zip(new, self._network.find(image, new) if len(new) > 0 else []):
-            found[text] = bits = torch.from_numpy(np.packbits(masks.union.cpu().numpy(), axis=1))
+            packed[text] = bits = torch.from_numpy(np.packbits(masks.union.cpu().numpy(), axis=1))
             with suppress(OSError):
                 _write(paths[text], "bits", bits)
-        packed = np.stack([bits.numpy() for text in texts if (bits := found[text]) is not None])
-        return torch.from_numpy(np.unpackbits(packed, axis=2, count=size[1]).astype(bool))
+        rows = np.stack([bits.numpy() for text in texts if (bits := packed[text]) is not None])
+        return torch.from_numpy(np.unpackbits(rows, axis=2, count=size[1]).astype(bool))
 
     @cached_property
     def _identity(self) -> dict[str, Any]:
@@ -255,36 +255,41 @@ class KeptTextMasks:
         return Sam3Network.load(self.checkpoint, self.device)
 
 
-def _are_bits(found: Tensor, size: tuple[int, int]) -> bool:
-    return found.dtype == torch.uint8 and found.shape == (size[0], -(-size[1] // 8))
+def _are_bits(bits: Tensor, size: tuple[int, int]) -> bool:
+    """Return whether a cached tensor has the type and shape of packed masks."""
+    return bits.dtype == torch.uint8 and bits.shape == (size[0], -(-size[1] // 8))
 
 
-def _parts(tensor: Tensor) -> tuple[bytes, bytes]:
+def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
+    """Return the parts of a cache key that identify a tensor: its type and shape, and its content."""
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
 
 
-def _read(path: Path, name: str, fits: Callable[[Tensor], bool]) -> Tensor | None:
-    """What was kept; None also where the file is damaged, is that of another image, or holds what does not fit."""
+def _read(path: Path, name: str, is_valid: Callable[[Tensor], bool]) -> Tensor | None:
+    """Return a cached tensor; None if it is missing, damaged, cached under another key, or not valid."""
     try:
-        found = load_tensors(path, key=path.stem).tensors[name] if os.path.isfile(path) else None
+        tensor = load_tensors(path, key=path.stem).tensors[name] if os.path.isfile(path) else None
     except (FileNotFoundError, ValueError, KeyError):
         return None
-    return found if found is not None and fits(found) else None
+    return tensor if tensor is not None and is_valid(tensor) else None
 
 
-def _are_labels(found: Tensor, image: Tensor) -> bool:
-    fitting = found.dtype in (torch.int16, torch.int32) and found.ndim == 4 and found.shape[2:] == image.shape[:2]
-    return fitting and found.numel() > 0 and int(found.min()) >= -1
+def _are_labels(labels: Tensor, image: Tensor) -> bool:
+    """Return whether a cached tensor is a valid label map of the image."""
+    matches = labels.dtype in (torch.int16, torch.int32) and labels.ndim == 4 and labels.shape[2:] == image.shape[:2]
+    return matches and labels.numel() > 0 and int(labels.min()) >= -1
 
 
-def _are_units(found: Tensor, count: int) -> bool:
-    if found.dtype != torch.float32 or found.ndim != 2 or found.shape[-1] == 0 or len(found) != count:
+def _are_units(rows: Tensor, count: int) -> bool:
+    """Return whether a cached tensor has `count` unit rows."""
+    if rows.dtype != torch.float32 or rows.ndim != 2 or rows.shape[-1] == 0 or len(rows) != count:
         return False
-    return bool(((torch.linalg.vector_norm(found, dim=-1) - 1).abs() < UNIT_TOLERANCE).all())
+    return bool(((torch.linalg.vector_norm(rows, dim=-1) - 1).abs() < UNIT_TOLERANCE).all())
 
 
 def _write(path: Path, name: str, tensor: Tensor) -> None:
+    """Write a tensor to the cache; raise OSError with advice if that fails."""
     try:
         save_tensors(path, {name: tensor}, key=path.stem, overwrite=True)
     except OSError as error:
-        raise OSError(f"cannot keep 2D {name}: {error}; the views that are done are found there") from error
+        raise OSError(f"cannot cache 2D {name}: {error}; the next lift reuses the views cached so far") from error

@@ -1,4 +1,4 @@
-"""The colour encoder: image regions as their mean colours, in the space of `encoders.texts.colours`."""
+"""The color encoder: regions are embedded by their mean colors; see `encoders.texts.colours`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from normlift_ns.encoders.texts.colours import ColourTexts, embed
 
 @dataclass(frozen=True)
 class ColourEncoder(ColourTexts):
-    """Mean CIELAB colours against colour names; formulas in `texts.colours`. Needs neither weights nor a GPU."""
+    """Encoder that compares mean CIELAB colors with color names; formulas in `texts.colours`. Needs neither weights nor
+    a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        from skimage.color import rgb2lab  # noqa: PLC0415 (what other encoders do without is not loaded)
+        from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
 
         labels = labels.cpu()
         depth, y, x = (labels >= 0).nonzero(as_tuple=True)

@@ -1,4 +1,4 @@
-"""Features of your own: label maps and vectors that are in memory already."""
+"""Precomputed features: label maps and vectors from memory."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ from normlift_ns.errors import InputError
 
 @dataclass(frozen=True)
 class GivenFeatures:
-    """A `FeatureSource` of (labels, vectors) per image, and of texts with their vectors.
+    """A `FeatureSource` of precomputed (labels, vectors) per image, and of precomputed text embeddings.
 
     Raises:
-        ValueError: vectors that are not [regions, D], or [D] for a text, with the same D everywhere, zero or not
-            finite; labels that are no integer matrix or name a region without a vector; a text that is empty or cannot
-            be the name of a file in an archive. The message names the image or the text.
+        ValueError: If vectors are zero, not finite, or not [regions, D] ([D] for a text) with the same D everywhere.
+            Also if labels are not an integer matrix, or name a region without a vector. Also if a text is empty, or
+            cannot be a file name in an archive. The message names the image or the text.
     """
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
-    """By the name of the image. Labels are 0..R-1, -1 for none; vectors may have any length > 0."""
+    """Labels and vectors by image name. Labels are 0..R-1, -1 for none; vectors may have any length > 0."""
     texts: Mapping[str, Float[Tensor, " d"]] = field(default_factory=dict)
+    """Embeddings by text."""
 
     def __post_init__(self) -> None:
         lengths = set()
@@ -48,14 +49,14 @@ class GivenFeatures:
             if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
                 raise InputError(f"the vector of text {text!r} must be [D], finite and not zero; got {vector.shape}")
             if text.strip() == "" or text.endswith(".npy") or "\0" in text:
-                raise InputError(f"{text!r} cannot be a text: it is empty, ends in .npy, or holds a zero character")
+                raise InputError(f"{text!r} is not a valid text: it is empty, ends in .npy or contains NUL characters")
             lengths.add(len(vector))
         if len(lengths) > 1:
             raise InputError(f"vectors of images and texts must have the same length, found {sorted(lengths)}")
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Features count by their content."""
+        """A digest of the content of all images."""
         digest = blake2b(digest_size=16)
         for name, (labels, vectors) in self.views.items():
             digest.update(f"{name} {labels.dtype} {tuple(labels.shape)} {vectors.dtype}".encode())
@@ -67,7 +68,7 @@ class GivenFeatures:
         unknown = sorted(set(self.views) - set(names))
         if len(unknown) > 0:
             raise InputError(
-                f"there is no training image {unknown[0]!r} for the features given; there are {len(names)}, from "
+                f"features were given for {unknown[0]!r}, which is not a training image; there are {len(names)}, from "
                 f"{names[0]!r} to {names[-1]!r}"
             )
         return [name for name in names if name in self.views]
@@ -77,45 +78,46 @@ class GivenFeatures:
         if labels.shape != image.shape[:2]:
             raise InputError(
                 f"labels of {name} are {tuple(labels.shape)}, but the image is {tuple(image.shape[:2])} (height x "
-                "width, undistorted, after lift_downscale); give labels of that size"
+                "width, undistorted, after lift_downscale); pass labels of that size"
             )
         return ViewFeatures(labels.int().cpu(), torch.from_numpy(unit_rows(vectors.cpu())))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
         known = {text: vector.cpu() for text, vector in self.texts.items()}
-        return torch.from_numpy(look_up(prompts, known, "the texts given"))
+        return torch.from_numpy(look_up(prompts, known, "the given texts"))
 
 
 def given_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> GivenFeatures:
-    """Features of your own from tensors, arrays or lists.
+    """Return a source of precomputed features from tensors, arrays or lists.
 
     Args:
-        features: one pair of labels and vectors per training image, in order; or a mapping from names of images, which
-            may leave some out.
-        texts: vectors by text.
-        names: of all training images.
+        features: One pair of labels and vectors per training image, in order; or a mapping from image names to pairs,
+            which may omit images.
+        texts: Vectors by text.
+        names: Names of all training images.
     Raises:
-        ValueError: a list of another length, no pair at all, or what `GivenFeatures` refuses.
+        ValueError: If `features` is empty or a list of another length, or `GivenFeatures` raises.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
         raise InputError(f"features must be a list or a dictionary of pairs, got {type(features).__name__}")
     if not isinstance(features, Mapping):
         if len(features) != len(names):
             raise InputError(
-                f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; give one "
-                "pair per image in the order of scene.train.names, or a dictionary by those names"
+                f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; pass one "
+                "pair per image in the order of scene.train.names, or a dictionary with those names as keys"
             )
         features = dict(zip(names, features))
     if len(features) == 0:
-        raise InputError("features are empty; give labels and vectors of at least one training image")
+        raise InputError("features are empty; pass labels and vectors of at least one training image")
     if texts is not None and not (isinstance(texts, Mapping) and all(isinstance(text, str) for text in texts)):
-        raise InputError("texts must be a dictionary from texts to vectors")
-    views = {name: _pair(name, pair) for name, pair in features.items()}
-    return GivenFeatures(views, {text: _floats(vector) for text, vector in (texts or {}).items()})
+        raise InputError("texts must be a dictionary that maps texts to vectors")
+    views = {name: _check_pair(name, pair) for name, pair in features.items()}
+    return GivenFeatures(views, {text: _to_floats(vector) for text, vector in (texts or {}).items()})
 
 
-def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
+def _check_pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
+    """Check and convert the labels and vectors of one image."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
     try:
@@ -124,15 +126,15 @@ def _pair(name: str, pair: Any) -> tuple[Tensor, Tensor]:
         raise InputError(f"labels of {name} must be a matrix of integers ({error})") from None
     if labels.dtype.kind not in "iub":
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
-    return torch.from_numpy(labels.astype(np.int64)), _floats(pair[1])
+    return torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
 
 
-def _floats(values: Any) -> Tensor:
-    """Detached, on the CPU, in float32 or float64."""
+def _to_floats(values: Any) -> Tensor:
+    """Return the values as a detached float32 or float64 tensor on the CPU."""
     try:
         tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
     except (TypeError, ValueError) as error:
         raise InputError(f"vectors must be numbers ({error})") from None
     if tensor.is_complex():
-        raise InputError("vectors must be of real numbers, got complex ones")
+        raise InputError("vectors must be real, got complex numbers")
     return tensor if tensor.dtype == torch.float64 else tensor.float()

@@ -1,5 +1,7 @@
-"""Kinds of encoders, by the names that `--encoder` takes. Each is an entry point of the group `normlift_ns.encoders`,
-ours and those of other packages alike. Imports nothing heavy; a package is loaded when its encoder is asked for.
+"""Registry of encoders by their `--encoder` names.
+
+Every encoder, built-in or from another package, is an entry point of the group `normlift_ns.encoders`. This module
+imports nothing heavy; a package is imported only when its encoder is requested.
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.source import Encoder
 
 GROUP = "normlift_ns.encoders"
-"""Of entry points."""
-_OURS = "normlift_ns."
+"""Entry point group of encoders."""
+_PACKAGE_PREFIX = "normlift_ns."
 BUILT_IN = {
     "open_clip": "normlift_ns.encoders.clip.kind:OPEN_CLIP",
     "siglip": "normlift_ns.encoders.hub.kinds:SIGLIP",
@@ -34,39 +36,40 @@ BUILT_IN = {
     "metaclip2": "normlift_ns.encoders.hub.kinds:METACLIP2",
     "colour": "normlift_ns.encoders.texts.colour_kind:COLOUR",
 }
-"""Ours, as pyproject.toml registers them: for a source tree that is not installed, or was before they were there."""
+"""The built-in encoders, as pyproject.toml registers them. Listed here for source trees that are not installed, or were
+installed before an encoder was added."""
 
 
 class Texts(Protocol):
-    """A reader of texts that needs torch where it has to, and for nothing else."""
+    """A text encoder that imports torch only if it has to run a network."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes the vectors, ready for JSON."""
+        """Every setting that changes the vectors, as JSON-serializable values."""
         ...
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """One unit row per prompt; raises ValueError for what it does not understand."""
+        """Return one unit row per prompt; raise ValueError for a prompt that the encoder does not understand."""
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """As `rows`, for torch."""
+        """Return `rows` as a torch tensor."""
         ...
 
 
-def _nothing(options: SourceOptions) -> None:
-    """Every option is right."""
+def _accept_all(options: SourceOptions) -> None:
+    """Accept all options."""
 
 
-def _none(options: SourceOptions) -> bool:
+def _no_patches(options: SourceOptions) -> bool:
     return False
 
 
 @dataclass(frozen=True)
 class EncoderKind:
-    """What an entry point of the group `normlift_ns.encoders` names: how an encoder is made, and how it is asked.
+    """An encoder and its query defaults; the object that an entry point of the group `normlift_ns.encoders` names.
 
-    The module that holds it should import torch inside `make` only, so that questions and errors are quick.
+    The module that defines it should import torch only inside `make`, so that queries and error messages stay fast.
 
     >>> from normlift_ns.encoders.kinds import encoder_kind
     >>> encoder_kind("colour").negatives, encoder_kind("open_clip").rule
@@ -74,65 +77,64 @@ class EncoderKind:
     """
 
     make: Callable[[SourceOptions, str], Encoder]
-    """Options and device, such as "cuda", to the encoder. Weights should be loaded where they are first needed."""
+    """Makes the encoder from the options and a device such as "cuda". It should load weights at their first use."""
     rule: Rule = "lerf"
-    """How relevancy follows from cosines, unless a question says otherwise."""
+    """Relevancy rule of queries that set none."""
     negatives: tuple[str, ...] = CANONICAL_NEGATIVES
-    """Texts to compare with, unless a question names others; (): none."""
+    """Negative prompts of queries that set none; (): no negatives."""
     threshold: float | Literal["auto"] = 0.5
-    """Relevancy by that rule above which a Gaussian is selected; "auto": what the histogram suggests."""
-    check: Callable[[SourceOptions], None] = _nothing
+    """Relevancy by `rule` above which a Gaussian is selected; "auto": chosen from the histogram."""
+    check: Callable[[SourceOptions], None] = _accept_all
     """Raises InputError or FileNotFoundError for options that cannot work, without importing torch."""
     texts: Callable[[SourceOptions, str, Path | None, Mapping[str, Any]], Texts] | None = None
-    """Makes what reads the texts of a lifted run, from its options, the device, the folder in which to keep vectors and
-    the identity that the encoder had when the run was lifted ({} if nobody knows). None: the encoder does, and what it
-    has read is kept."""
-    has_patches: Callable[[SourceOptions], bool] = _none
-    """Whether the encoder is a `DenseEncoder`, which has features of patches."""
+    """Makes the text encoder of a lifted run. Its arguments: the options, the device, the folder in which to cache
+    embeddings, and the encoder's identity recorded at the lift ({} if unknown). None: the encoder itself embeds the
+    prompts, and the embeddings are cached."""
+    has_patches: Callable[[SourceOptions], bool] = _no_patches
+    """Returns whether the encoder is a `DenseEncoder`, which has features of patches."""
     learned: bool = True
-    """A network sees the images: it is worth the best regions that there are."""
+    """True if a network processes the images, so that better regions improve its features."""
     paths: tuple[str, ...] = ()
-    """Options that may be the path of a file or folder; they are stored absolute."""
+    """Options that may be the path of a file or folder; they are stored as absolute paths."""
 
 
 def encoder_names() -> list[str]:
-    """The names that `encoder_kind` knows, in alphabetical order, whether they can be loaded or not."""
+    """Return the names of all registered encoders in alphabetical order, including those that fail to load."""
     return sorted({point.name for point in _points()})
 
 
 def encoder_kind(name: str) -> EncoderKind:
-    """A kind of encoder by its name. Other packages cannot take the name of one of ours.
+    """Return the encoder kind of a name. Other packages cannot take the name of a built-in encoder.
 
     Raises:
-        InputError: an unknown name, one that two packages claim, or an encoder of another package that cannot be
-            loaded.
+        InputError: If the name is unknown, two packages claim it, or the encoder of another package cannot be loaded.
     """
-    claims = {point.value: point for point in _points() if point.name == name}
-    ours = [value for value in claims if value.startswith(_OURS)]
-    if len(claims) == 0:
+    points = {point.value: point for point in _points() if point.name == name}
+    built_in = [value for value in points if value.startswith(_PACKAGE_PREFIX)]
+    if len(points) == 0:
         known = ", ".join(encoder_names()) or "none: normlift_ns is not installed (pip install -e .)"
         raise InputError(f"unknown encoder {shortened(name)!r}; --encoder is one of {known}")
-    if len(claims) > 1 and len(ours) == 0:
-        who = " and ".join(f"{_package(point)} ({value})" for value, point in claims.items())
-        raise InputError(f"encoder {name!r} is claimed by {who}; uninstall one of the two")
-    point = claims[ours[0] if len(ours) > 0 else next(iter(claims))]
+    if len(points) > 1 and len(built_in) == 0:
+        packages = " and ".join(f"{_package(point)} ({value})" for value, point in points.items())
+        raise InputError(f"encoder {name!r} is claimed by {packages}; uninstall one of the two")
+    point = points[built_in[0] if len(built_in) > 0 else next(iter(points))]
     try:
         kind = point.load()
-    except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
+    except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
         raise InputError(
             f"encoder {name!r} of {_package(point)} cannot be loaded ({first_line(error)}); repair or uninstall that "
             "package, or use another encoder, such as --encoder open_clip"
         ) from error
     if not isinstance(kind, EncoderKind):
         raise InputError(
-            f"encoder {name!r} of {_package(point)} is no encoder: {point.value} is of type {type(kind).__name__}, "
-            "expected an EncoderKind; use another one, such as --encoder open_clip"
+            f"encoder {name!r} of {_package(point)} is invalid: {point.value} is of type {type(kind).__name__}, "
+            "expected an EncoderKind; use another encoder, such as --encoder open_clip"
         )
     return kind
 
 
 def known_kind(name: object) -> EncoderKind | None:
-    """A kind of encoder; None where it is not known here, or cannot be loaded."""
+    """Return the encoder kind of a name; None if it is unknown or cannot be loaded."""
     try:
         return encoder_kind(name) if isinstance(name, str) else None
     except InputError:
@@ -140,39 +142,41 @@ def known_kind(name: object) -> EncoderKind | None:
 
 
 def is_ours(kind: EncoderKind) -> bool:
-    """Whether a kind is made by this package."""
-    return kind.make.__module__.startswith(_OURS)
+    """Return whether an encoder kind is built in."""
+    return kind.make.__module__.startswith(_PACKAGE_PREFIX)
 
 
 def absolute_paths(options: SourceOptions) -> dict[str, str]:
-    """The options of the encoder that may be paths, absolute where there is a file or folder, as they are elsewhere."""
+    """Return the encoder's options that may be paths. The path of an existing file or folder is made absolute."""
     kind = known_kind(options.encoder)
     values = {name: getattr(options, name) for name in (() if kind is None else kind.paths)}
     return {name: os.path.abspath(value) if os.path.exists(value) else value for name, value in values.items()}
 
 
 def _points() -> Sequence[EntryPoint]:
-    """The entry points of the group. Packages whose metadata is damaged are passed over."""
+    """Return the entry points of the group. Packages with damaged metadata are skipped."""
     return _points_on(tuple(sys.path))
 
 
 @cache
 def _points_on(path: tuple[str, ...]) -> Sequence[EntryPoint]:
-    """Found once for every `sys.path`: looking through hundreds of packages takes 20 ms, and a command asks often."""
-    return tuple(_found(path))
+    """Cache the entry points per `sys.path`: a search through hundreds of packages takes 20 ms, and a command needs it
+    often."""
+    return tuple(_discover(path))
 
 
-def _found(path: Sequence[str]) -> Iterator[EntryPoint]:
-    seen: set[str] = set()
+def _discover(path: Sequence[str]) -> Iterator[EntryPoint]:
+    """Yield the built-in entry points, then those of the packages on a path."""
+    names: set[str] = set()
     yield from [EntryPoint(name, value, GROUP) for name, value in BUILT_IN.items()]
     for package in distributions(path=list(path)):
         try:
             text = package.read_text("entry_points.txt")
-            if text is None or GROUP not in text or package.name in seen:
+            if text is None or GROUP not in text or package.name in names:
                 continue
-            seen.add(package.name)  # the first on the path is the one that is imported
+            names.add(package.name)  # the first on the path is the one that Python imports
             yield from [point for point in package.entry_points if point.group == GROUP]
-        except Exception:  # of any foreign package
+        except Exception:  # reading third-party metadata may raise anything
             continue
 
 

@@ -1,4 +1,4 @@
-"""Dense features without masks: every patch of a vision transformer is a region with a feature of its own."""
+"""Dense features without masks: every patch of a vision transformer is a region with its own feature."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from normlift_ns.errors import InputError
 
 
 class DenseEncoder(Encoder, Protocol):
-    """An encoder that has features of patches too."""
+    """An encoder that also has features of patches."""
 
     @property
     def why_not_dense(self) -> str | None:
-        """What keeps this network from having any, and what to do; None where it has them."""
+        """The reason that this network has no features of patches, and what to do; None if it has them."""
         ...
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        """One unit row per patch of a grid over the image, row by row, on the CPU.
+        """Return one unit row per patch of a grid over the image, row by row, on the CPU.
 
         Raises:
-            FileNotFoundError, ValueError: as `Encoder.encode`.
+            FileNotFoundError, ValueError: As `Encoder.encode`.
         """
         ...
 
@@ -41,13 +41,13 @@ class PatchFeatures:
     """A `FeatureSource` of patches.
 
     Raises:
-        ValueError: a network without features of patches; a count below 1.
+        ValueError: If the network has no features of patches, or the count is below 1.
     """
 
     encoder: DenseEncoder
-    """Whose network it is, and who reads texts."""
+    """Encodes the patches and the prompts."""
     count: int = 1024
-    """Patches per image, about; at least 1."""
+    """Approximate number of patches per image, at least 1."""
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -64,38 +64,38 @@ class PatchFeatures:
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """As in `FeatureSource`; raises as `features`."""
+        """Return the regions and features of one image; raises as `features`."""
         return ViewFeatures(self.labels(image), self.features(image, name))
 
     def labels(self, image: UInt8[Tensor, "h w 3"]) -> Int32[Tensor, "h w"]:
-        """Patch of every pixel, the nearest one, counted row by row."""
+        """Return the nearest patch of every pixel, numbered row by row."""
         height, width = image.shape[:2]
         rows, columns = patch_grid(height, width, self.count)
         patches = np.arange(rows * columns, dtype=np.int32).reshape(1, rows, columns)
         return torch.from_numpy(resample_nearest(patches, height, width)[0])
 
     def features(self, image: UInt8[Tensor, "h w 3"], name: str) -> Float32[Tensor, "r d"]:
-        """One unit row per patch.
+        """Return one unit row per patch.
 
         Raises:
-            FileNotFoundError: the weights cannot be downloaded.
-            ValueError: no picture; a weight file that is damaged or of another architecture.
-            MemoryError: the memory of the device does not hold the image.
+            FileNotFoundError: If the weights cannot be downloaded.
+            ValueError: If the image is invalid, or the weight file is damaged or of another architecture.
+            MemoryError: If the image does not fit into the memory of the device.
         """
         check_image(image, name)
         rows, columns = patch_grid(image.shape[0], image.shape[1], self.count)
-        return next(self._images(lambda batch: self.encoder.patches(batch[0], rows, columns), image[None]))
+        return next(self._batches(lambda batch: self.encoder.patches(batch[0], rows, columns), image[None]))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
 
     @cached_property
-    def _images(self) -> Batches:
+    def _batches(self) -> Batches:
         return Batches(1)
 
 
 def patch_grid(height: int, width: int, count: int) -> tuple[int, int]:
-    """Rows and columns of about `count` squares in an image, none of them smaller than a pixel.
+    """Return rows and columns of about `count` squares in an image, none smaller than a pixel.
 
     >>> patch_grid(960, 540, 1024)
     (43, 24)
@@ -105,7 +105,7 @@ def patch_grid(height: int, width: int, count: int) -> tuple[int, int]:
 
 
 def scaled(image: UInt8[Tensor, "h w 3"], height: int, width: int) -> Float32[Tensor, "1 3 y x"]:
-    """The image at another size, bicubic between its pixels and their mean where it shrinks, in 0..255."""
+    """Return the image at another size, in 0..255: bicubic interpolation, with antialiasing when it shrinks."""
     pixels = image.permute(2, 0, 1)[None].float()
     size = height, width
     return torch.nn.functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False).clamp(

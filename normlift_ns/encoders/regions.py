@@ -1,4 +1,4 @@
-"""Cutting images into regions: superpixels, a grid, or label maps from files."""
+"""Segmentation of images into regions: superpixels, a grid, or label maps from files."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from normlift_ns.encoders.images import grey_depth, read_pixels, read_size
 from normlift_ns.encoders.npy import read_npy
 from normlift_ns.errors import InputError
 
-_SUFFIXES, _FORMATS = (".png", ".npy"), ("PNG",)
-_MOST_BYTES = 2**31
-"""Of a label map."""
-_AT_ONCE = min(4, os.cpu_count() or 1)
-"""Images that are cut at a time: superpixels need many times the memory of their image."""
+_MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
+_MAX_MAP_BYTES = 2**31
+"""Largest size of a label map file."""
+_WORKERS = min(4, os.cpu_count() or 1)
+"""Number of images that are segmented concurrently; superpixels need many times the memory of their image."""
 
 
 @dataclass(frozen=True)
 class Superpixels:
-    """Regions of about the same size that follow the edges of the image: SLIC on CIELAB colour and position.
+    """Regions of similar size that follow image edges: SLIC on CIELAB color and position.
 
     Raises:
-        ValueError: a count below 1, a compactness that is not positive.
+        ValueError: If the count is below 1, or the compactness is not positive.
     """
 
     count: int = 256
-    """Superpixels per image, about; at least 1. An image gets no more than it has pixels."""
+    """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
     compactness: float = 10.0
-    """How much closeness in space counts against closeness in colour, > 0; higher gives squarer regions."""
+    """Weight of spatial distance against color distance, > 0; higher values give squarer regions."""
 
     def __post_init__(self) -> None:
         _check_count(self.count)
@@ -48,7 +48,7 @@ class Superpixels:
 
     @property
     def at_once(self) -> int:
-        return _AT_ONCE
+        return _WORKERS
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -58,22 +58,22 @@ class Superpixels:
         return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
-        from skimage.segmentation import slic  # noqa: PLC0415 (0.5 s that other regions need not wait)
+        from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
 
-        found = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
-        return _compact(found, np.ones(found.shape, dtype=bool))[None, None]
+        segments = slic(image.numpy(), n_segments=self.count, compactness=self.compactness, start_label=0)
+        return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Square cells of one size; those at the right and lower edge are cut off.
+    """Square cells of one size; the image border cuts off those at the right and lower edges.
 
     Raises:
-        ValueError: a count below 1.
+        ValueError: If the count is below 1.
     """
 
     count: int = 256
-    """Cells per image, about; at least 1. The side of a cell is a whole number of pixels."""
+    """Approximate number of cells per image, at least 1. The side of a cell is a whole number of pixels."""
 
     def __post_init__(self) -> None:
         _check_count(self.count)
@@ -102,34 +102,35 @@ class Grid:
 
 @dataclass(frozen=True)
 class LabelFiles:
-    """Label maps from a folder, one per image: PNG (grey of 1, 8 or 16 bit, or palette, whose indices count) or NPY of
-    any integer type, of the size of the image. An NPY file may hold several levels, [levels, H, W].
+    """Label maps from a folder, one per image and of the size of the image. A PNG is grayscale with 1, 8 or 16 bits, or
+    indexed, with palette indices as labels. An NPY file holds any integer type, and may hold several levels, [levels,
+    H, W].
 
-    The map of "images/left/0001.jpg" is the first that exists of images/left/0001.png, left/0001.png and 0001.png in
+    The map of "images/left/0001.jpg" is the first of images/left/0001.png, left/0001.png and 0001.png that exists in
     the folder, or the same with .npy. Every value is one region, whether connected or not.
 
     Raises:
-        FileNotFoundError: no such folder.
+        FileNotFoundError: If the folder does not exist.
     """
 
     folder: Path
     background: int = 0
-    """The value of pixels that belong to no region. Negative values are never a region. With -1 for the background, 0
-    is a region like any other."""
+    """Value of pixels that belong to no region. Negative values never denote a region. With background -1, 0 denotes a
+    region."""
     level: int | None = None
-    """Which map of an NPY file [levels, H, W] counts; None for files [H, W]."""
+    """Index of the map that counts in an NPY file [levels, H, W]; None for files [H, W]."""
     resample: bool = False
-    """Bring maps of another size to the image's by nearest neighbour, instead of refusing them."""
+    """Resize maps of another size to the image's by nearest neighbor, instead of raising an error."""
     what: str = "label map"
-    """What messages call a file."""
+    """Name of a file in messages."""
     flag: str = "--regions-dir"
-    """What messages call the option that gives the folder."""
+    """Name, in messages, of the option that sets the folder."""
 
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
-                f"folder of {self.what}s {self.folder} does not exist ({self.flag}); give the folder that holds one "
-                "PNG or NPY file per image"
+                f"folder of {self.what}s {self.folder} does not exist ({self.flag}); give a folder with one PNG or NPY "
+                "file per image"
             )
 
     @property
@@ -138,7 +139,7 @@ class LabelFiles:
 
     @property
     def at_once(self) -> int:
-        return _AT_ONCE
+        return _WORKERS
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -147,109 +148,112 @@ class LabelFiles:
     def files(self, name: str) -> tuple[Path, ...]:
         path = self.path(name)
         if not path.is_file():
-            raise InputError(f"{self.what} {path} is no file; expected a PNG or NPY file with one value per pixel")
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{self.what} {path} has {path.stat().st_size:,} bytes, expected {_MOST_BYTES:,} at most")
+            raise InputError(f"{self.what} {path} is not a file; expected a PNG or NPY file with one value per pixel")
+        if path.stat().st_size > _MAX_MAP_BYTES:
+            raise InputError(
+                f"{self.what} {path} has {path.stat().st_size:,} bytes, expected at most {_MAX_MAP_BYTES:,}"
+            )
         return (path,)
 
     def path(self, name: str) -> Path:
-        """The label map of an image.
+        """Return the path of the label map of an image.
 
         Raises:
-            FileNotFoundError: there is none.
-            ValueError: there are a PNG and an NPY file.
+            FileNotFoundError: If the map does not exist.
+            ValueError: If there are both a PNG and an NPY file.
         """
         relative = PurePath(name)
         parts = [part for part in relative.parts if part not in ("..", relative.anchor)]
         for first in range(len(parts)):
             base = self.folder.joinpath(*parts[first:])
-            found = [path for suffix in _SUFFIXES if os.path.lexists(path := base.with_suffix(suffix))]
-            if len(found) > 1:
-                raise InputError(f"image {name} has two {self.what}s, {found[0]} and {found[1]}; keep one of them")
-            if len(found) == 1:
-                return found[0]
+            paths = [path for suffix in _MAP_SUFFIXES if os.path.lexists(path := base.with_suffix(suffix))]
+            if len(paths) > 1:
+                raise InputError(f"image {name} has two {self.what}s, {paths[0]} and {paths[1]}; keep one of them")
+            if len(paths) == 1:
+                return paths[0]
         raise FileNotFoundError(
             f"image {name} has no {self.what} in {self.folder}; expected {relative.stem}.png or {relative.stem}.npy"
         )
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels 1 h w"]:
-        """As in `Regions`.
+        """Return the regions of an image; see `Regions.labels`.
 
         Raises:
-            FileNotFoundError: no label map.
-            ValueError: a map that cannot be read, has colour channels or fractional values, or has another size than
-                the image while `resample` is off.
+            FileNotFoundError: If the label map does not exist.
+            ValueError: If a map cannot be read, has color channels or fractional values, or differs in size from the
+                image while `resample` is off.
         """
-        path, found = self.path(name), self.values(name)
+        path, maps = self.path(name), self.values(name)
         height, width = image.shape[:2]
-        if found.shape[1:] != (height, width):
+        if maps.shape[1:] != (height, width):
             if not self.resample:
                 raise InputError(
-                    f"{self.what} {path} is {found.shape[2]}x{found.shape[1]} (width x height), its image {name} is "
-                    f"{width}x{height}; make {self.what}s of the image's size (undistorting an image crops it), or "
-                    "resample them by nearest neighbour: --regions-resample True"
+                    f"{self.what} {path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image {name} is "
+                    f"{width}x{height}; make {self.what}s of the size of the image (undistortion crops images), or "
+                    "resample them by nearest neighbor: --regions-resample True"
                 )
-            found = resample_nearest(found, height, width)
-        return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in found])[:, None]
+            maps = resample_nearest(maps, height, width)
+        return torch.stack([_compact(level, (level != self.background) & (level >= 0)) for level in maps])[:, None]
 
     def size(self, name: str) -> tuple[Path, int, int]:
-        """The map of an image, its width and its height; raises as `values`."""
+        """Return the path, width and height of the label map of an image; raises as `values`."""
         path = self.path(name)
         if path.suffix != ".npy":
-            return path, *read_size(path, what=self.what, formats=_FORMATS)
+            return path, *read_size(path, what=self.what, formats=_MAP_FORMATS)
         _, height, width = self.values(name).shape
         return path, width, height
 
     def values(self, name: str) -> np.ndarray:
-        """The maps of an image as they are stored, [levels, H, W], of an integer type or booleans.
+        """Return the stored maps of an image, [levels, H, W], of an integer type.
 
         Raises:
-            FileNotFoundError: no label map.
-            ValueError: a map that cannot be read, or has colour channels or fractional values.
+            FileNotFoundError: If the label map does not exist.
+            ValueError: If a map cannot be read, or has color channels or fractional values.
         """
         path = self.path(name)
         if path.suffix == ".npy":
-            found = read_npy(path, self.what)
+            maps = read_npy(path, self.what)
         else:
-            found = read_pixels(path, what=self.what, formats=_FORMATS)
-            depth = grey_depth(path)
-            if depth in (2, 4):
+            maps = read_pixels(path, what=self.what, formats=_MAP_FORMATS)
+            bits = grey_depth(path)
+            if bits in (2, 4):
                 raise InputError(
-                    f"{self.what} {path} is a grey PNG of {depth} bits, whose values readers multiply by "
-                    f"{255 // (2**depth - 1)}; save it as grey of 8 or 16 bits, as a palette PNG, or as NPY"
+                    f"{self.what} {path} is a grayscale PNG with {bits} bits, whose values readers multiply by "
+                    f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
-        if found.ndim == 3 and path.suffix == ".png":
+        if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"{self.what} {path} has {found.shape[2]} colour channels; expected one value per pixel: save it as "
-                "grey, 16-bit grey or palette PNG, or as NPY"
+                f"{self.what} {path} has {maps.shape[2]} color channels; expected one value per pixel: save it as an "
+                "8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
-        if found.dtype.kind not in "iub":
+        if maps.dtype.kind not in "iub":
             raise InputError(
-                f"{self.what} {path} holds {found.dtype}; expected an integer type: save it with .astype(numpy.int32)"
+                f"{self.what} {path} holds {maps.dtype}; expected an integer type: save it with .astype(numpy.int32)"
             )
-        if found.ndim not in (2, 3) or found.size == 0:
-            raise InputError(f"{self.what} {path} has shape {found.shape}, expected [H, W] or [levels, H, W]")
-        found = found.astype(np.uint8) if found.dtype == bool else found
-        return found.reshape(-1, *found.shape[-2:])
+        if maps.ndim not in (2, 3) or maps.size == 0:
+            raise InputError(f"{self.what} {path} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
+        maps = maps.astype(np.uint8) if maps.dtype == bool else maps
+        return maps.reshape(-1, *maps.shape[-2:])
 
 
 def _check_count(count: int) -> None:
+    """Raise InputError unless the count is positive."""
     if count < 1:
         raise InputError(f"number of regions per image must be at least 1, got {count}")
 
 
 def resample_nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Maps [levels, H, W] at another size, by nearest neighbour."""
+    """Resize maps [levels, H, W] by nearest neighbor."""
     return maps[:, _nearest(height, maps.shape[1])][:, :, _nearest(width, maps.shape[2])]
 
 
 def _nearest(size: int, source_size: int) -> np.ndarray:
-    """For every pixel of a line, the pixel of a line of another size whose area holds its centre."""
+    """Return, for every pixel of a line, the pixel of a line of another size whose area contains its center."""
     return (2 * np.arange(size) + 1) * source_size // (2 * size)
 
 
-def _compact(found: np.ndarray, labelled: np.ndarray) -> Int32[Tensor, "h w"]:
-    """Renumbers the values of labelled pixels 0..R-1, in ascending order; -1 elsewhere."""
-    labels = np.full(found.shape, -1, dtype=np.int32)
-    labels[labelled] = np.unique(found[labelled], return_inverse=True)[1]
+def _compact(values: np.ndarray, labeled: np.ndarray) -> Int32[Tensor, "h w"]:
+    """Renumber the values of labeled pixels to 0..R-1, in ascending order; other pixels get -1."""
+    labels = np.full(values.shape, -1, dtype=np.int32)
+    labels[labeled] = np.unique(values[labeled], return_inverse=True)[1]
     return torch.from_numpy(labels)

@@ -1,11 +1,11 @@
-"""Where 2D semantics come from: an image becomes labelled regions with one unit feature each, a text a unit vector.
+"""Sources of 2D features: an image becomes labeled regions with one unit feature each, a prompt becomes a unit vector.
 
-The two concerns are kept apart. `Regions` cuts an image into pieces, an `Encoder` puts pieces and texts into one space,
-`RegionFeatures` joins one of each to a `FeatureSource`, which is all that the rest of the package knows. Whatever
-brings labels and features together, as the importer of a preprocessed data set does, is a `FeatureSource` of its own.
+The two steps are separate. `Regions` segments an image, an `Encoder` embeds regions and prompts in one space, and
+`RegionFeatures` combines the two into a `FeatureSource`. The rest of the package uses `FeatureSource` only. Code that
+gets labels and features together, such as an importer of preprocessed data, implements `FeatureSource` directly.
 
-An image may be cut in several ways, its levels. Evidence is rasterized once, on the pieces that all of them have in
-common (`joint_partition`), and added up to the regions of the level that counts.
+An image may be segmented at several levels. Evidence is rasterized once, on the cells that all levels share
+(`joint_partition`), and then summed over the regions of the selected level.
 """
 
 from __future__ import annotations
@@ -29,15 +29,14 @@ from normlift_ns.errors import InputError
 
 @dataclass(frozen=True)
 class ViewFeatures:
-    """The 2D semantics of one image, on the CPU: cells, the pieces that the rasterizer sums weights over, and regions,
-    the sets of cells that have a feature.
+    """2D features of one image, on the CPU. The rasterizer sums weights over cells; a region is a set of cells that
+    share one feature.
 
-    Cells depend on everything that is known of the image, not on what is chosen of it: another level of a source has
-    the same cells, so that its evidence is there already.
+    Cells depend on all levels of an image, not on the selected one. Another level of the same source has the same
+    cells, so its evidence is already computed.
 
     Raises:
-        ValueError: wrong types or shapes, a label without a cell, a cell without a feature row, rows that are not unit
-            vectors.
+        ValueError: If a type or shape is wrong, a label has no cell, a cell no feature row, or a row not unit length.
     """
 
     labels: Int32[Tensor, "h w"]
@@ -45,8 +44,8 @@ class ViewFeatures:
     features: Float32[Tensor, "r d"]
     """One unit row per region."""
     regions: Int32[Tensor, "levels c"] | None = None
-    """Region of every cell in each level that counts, in -1..R-1; -1: none, as if the pixels were unlabelled. With
-    several levels every pixel is seen once in each. None: every cell is a region."""
+    """Region of every cell in each selected level, in -1..R-1; -1: none, as if the pixels were unlabeled. With several
+    levels, every pixel counts once in each. None: every cell is a region."""
 
     def __post_init__(self) -> None:
         for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
@@ -66,130 +65,133 @@ class ViewFeatures:
             first = int(bad[0])
             raise InputError(
                 f"{bad.numel()} of {len(self.features)} rows of ViewFeatures.features are not unit vectors (row "
-                f"{first} has length {length[first]:.3g}); normalise them, and label regions without a feature -1"
+                f"{first} has length {length[first]:.3g}); normalize them, and label regions without a feature -1"
             )
 
     @property
     def region_of_cell(self) -> Int32[Tensor, "levels c"]:
-        """`regions`, also where they are the cells."""
+        """Return `regions`, or the identity mapping if `regions` is None."""
         return torch.arange(len(self.features), dtype=torch.int32)[None] if self.regions is None else self.regions
 
 
-def _check_range(name: str, values: Tensor, count: int, what: str) -> None:
+def _check_range(name: str, values: Tensor, count: int, unit: str) -> None:
+    """Raise InputError if a value is not in -1..count-1."""
     if values.numel() > 0 and not -1 <= int(values.min()) <= int(values.max()) < count:
         raise InputError(
-            f"ViewFeatures.{name} must be in -1..{count - 1} (there are {count} {what}s), found "
+            f"ViewFeatures.{name} must be in -1..{count - 1} (there are {count} {unit}s), found "
             f"{int(values.min())}..{int(values.max())}"
         )
 
 
 class FeatureSource(Protocol):
-    """2D semantics of images, and texts in the same space."""
+    """A source of 2D image features and of text embeddings in the same space."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes the result, ready for JSON; it stands in the manifest.
+        """Every setting that changes the result, as JSON-serializable values; the manifest stores it.
 
         Device and precision are left out: they change rounding only.
         """
         ...
 
     def available(self, names: Sequence[str]) -> list[str]:
-        """The images, of those given, that have semantics; the others are left out of a lift, as if never taken.
+        """Return the given images that have features. A lift skips the others, as if they had never been taken.
 
         Raises:
-            ValueError, FileNotFoundError: what `view` would raise, as far as it shows without looking at any image.
+            ValueError, FileNotFoundError: As `view`, for errors that can be detected without reading an image.
         """
         ...
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        """Regions and features of one image.
+        """Return the regions and features of one image.
 
         Args:
             image: RGB, 0..255.
-            name: path of the image relative to its dataset, such as "images/0001.jpg".
+            name: Path of the image relative to its dataset, such as "images/0001.jpg".
         Raises:
-            ValueError, FileNotFoundError: with what was found, what was expected and what to do.
+            ValueError, FileNotFoundError: With what was found, what was expected and what to do.
         """
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """One unit row per prompt, on the CPU.
+        """Return one unit row per prompt, on the CPU.
 
         Raises:
-            ValueError: no prompt, an empty one, or one that the encoder does not understand.
+            ValueError: If `prompts` or a prompt is empty, or the encoder does not understand one.
         """
         ...
 
 
 class Regions(Protocol):
-    """A rule that cuts images into regions."""
+    """A method that segments images into regions."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Every setting that changes `labels`, ready for JSON; not `chosen`."""
+        """Every setting that changes `labels`, as JSON-serializable values; `chosen` is not part of it."""
         ...
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """The levels of `labels` that count, by number; (): the only one."""
+        """Indices of the selected levels of `labels`; (): the only one."""
         ...
 
     @property
     def at_once(self) -> int:
-        """How many images to ask `labels` for at a time, each in a thread; 1 for a network, which fills its device."""
+        """Number of images to pass to `labels` concurrently, one per thread; 1 for a network, which uses its device
+        fully."""
         ...
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """The files beside the image that `labels` reads for it.
+        """Return the files that `labels` reads for an image, other than the image itself.
 
         Raises:
-            ValueError, FileNotFoundError: as `labels`.
+            ValueError, FileNotFoundError: As `labels`.
         """
         ...
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
-        """Region of every pixel in every level that there is, chosen or not; in each, ids 0..R-1 without gaps, -1 for
-        none. A rule without levels returns one. They may be on any device.
+        """Return the region of every pixel in every level, selected or not, on any device. Region ids in a level are
+        0..R-1 without gaps; -1: none. A method without levels returns one.
 
-        Where regions overlap, the one that counts is on top, at depth 0; those beneath are seen by the encoder only. A
-        rule without overlaps returns depth 1.
+        If regions overlap, depth 0 holds the one that counts for the lift; only the encoder uses deeper ones. A method
+        without overlaps returns depth 1.
         """
         ...
 
 
 class TextEncoder(Protocol):
-    """What queries need."""
+    """The part of an encoder that queries need."""
 
     @property
     def identity(self) -> dict[str, Any]:
-        """As in `FeatureSource`."""
+        """See `FeatureSource.identity`."""
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """As in `FeatureSource`."""
+        """See `FeatureSource.text`."""
         ...
 
 
 class Encoder(TextEncoder, Protocol):
-    """A joint space of image regions and texts."""
+    """A joint embedding space of image regions and text."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """One unit row per region, on the CPU; `labels` as `Regions.labels` returns them, of one level: a region is all
-        pixels that have its id at any depth."""
+        """Return one unit row per region, on the CPU. `labels` is one level of `Regions.labels`; a region consists of
+        all pixels that have its id at any depth."""
         ...
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        """`encode` of several views, in their order, but for rounding. A view is asked for when the features of those
-        before it are given, or can be found better together with its own."""
+        """Yield `encode` of several views in order; results may differ from `encode` by rounding. The iterator takes a
+        view from `views` only when all earlier features have been yielded, or when batching that view with earlier ones
+        is faster."""
         ...
 
 
 @dataclass(frozen=True)
 class RegionFeatures:
-    """A `FeatureSource` made of regions and an encoder."""
+    """A `FeatureSource` that combines a segmentation method and an encoder."""
 
     regions: Regions
     encoder: Encoder
@@ -201,41 +203,41 @@ class RegionFeatures:
 
     def available(self, names: Sequence[str]) -> list[str]:
         files = ((name, file) for name in names for file in self.regions.files(name))
-        refuse_shared(files, "label map", "in folders that are named like those of the images")
+        refuse_shared(files, "label map", "in folders named like those of the images")
         return list(names)
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
         return next(self.views([(image, name)]))
 
     def views(self, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
-        """As `each_view`."""
-        cut: deque[tuple[Tensor, Tensor]] = deque()  # cells, and their regions in the chosen levels
+        """Yield the features of several images; see `each_view`."""
+        pending: deque[tuple[Tensor, Tensor]] = deque()  # cells, and their regions in the selected levels
 
-        def levels() -> Iterator[tuple[Tensor, Tensor]]:
+        def selected_levels() -> Iterator[tuple[Tensor, Tensor]]:
             chosen = list(self.regions.chosen or (0,))
-            for image, maps in ahead(self._cut, images, self.regions.at_once):
+            for image, maps in ahead(self._segment, images, self.regions.at_once):
                 cells, regions = joint_partition(maps[:, 0])
-                cut.append((cells.cpu(), regions[chosen].cpu()))
+                pending.append((cells.cpu(), regions[chosen].cpu()))
                 for level in chosen:
                     yield image, maps[level]
 
-        encoded = self.encoder.encode_each(levels())
+        encoded = self.encoder.encode_each(selected_levels())
         for rows in encoded:
-            cells, regions = cut.popleft()
+            cells, regions = pending.popleft()
             features = [rows, *islice(encoded, len(regions) - 1)]
-            first = torch.tensor([0, *map(len, features)]).cumsum(0)[:-1, None].int()
-            yield ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + first, -1))
+            offsets = torch.tensor([0, *map(len, features)]).cumsum(0)[:-1, None].int()
+            yield ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + offsets, -1))
 
-    def _cut(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
-        """An image, on the CPU, and its label maps, which have the chosen levels."""
+    def _segment(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
+        """Return the image, on the CPU, and its label maps; check that they contain the selected levels."""
         image, name = view
         check_image(image, name)
         image = image.cpu()
         maps = self.regions.labels(image, name)
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
-            found = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
-            raise InputError(f"{found} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
+            origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
+            raise InputError(f"{origin} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
         return image, maps
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -243,20 +245,20 @@ class RegionFeatures:
 
 
 def cut_at_once(source: FeatureSource) -> int:
-    """How many images a source works on at a time."""
+    """Return the number of images that a source segments concurrently."""
     return source.regions.at_once if isinstance(source, RegionFeatures) else 1
 
 
 def each_view(source: FeatureSource, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
-    """`source.view` of several images, in their order, but for rounding. Images are asked for as they are needed:
-    several where an encoder sees the regions of several at once."""
+    """Yield `source.view` of several images in order; results may differ from `view` by rounding. Images are requested
+    as needed; an encoder that batches regions of several images requests several of them ahead."""
     if isinstance(source, RegionFeatures):
         return source.views(images)
     return (source.view(image, name) for image, name in images)
 
 
 def check_image(image: Tensor, name: str) -> None:
-    """Raises ValueError unless `image` is a picture."""
+    """Raise ValueError unless `image` is a non-empty uint8 RGB image [H, W, 3]."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
         raise InputError(
             f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
@@ -264,14 +266,14 @@ def check_image(image: Tensor, name: str) -> None:
 
 
 def refuse_shared(files: Iterable[tuple[str, Path]], what: str, how: str) -> None:
-    """Makes sure that every image has files of its own, wherever links lead.
+    """Check that no two images use the same file, with symbolic links resolved.
 
     Args:
-        files: names of images, with a file of each.
-        what: what the files are, for the message.
-        how: to tell them apart.
+        files: Pairs of an image name and one of its files.
+        what: Kind of file, for the message.
+        how: How to give each image its own file, for the message.
     Raises:
-        ValueError: two images share one.
+        ValueError: If two images share a file.
     """
     owner: dict[str, str] = {}
     for name, file in files:
@@ -281,37 +283,37 @@ def refuse_shared(files: Iterable[tuple[str, Path]], what: str, how: str) -> Non
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:
-    """Cells: the sets of pixels that have the same label in every level.
+    """Partition an image into cells: the sets of pixels that have the same label in every level.
 
     Args:
-        maps: region of every pixel in every level, -1 for none.
+        maps: Region of every pixel in every level; -1: none.
     Returns:
-        The cell of every pixel, ids 0..C-1 without gaps, -1 where no level has a label; and the region of every cell in
-        every level, -1 for none. With one level without gaps in its ids, cells are its regions.
+        The cell of every pixel, with ids 0..C-1 without gaps; -1 marks pixels without a label in any level. Then the
+        region of every cell in every level; -1: none. With one level without gaps in its ids, cells equal regions.
     """
     key = torch.zeros_like(maps[0], dtype=torch.int64)
-    most = 1
+    key_count = 1
     for labels in maps:
         count = int(labels.max()) + 2
-        key, most = key * count + labels + 1, most * count
-        if len(maps) > 2:  # so that the product of the numbers of regions stays in 64 bits
-            key, most = _numbered(key, most)
-    cells, count = _numbered(key, most)
-    nothing = int((maps == -1).all(dim=0).any())  # their key, 0, is the least
-    cells = cells - nothing
-    regions = torch.empty(len(maps), count - nothing, dtype=torch.int32, device=maps.device)
-    labelled = cells >= 0
+        key, key_count = key * count + labels + 1, key_count * count
+        if len(maps) > 2:  # keep the product of the region counts within 64 bits
+            key, key_count = _renumber(key, key_count)
+    cells, count = _renumber(key, key_count)
+    unlabeled = int((maps == -1).all(dim=0).any())  # key 0, the smallest
+    cells = cells - unlabeled
+    regions = torch.empty(len(maps), count - unlabeled, dtype=torch.int32, device=maps.device)
+    labeled = cells >= 0
     for level, labels in enumerate(maps):
-        regions[level, cells[labelled]] = labels[labelled]
+        regions[level, cells[labeled]] = labels[labeled]
     return cells.int(), regions
 
 
-def _numbered(key: Int64[Tensor, "h w"], most: int) -> tuple[Int64[Tensor, "h w"], int]:
-    """Numbers 0..C-1 in the order of the keys, which are in 0..most-1; and C."""
-    if most > 8 * key.numel():
+def _renumber(key: Int64[Tensor, "h w"], key_count: int) -> tuple[Int64[Tensor, "h w"], int]:
+    """Map keys in 0..key_count-1 to 0..C-1 in ascending order; return the mapped keys and C."""
+    if key_count > 8 * key.numel():
         values, number = key.unique(return_inverse=True)
         return number, len(values)
-    there = torch.zeros(most, dtype=torch.bool, device=key.device)
-    there[key] = True
-    number = there.cumsum(0)
+    present = torch.zeros(key_count, dtype=torch.bool, device=key.device)
+    present[key] = True
+    number = present.cumsum(0)
     return number[key] - 1, int(number[-1])

@@ -1,4 +1,4 @@
-"""Label maps are of the undistorted photographs, as the scene was trained on them, or they are refused."""
+"""Check that label maps match the undistorted images that the scene was trained on."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from normlift_ns.errors import InputError
 
 
 def check_undistorted(source: FeatureSource, *views: View) -> None:
-    """Makes sure that the label map of an undistorted photograph was not made of the photograph as it was taken.
+    """Check that the label map of an undistorted image was not made from the original, distorted image.
 
-    Undistortion crops by few pixels and moves others by many, so a map of another size cannot be told from one of the
-    distorted photograph: only maps of exactly the undistorted size are taken.
+    Undistortion crops an image by a few pixels, but may move its content by many. A map of another size may therefore
+    show the distorted image, so only maps of exactly the undistorted size are accepted.
 
     Args:
-        views: the same one, at all sizes at which the source may have looked at it.
+        views: The same view at every size at which the source may have processed it.
     Raises:
-        ValueError: a map of another size, unless the source is told to resample: that is warned of.
+        ValueError: If a map has another size, unless the source resamples maps; then the function warns.
     """
-    before, name = views[0].original, views[0].name
-    found = source.regions if isinstance(source, RegionFeatures) else source
-    found = found.regions if isinstance(found, CachedRegions) else found
-    if before is None or not isinstance(found, LabelFiles | LangSplat):
+    original_size, name = views[0].original, views[0].name
+    maps = source.regions if isinstance(source, RegionFeatures) else source
+    maps = maps.regions if isinstance(maps, CachedRegions) else maps
+    if original_size is None or not isinstance(maps, LabelFiles | LangSplat):
         return
-    file, width, height = found.size(name)
+    file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]
-    why = "the training undistorted the photograph, which moves and crops what is in it"
+    reason = "training undistorted the image, which moves and crops its content"
     if (width, height) not in sizes:
-        kind = "the size of the photograph as it was taken" if (width, height) == before else "another size"
-        what = f"is {width}x{height} (width x height), {kind}; {why}, to {sizes[0][0]}x{sizes[0][1]}"
-        if not found.resample:
+        kind = "the size of the original image" if (width, height) == original_size else "another size"
+        mismatch = f"is {width}x{height} (width x height), {kind}; {reason}, to {sizes[0][0]}x{sizes[0][1]}"
+        if not maps.resample:
             raise InputError(
-                f"label map {file} of {name} {what}. Make the maps from the undistorted images, or accept that they "
-                "are some pixels off: --regions-resample True"
+                f"label map {file} of {name} {mismatch}. Make the maps from the undistorted images, or accept an error "
+                "of some pixels: --regions-resample True"
             )
-        warnings.warn(f"label map {file} {what}; it is stretched, and may be some pixels off", stacklevel=2)
-    elif (width, height) == before:
+        warnings.warn(f"label map {file} {mismatch}; it is stretched, and may be some pixels off", stacklevel=2)
+    elif (width, height) == original_size:
         warnings.warn(
-            f"{why} without changing its size: make sure that the label maps in {file.parent} were made from the "
+            f"{reason} without changing its size: make sure that the label maps in {file.parent} were made from the "
             "undistorted images",
             stacklevel=2,
         )

@@ -1,6 +1,6 @@
-"""What weight files of all networks have in common: where they are, and errors of foreign libraries as one line.
+"""Shared helpers for weight files: local and hub lookups, and one-line summaries of third-party errors.
 
-Imports nothing heavy.
+This module imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -23,30 +23,32 @@ from safetensors import SafetensorError
 
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
-_PATHS_ONLY = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_LONGEST = 300
+_FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
+_MAX_LENGTH = 300
 _CLIP_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
-"""Names that the hub's repositories give the weights of OpenCLIP models."""
+"""Names of the weight files of OpenCLIP models in hub repositories."""
 _SAM_FILES = ("model.safetensors", "pytorch_model.bin")
 FOREIGN_ERRORS = (
     OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError,
     ImportError, EOFError, SyntaxError, pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile,
     SafetensorError,
 )  # fmt: skip
-"""What torch, safetensors and open_clip raise where a file or a name is not what they
-expect. Not among them: a full memory."""
+"""Exceptions that torch, safetensors and open_clip raise for a bad file or name. Out-of-memory errors are not among
+them."""
 
 
 def clip_weights_at_hand(model: str, pretrained: str) -> bool | None:
-    """Whether the weights of an OpenCLIP model are on this machine; None: not to be told without importing open_clip,
-    as of weights that are not on the Hugging Face hub.
+    """Return whether the weights of an OpenCLIP model are on this machine.
+
+    Return None if that cannot be determined without importing open_clip, as for weights that are not on the Hugging
+    Face hub.
 
     >>> clip_weights_at_hand("ViT-B-16", __file__)
     True
     """
     if os.path.isfile(pretrained):
         return True
-    repository = _published(model, pretrained)
+    repository = _hub_location(model, pretrained)
     if not repository:
         return None
     owner_and_name, _, file = repository.rpartition("/")
@@ -54,13 +56,13 @@ def clip_weights_at_hand(model: str, pretrained: str) -> bool | None:
 
 
 def sam_weights_at_hand(checkpoint: str) -> bool:
-    """Whether a checkpoint of SAM, a path or a name on the hub, is on this machine."""
+    """Return whether a SAM checkpoint, given as a path or a hub name, is on this machine."""
     cached = is_cached(checkpoint, "config.json") and any(is_cached(checkpoint, name) for name in _SAM_FILES)
     return os.path.exists(checkpoint) or cached
 
 
 def is_cached(repository: str, file: str) -> bool:
-    """Whether the cache of the Hugging Face hub holds a file, in its main revision. Needs no network."""
+    """Return whether the Hugging Face hub cache holds a file in its main revision. Needs no network."""
     constants = importlib.import_module("huggingface_hub.constants")
     folder = Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
     try:
@@ -71,26 +73,29 @@ def is_cached(repository: str, file: str) -> bool:
 
 
 def hub_file(published: Mapping[str, Any], constants: Any) -> Path | None:
-    """The weights in the cache of the Hugging Face hub, looked for without the network.
+    """Return the path of the weights in the Hugging Face hub cache, or None. Needs no network.
 
     Args:
-        published: what open_clip knows of a tag.
-        constants: the module of open_clip that names files.
+        published: Entry of open_clip's table of pretrained weights.
+        constants: open_clip's module of file names.
     """
     hub = importlib.import_module("huggingface_hub")
     repository, name = os.path.split(published.get("hf_hub", ""))
     for file in [name] if name else [constants.HF_SAFE_WEIGHTS_NAME, constants.HF_WEIGHTS_NAME]:
-        found = hub.try_to_load_from_cache(repository, file) if repository else None
-        if isinstance(found, str):
-            return Path(found)
+        path = hub.try_to_load_from_cache(repository, file) if repository else None
+        if isinstance(path, str):
+            return Path(path)
     return None
 
 
-def _published(model: str, tag: str) -> str | None:
-    """Where the hub has weights, "OWNER/NAME/" or "OWNER/NAME/FILE", from the table in the source of open_clip, which
-    takes seconds to import; None: nowhere, or the table looks different from what is expected."""
+def _hub_location(model: str, tag: str) -> str | None:
+    """Return the hub location of weights, "OWNER/NAME/" or "OWNER/NAME/FILE".
+
+    The location is parsed from the source of open_clip, which takes seconds to import. None: the weights are not on the
+    hub, or the source has an unexpected form.
+    """
     try:
-        spec = find_spec("open_clip")  # does not import it
+        spec = find_spec("open_clip")  # does not import the package
         assert spec is not None and spec.origin is not None
         source = Path(spec.origin).with_name("pretrained.py").read_text("utf8")
         tables = {
@@ -110,42 +115,43 @@ def _published(model: str, tag: str) -> str | None:
 
 
 def _argument(call: ast.AST, name: str) -> ast.expr:
+    """Return the value of a keyword argument of a call."""
     return next(keyword.value for keyword in vars(call)["keywords"] if keyword.arg == name)
 
 
 def first_line(error: BaseException) -> str:
-    """The beginning of a foreign error, for a message of ours."""
+    """Return the beginning of a third-party error message, for use in an error message."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
-    kept = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
-    text = " ".join([f"{type(error).__name__}:", *kept]) if len(kept) > 0 else type(error).__name__
-    return text if len(text) <= _LONGEST else text[:_LONGEST] + " ..."
+    lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
+    text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
+    return text if len(text) <= _MAX_LENGTH else text[:_MAX_LENGTH] + " ..."
 
 
 def probe(address: str) -> None:
-    """Raises OSError if a server does not answer: the hub's own client would retry for most of a minute."""
+    """Raise OSError if a server does not respond; the hub's own client would retry for most of a minute."""
     try:
         urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
-    except urllib.error.HTTPError:  # an answer
+    except urllib.error.HTTPError:  # the server responded
         pass
     except OSError as error:
-        raise ConnectionError(f"{address} cannot be reached, {error}") from error
+        raise ConnectionError(f"{address} cannot be reached: {error}") from error
 
 
 def reach_hub() -> None:
-    """Raises OSError where nothing can be downloaded from the Hugging Face hub."""
+    """Raise OSError if the Hugging Face hub is not available for downloads."""
     if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-        raise ConnectionError("HF_HUB_OFFLINE forbids to download")
+        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
     probe(os.environ.get("HF_ENDPOINT", _HUB))
 
 
 def is_path(name: str, parts: int) -> bool:
-    """Whether a name can only be that of a file or folder here.
+    """Return whether a name can only be a local path.
 
     Args:
-        parts: of other names, at most.
+        parts: Largest number of parts that names of other kinds have.
 
     >>> is_path("google/siglip2-base-patch16-224", 2), is_path("a/b/c", 2), is_path("clip.pt", 2)
     (False, True, True)
     """
     path = Path(name)
-    return path.is_absolute() or len(path.parts) > parts or path.suffix in _PATHS_ONLY
+    return path.is_absolute() or len(path.parts) > parts or path.suffix in _FILE_SUFFIXES

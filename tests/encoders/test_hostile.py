@@ -130,8 +130,8 @@ def test_bombs_programs_and_lossy_pictures_are_refused_by_name(tmp_path: Path) -
         path.write_bytes(grey_png(side, side, 8, bytes(2**20)))
         refused(lambda: LabelFiles(tmp_path, resample=True).labels(IMAGE, NAME), str(path))
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\nshowpage\n")
-    refused(lambda: read_image(path), str(path), "damaged or no picture")
-    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "damaged or no picture")
+    refused(lambda: read_image(path), str(path), "damaged or not an image")
+    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "damaged or not an image")
     Image.fromarray(MAP.astype(np.uint8)).save(path, "jpeg")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "PNG")
 
@@ -161,8 +161,8 @@ def test_entries_of_text_vectors_are_checked_before_they_are_read(tmp_path: Path
     for content, parts in (
         (entry("fox", npy(np.ones(150_000))), ["'fox'", "1,200,128", "1,048,576"]),
         (entry("fox", b"no array"), ["'fox'", "NPY"]),
-        (entry("fox", ones[:-3]), ["'fox'", "4 float64 take 32 bytes", "29"]),
-        (entry("fox", ones, npy(np.arange(4.0))), ["two vectors of 'fox'"]),
+        (entry("fox", ones[:-3]), ["'fox'", "4 float64 needs 32 bytes", "29"]),
+        (entry("fox", ones, npy(np.arange(4.0))), ["two vectors for 'fox'"]),
         (npz(fox=np.ones(4, np.longdouble)), ["'fox'", np.dtype(np.longdouble).name]),
         (npz(fox=np.array("text")), ["'fox'", "<U4"]),
         (npz(fox=np.ones((2, 4))), ["'fox'", "float64 (2, 4)"]),

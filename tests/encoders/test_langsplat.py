@@ -292,8 +292,8 @@ def test_flags_make_the_source(folder):
     assert torch.allclose(found.text(["cup"]), torch.full((1, D), D**-0.5))
     for given, parts in (
         ({**options, "regions": "grid"}, ["--regions", "--regions-dir", "--features"]),
-        ({**options, "regions_dir": folder}, ["leave one out"]),
-        ({**options, "encoder": "colour"}, ["'colour'", "--encoder-model"]),
+        ({**options, "regions_dir": folder}, ["leave one of them out"]),
+        ({**options, "encoder": "colour"}, ["--encoder colour", "--encoder-model"]),
         ({"encoder": "colour", "text_vectors": folder / "texts.npz"}, ["--text-vectors", "--features langsplat"]),
     ):
         refused(lambda given=given: make_source(SourceOptions(**given)), *parts)
@@ -345,7 +345,7 @@ def test_existing_files_stay_unless_asked(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a_f.npy", "a_s.npy"]
     both = type("Both", (LabelFiles,), {"chosen": (0, 1)})(labels_4(tmp_path, 2).regions.folder)
     several = RegionFeatures(both, ColourEncoder())  # at once, which have no place in the format
-    refused(lambda: write_langsplat(several, PHOTO, "a.jpg", tmp_path, overwrite=False), "several levels")
+    refused(lambda: write_langsplat(several, PHOTO, "a.jpg", tmp_path, overwrite=False), "several selected levels")
 
 
 def test_damage_of_text_vectors_is_noticed(tmp_path):
@@ -367,10 +367,10 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
         try:
             assert TextVectors(file).text(["fox", "file"]).tolist() == expected
         except ValueError as error:
-            assert "texts.npz is damaged or no NPZ file" in str(error)
+            assert "texts.npz is damaged or not an NPZ file" in str(error)
     with zipfile.ZipFile(file, "w") as archive, zipfile.ZipFile(io.BytesIO(whole)) as original:
         for name, other in (("fox.npy", "file.npy"), ("file.npy", "fox.npy")):
             archive.writestr(name, original.read(other))
         archive.comment = original.comment
-    with pytest.raises(ValueError, match=r"texts\.npz is damaged .*content has 'normlift_ns xxh3_128:\w+', expected"):
+    with pytest.raises(ValueError, match=r"texts\.npz is damaged .*digest is 'normlift_ns xxh3_128:\w+', expected"):
         TextVectors(file).text(["fox"])

@@ -101,7 +101,7 @@ def test_what_is_no_file_makes_nobody_wait(tmp_path):
         path = tmp_path / name
         for make in (os.mkfifo, os.mkdir, lambda path: path.symlink_to("nowhere")):
             make(path)
-            refused(lambda: LabelFiles(tmp_path).files("a.jpg"), f"{path} is no file", "PNG or NPY")
+            refused(lambda: LabelFiles(tmp_path).files("a.jpg"), f"{path} is not a file", "PNG or NPY")
             path.rmdir() if path.is_dir() else path.unlink()
         with path.open("wb") as file:
             file.truncate(2**32)
@@ -158,9 +158,9 @@ def test_wrong_label_files_say_what_is_wrong(tmp_path):
         refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.npy", *parts)
     (tmp_path / "a.npy").unlink()
     Image.fromarray(np.zeros((2, 3, 3), np.uint8)).save(tmp_path / "a.png")
-    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "3 colour channels")
+    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "3 color channels")
     (tmp_path / "a.png").write_bytes(b"no picture")
-    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "picture")
+    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "not an image")
     refused(lambda: LabelFiles(tmp_path / "nowhere"), "nowhere", "--regions-dir", error=FileNotFoundError)
     parts = ("images/b.jpg", "b.png or b.npy")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/b.jpg"), *parts, error=FileNotFoundError)

@@ -76,5 +76,5 @@ assert {"torch", "open_clip", "transformers", "numpy", "skimage"}.isdisjoint(sys
 def test_what_is_no_weight_file_is_never_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.pt")
     for path in (tmp_path / "a.pt", tmp_path):
-        refused(lambda path=path: check_names(DEFAULT_MODEL, str(path)), f"{path} is no weight file")
+        refused(lambda path=path: check_names(DEFAULT_MODEL, str(path)), f"{path} is not a weight file")
     refused(lambda: check_sam(str(tmp_path / "a.pt")), str(tmp_path / "a.pt"), "neither a file nor a folder")

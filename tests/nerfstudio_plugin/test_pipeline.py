@@ -147,7 +147,11 @@ def test_the_features_of_lerf_ovs_lie_in_the_scene(train: Any, workspace: Path, 
     assert options == SourceOptions(features="langsplat")
     with pytest.raises(FileNotFoundError) as caught:
         train("nothing", source=options)
-    for part in ("scene holds no features", "--pipeline.source.features-dir", "--pipeline.source.features none"):
+    for part in (
+        "scene contains no LangSplat features",
+        "--pipeline.source.features-dir",
+        "--pipeline.source.features none",
+    ):
         assert part in str(caught.value)
 
     folder = workspace / "scene" / "language_features"

@@ -1,8 +1,9 @@
-"""Masked square crops of regions, as LangSplat cuts them.
+"""Masked square crops of regions, as in LangSplat.
 
-For every region: pixels outside of it are filled, the image is cropped to its box, padded with black to a centred
-square and resized bilinearly. LangSplat fills with black; LaGa and SFS fill with white (and pad with black too).
-LangSplat's boxes, which come from SAM, leave out the last row and column of a mask; ours do not.
+For every region, pixels outside of it are filled, and the image is cropped to its bounding box. The crop is padded with
+black to a centered square and resized bilinearly. LangSplat fills with black; LaGa and SFS fill with white (and also
+pad with black). LangSplat's boxes, which come from SAM, omit the last row and column of a mask; the boxes here include
+them.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from normlift_ns.options import Fill
 
 
 class CropNetwork(NamedTuple):
-    """What a network needs to see crops. The functions are called where there is something to see."""
+    """The parts of a network that encode crops. Its functions are called only if there are crops to encode."""
 
     size: Callable[[], tuple[int, int]]
-    """Height and width of the crops that it takes."""
+    """Returns height and width of the crops that the network takes."""
     rows: Callable[[Float[Tensor, "b 3 y x"]], Float32[Tensor, "b d"]]
-    """Crops, 0..255, on the device, to unit rows on the CPU."""
+    """Maps crops, 0..255, on the device, to unit rows on the CPU."""
     width: Callable[[], int]
-    """D."""
+    """Returns the embedding dimension D."""
 
 
 def crop_features(
@@ -38,34 +39,34 @@ def crop_features(
     fill: Fill,
     device: str,
 ) -> Iterator[Float32[Tensor, "r d"]]:
-    """One unit row per region of every view, as `Encoder.encode_each` gives them: crops of several views fill a batch.
+    """Yield one unit row per region of every view, like `Encoder.encode_each`; crops of several views share batches.
 
     Raises:
-        MemoryError: the memory of the device does not hold a single crop.
+        MemoryError: If not even one crop fits into the memory of the device.
     """
-    seen: dict[int, _Seen] = {}
+    pending: dict[int, _PendingView] = {}
 
-    def crops() -> Iterator[list[tuple[int, int]]]:
+    def crop_ids() -> Iterator[list[tuple[int, int]]]:
         for number, (image, labels) in enumerate(views):
-            there = labels.to(device)
-            seen[number] = _Seen(image.to(device), there, region_boxes(there))
-            yield [(number, region) for region in range(len(seen[number].boxes))]
+            device_labels = labels.to(device)
+            pending[number] = _PendingView(image.to(device), device_labels, region_boxes(device_labels))
+            yield [(number, region) for region in range(len(pending[number].boxes))]
 
     def encode(batch: Sequence[tuple[int, int]]) -> Tensor:
-        cut = []
+        crops = []
         for number, crops_of_view in groupby(batch, itemgetter(0)):
-            image, labels, boxes = seen[number]
+            image, labels, boxes = pending[number]
             regions = torch.tensor([region for _, region in crops_of_view], device=device)
-            cut.append(masked_crops(image, labels, regions, boxes[regions], network.size(), fill))
-        return network.rows(torch.cat(cut))
+            crops.append(masked_crops(image, labels, regions, boxes[regions], network.size(), fill))
+        return network.rows(torch.cat(crops))
 
-    for number, rows in enumerate(batches.across(encode, crops())):
-        del seen[number]
+    for number, rows in enumerate(batches.across(encode, crop_ids())):
+        del pending[number]
         yield torch.stack(rows) if len(rows) > 0 else torch.empty(0, network.width())
 
 
-class _Seen(NamedTuple):
-    """A view, on the device, whose regions wait for a batch."""
+class _PendingView(NamedTuple):
+    """A view, on the device, with regions that wait for a batch."""
 
     image: UInt8[Tensor, "h w 3"]
     labels: Int32[Tensor, "depth h w"]
@@ -73,12 +74,12 @@ class _Seen(NamedTuple):
 
 
 def region_boxes(labels: Int32[Tensor, "depth h w"]) -> Int64[Tensor, "r 4"]:
-    """First and last column and row of each region, as (x0, y0, x1, y1), both ends inside."""
+    """Return the first and last column and row of each region as inclusive boxes (x0, y0, x1, y1)."""
     depth, y, x = (labels >= 0).nonzero(as_tuple=True)
     region = labels[depth, y, x].long()
     count = int(region.max()) + 1 if len(region) > 0 else 0
     ends = ((x, "amin"), (y, "amin"), (x, "amax"), (y, "amax"))
-    columns = [x.new_zeros(count).scatter_reduce(0, region, line, how, include_self=False) for line, how in ends]
+    columns = [x.new_zeros(count).scatter_reduce(0, region, at, reduce, include_self=False) for at, reduce in ends]
     return torch.stack(columns, dim=1)
 
 
@@ -90,46 +91,48 @@ def masked_crops(
     size: tuple[int, int],
     fill: Fill,
 ) -> Float[Tensor, "b 3 size_y size_x"]:
-    """Some regions, 0..255, as the top of this file describes it.
+    """Return masked crops of regions, 0..255; see the module docstring.
 
     Args:
-        labels: a region is all pixels that have its id at any depth.
-        boxes: of these regions, as `region_boxes` returns them.
-        size: height and width of the result.
+        labels: A region consists of all pixels that have its id at any depth.
+        boxes: Boxes of these regions from `region_boxes`.
+        size: Height and width of the result.
     """
     x0, y0, x1, y1 = boxes.T
     width, height = x1 - x0 + 1, y1 - y0 + 1
     side = torch.maximum(width, height)
-    rows = _line(side, (side - height) // 2, height, y0, size[0])
-    columns = _line(side, (side - width) // 2, width, x0, size[1])
+    rows = _bilinear_samples(side, (side - height) // 2, height, y0, size[0])
+    columns = _bilinear_samples(side, (side - width) // 2, width, x0, size[1])
     outside = 255.0 if fill == "white" else 0.0
     crops = torch.zeros(len(regions), *size, 3, device=image.device)
     for y, row_weight, row_inside in rows:
         for x, column_weight, column_inside in columns:
             at = y[:, :, None], x[:, None, :]
-            mine = torch.zeros(len(regions), *size, dtype=torch.bool, device=image.device)
+            inside = torch.zeros(len(regions), *size, dtype=torch.bool, device=image.device)
             for layer in labels:
-                mine |= layer[at] == regions[:, None, None]
-            pixels = torch.where(mine[:, :, :, None], image[at].float(), outside)
+                inside |= layer[at] == regions[:, None, None]
+            pixels = torch.where(inside[:, :, :, None], image[at].float(), outside)
             weight = (row_weight * row_inside)[:, :, None] * (column_weight * column_inside)[:, None, :]
             crops += weight[:, :, :, None] * pixels
     return crops.permute(0, 3, 1, 2)
 
 
-def _line(
+def _bilinear_samples(
     side: Tensor, margin: Tensor, length: Tensor, start: Tensor, size: int
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Where `size` samples of each square fall along one axis: the two pixels beside each, as position in the image,
-    weight, and whether they lie in the box rather than in the margin.
+    """Return the bilinear samples of each square along one axis.
+
+    The result has one entry for each of the two pixels next to a sample. It holds the position in the image, the
+    weight, and whether the pixel is in the box rather than in the margin.
     """
-    centre = (torch.arange(size, device=side.device) + 0.5) * (side[:, None].double() / size) - 0.5
-    centre = centre.clamp(min=0)
-    low = centre.long()
+    center = (torch.arange(size, device=side.device) + 0.5) * (side[:, None].double() / size) - 0.5
+    center = center.clamp(min=0)
+    low = center.long()
     high = torch.minimum(low + 1, side[:, None] - 1)
-    share = (centre - low).float()
-    taps = []
-    for position, weight in ((low, 1 - share), (high, share)):
+    fraction = (center - low).float()
+    samples = []
+    for position, weight in ((low, 1 - fraction), (high, fraction)):
         inside = position - margin[:, None]
         within = (inside >= 0) & (inside < length[:, None])
-        taps.append((start[:, None] + torch.minimum(inside.clamp(min=0), length[:, None] - 1), weight, within))
-    return taps
+        samples.append((start[:, None] + torch.minimum(inside.clamp(min=0), length[:, None] - 1), weight, within))
+    return samples

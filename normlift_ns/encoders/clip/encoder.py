@@ -1,4 +1,4 @@
-"""OpenCLIP as an encoder: masked square crops of regions against texts."""
+"""OpenCLIP encoder: masked square crops of regions, compared with text."""
 
 from __future__ import annotations
 
@@ -26,56 +26,56 @@ from normlift_ns.encoders.texts.templates import check_template, templates_of
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, Fill
 
-_BATCH = {"cuda": 128, "cpu": 8}
+_BATCH_SIZE = {"cuda": 128, "cpu": 8}
 
 
 @dataclass(frozen=True)
 class OpenClipEncoder:
-    """CLIP features of masked crops, by open_clip. The weights are loaded at the first use: in half precision on a
-    GPU, in float32 elsewhere; vectors are normalised in float32.
+    """CLIP features of masked crops, computed with open_clip. The weights are loaded at their first use, in half
+    precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
 
     Raises:
-        ValueError: a model or a tag of weights that open_clip does not know, a model that the installed timm does not
-            know, an unknown fill, a template without a place for the text.
-        FileNotFoundError: a weight file that does not exist.
+        ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
+            tag. Also if the fill is unknown, or the template has no placeholder for the text.
+        FileNotFoundError: If a weight file does not exist.
     """
 
     model: str = DEFAULT_MODEL
-    """Architecture, a name of open_clip.list_models()."""
+    """Architecture, a name in open_clip.list_models()."""
     pretrained: str = DEFAULT_PRETRAINED
     """Tag of weights to download, or a weight file of that architecture. Pickles are read with weights_only=True."""
     fill: Fill = "black"
-    """What the pixels outside of a region become."""
+    """Color of the pixels outside of a region."""
     device: str = "cpu"
-    """Where the network runs; results are on the CPU anyway."""
+    """Device of the network; results are always on the CPU."""
     template: str = "{}"
-    """What the network reads for a text, which takes the place of {}; "ensemble": the mean of open_clip's seven."""
+    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
     def __post_init__(self) -> None:
         if self.fill not in get_args(Fill):
-            raise InputError(f"fill of crops must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
+            raise InputError(f"crop fill must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
         check_template(self.template)
         check_names(self.model, self.pretrained)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """A weight file counts by its content, wherever it lies."""
+        """Settings of the image features. A weight file is identified by its content, independent of its path."""
         return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """As in `Encoder`.
+        """Return one unit row per region; see `Encoder.encode`.
 
         Raises:
-            FileNotFoundError: the weights cannot be downloaded.
-            ValueError: a weight file that is damaged or of another architecture.
-            MemoryError: the memory of the device does not hold a single crop.
+            FileNotFoundError: If the weights cannot be downloaded.
+            ValueError: If the weight file is damaged or of another architecture.
+            MemoryError: If not even one crop fits into the memory of the device.
         """
         return next(self.encode_each([(image, labels)]))
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        """As in `Encoder`: crops of several views fill a batch; raises as `encode`."""
+        """Yield the features of several views; their crops share batches. Raises as `encode`."""
         network = CropNetwork(lambda: self.network.size, self._image_rows, self._width)
         return crop_features(views, network, self._crops, self.fill, self.device)
 
@@ -85,18 +85,18 @@ class OpenClipEncoder:
         if reason is None:
             return None
         return (
-            f"--regions patches needs a vision transformer of open_clip; {self.model} is none: {reason}. "
-            f"Take --encoder-model {DEFAULT_MODEL}, or other regions"
+            f"--regions patches needs a vision transformer of open_clip, which {self.model} is not: {reason}. "
+            f"Use --encoder-model {DEFAULT_MODEL}, or other regions"
         )
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
         visual = self.network.model.visual
-        tall, wide = visual.patch_size
-        pixels = self.network.normalized(scaled(image.to(self.device), rows * tall, columns * wide))
+        patch_height, patch_width = visual.patch_size
+        pixels = self.network.normalized(scaled(image.to(self.device), rows * patch_height, columns * patch_width))
         return normalize(dense_tokens(visual, pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """One unit row per prompt; raises as `encode`, and ValueError for an empty prompt or none."""
+        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
         check_prompts(prompts)
         templates = templates_of(self.template)
         tokens = self.network.tokenizer([template(prompt) for prompt in prompts for template in templates])
@@ -121,13 +121,13 @@ class OpenClipEncoder:
 
     @cached_property
     def network(self) -> ClipNetwork:
-        """The model with its weights, loaded at the first use; raises as `encode`."""
+        """The model with its weights, loaded at its first use; raises as `encode`."""
         return load_clip(self.model, self.pretrained, self.device)
 
     @cached_property
     def _crops(self) -> Batches:
-        return Batches(_BATCH[torch.device(self.device).type])
+        return Batches(_BATCH_SIZE[torch.device(self.device).type])
 
     @cached_property
     def _texts(self) -> Batches:
-        return Batches(_BATCH[torch.device(self.device).type])
+        return Batches(_BATCH_SIZE[torch.device(self.device).type])

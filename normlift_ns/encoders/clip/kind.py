@@ -1,4 +1,4 @@
-"""`--encoder open_clip`: what is known of it before torch is loaded."""
+"""Registration of `--encoder open_clip`, without torch."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.source import Encoder, TextEncoder
     from normlift_ns.encoders.texts.kept import KeptTexts
 
-_OF_FILES = ("xxh3_128:", "blake2b:")
-"""How the identities of weights begin that are the content of a file, and no tag."""
+_DIGEST_PREFIXES = ("xxh3_128:", "blake2b:")
+"""Prefixes of weight identities that are digests of file contents rather than tags."""
 _REMEDY = (
     "give a local weight file with --encoder-pretrained, or use the encoder that needs no weights: --encoder colour"
 )
 
 
-def _make(options: SourceOptions, device: str) -> Encoder:
+def _make_encoder(options: SourceOptions, device: str) -> Encoder:
     from normlift_ns.encoders.clip.encoder import OpenClipEncoder  # noqa: PLC0415 (needs torch)
 
     model, pretrained = options.encoder_model, options.encoder_pretrained
     return OpenClipEncoder(model, pretrained, options.crop_fill, device, options.text_template)
 
 
-def _texts(options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]) -> KeptTexts:
-    """As `EncoderKind.texts`. A weight file is read whole at every use."""
+def _make_texts(options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]) -> KeptTexts:
+    """Make the text encoder of a lifted run, see `EncoderKind.texts`. A weight file is read completely at every use."""
     from normlift_ns.encoders.texts.kept import KeptTexts, text_identity  # noqa: PLC0415 (needs numpy)
 
     model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.text_template
@@ -41,39 +41,41 @@ def _texts(options: SourceOptions, device: str, cache: Path | None, recorded: Ma
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (needs torch)
         from normlift_ns.encoders.clip.text_tower import load_text_tower  # noqa: PLC0415
 
-        there = "cpu" if device == "auto" else choose_device(device)  # a text takes less than waking a GPU
-        tower: Any = load_text_tower(model, pretrained, template, there)
-        return _make(options, choose_device(device)) if tower is None else tower  # which imports all of open_clip
+        text_device = "cpu" if device == "auto" else choose_device(device)  # faster than initializing a GPU
+        tower: Any = load_text_tower(model, pretrained, template, text_device)
+        if tower is not None:
+            return tower
+        return _make_encoder(options, choose_device(device))  # imports all of open_clip
 
     return KeptTexts(lambda: text_identity(model, pretrained, template), network, cache)
 
 
 def _check_unchanged(pretrained: str, expected: object) -> None:
-    """Makes sure that the weights are those of the lift."""
+    """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
     remedy = (
-        "put the file of the lift back there; or give texts with vectors of the same network, --text-vectors; or lift "
+        "restore the file of the lift, give embeddings of your texts by the same network with --text-vectors, or lift "
         "again with: ns-normlift"
     )
     if not isinstance(expected, str):
         return
-    from normlift_ns.core.disk.digests import file_digest  # noqa: PLC0415 (needed by questions only)
+    from normlift_ns.core.disk.digests import file_digest  # noqa: PLC0415 (only queries need it)
 
-    path, found = Path(pretrained), pretrained
+    path, identity = Path(pretrained), pretrained
     if path.is_file():
-        found = file_digest(path, like=expected)
-    elif expected.startswith(_OF_FILES) and os.path.lexists(path):
-        raise InputError(f"weight file {path}, with which the run was lifted, is no file any more; {remedy}")
-    elif expected.startswith(_OF_FILES):
-        raise FileNotFoundError(f"weight file {path}, with which the run was lifted, does not exist; {remedy}")
-    if found != expected:
+        identity = file_digest(path, like=expected)
+    elif expected.startswith(_DIGEST_PREFIXES) and os.path.lexists(path):
+        raise InputError(f"weight file {path}, which the run was lifted with, is not a file anymore; {remedy}")
+    elif expected.startswith(_DIGEST_PREFIXES):
+        raise FileNotFoundError(f"weight file {path}, which the run was lifted with, does not exist; {remedy}")
+    if identity != expected:
         raise InputError(
-            f"{path} is not what the run was lifted with, and would give other answers: its content is {found}, "
-            f"expected {expected}. {remedy[0].upper()}{remedy[1:]}"
+            f"{path} differs from the weights that the run was lifted with, and would give other results: it is "
+            f"{identity}, expected {expected}. {remedy[0].upper()}{remedy[1:]}"
         )
 
 
-def _check(options: SourceOptions) -> None:
-    """Weights that are neither on this machine nor to be had."""
+def _check_weights(options: SourceOptions) -> None:
+    """Raise FileNotFoundError if the weights are neither on this machine nor available for download."""
     model, pretrained = options.encoder_model, options.encoder_pretrained
     if Path(pretrained).is_file():
         return
@@ -84,7 +86,7 @@ def _check(options: SourceOptions) -> None:
             weights.reach_hub()
         except OSError as error:
             raise FileNotFoundError(
-                f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine, and cannot be downloaded "
+                f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded "
                 f"({error}); go online once, {_REMEDY}"
             ) from None
 
@@ -95,5 +97,7 @@ def _has_patches(options: SourceOptions) -> bool:
     return why_not_dense(options.encoder_model) is None
 
 
-OPEN_CLIP = EncoderKind(_make, check=_check, texts=_texts, has_patches=_has_patches, paths=("encoder_pretrained",))
+OPEN_CLIP = EncoderKind(
+    _make_encoder, check=_check_weights, texts=_make_texts, has_patches=_has_patches, paths=("encoder_pretrained",)
+)
 """CLIP features of masked crops, or of patches."""

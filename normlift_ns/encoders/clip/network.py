@@ -1,4 +1,4 @@
-"""An OpenCLIP model with its weights on a device."""
+"""OpenCLIP models with their weights on a device."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from normlift_ns.options import DEFAULT_MODEL
 
 
 class ClipNetwork(NamedTuple):
-    """A model in half precision on a GPU, in float32 elsewhere, and what belongs to it."""
+    """A model, in half precision on a GPU and in float32 elsewhere, with its tokenizer and preprocessing."""
 
     model: Any
     tokenizer: Any
     size: tuple[int, int]
-    """Height and width of the images that it was trained on."""
+    """Height and width of the training images."""
     mean: Float[Tensor, "3 1 1"]
     std: Float[Tensor, "3 1 1"]
 
     def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Pixels, 0..255, on the device, as the model expects them."""
+        """Return pixels, 0..255, on the device, normalized for the model."""
         return ((pixels / 255 - self.mean) / self.std).to(torch.float16 if pixels.is_cuda else torch.float32)
 
 
 def load_clip(model: str, pretrained: str, device: str) -> ClipNetwork:
-    """The network of an architecture and weights that `check_names` lets pass.
+    """Load the network of an architecture and weights that have passed `check_names`.
 
     Raises:
-        FileNotFoundError: the weights or the tokenizer cannot be downloaded.
-        ValueError: an architecture that the installed packages cannot build; a weight file that is damaged or of
-            another architecture.
+        FileNotFoundError: If the weights or the tokenizer cannot be downloaded.
+        ValueError: If the installed packages cannot build the architecture, or the weight file is damaged or of another
+            architecture.
     """
     open_clip = import_open_clip()
     path, training = find_weights(model, pretrained)
@@ -49,21 +49,21 @@ def load_clip(model: str, pretrained: str, device: str) -> ClipNetwork:
         )
     except FOREIGN_ERRORS as error:
         raise InputError(
-            f"OpenCLIP model {model} cannot be built with the packages installed here ({first_line(error)}); take "
+            f"OpenCLIP model {model} cannot be built with the packages installed here ({first_line(error)}); choose "
             f"another with --encoder-model, such as {DEFAULT_MODEL}"
         ) from None
     try:
         open_clip.load_checkpoint(network, str(path), weights_only=True)
     except FOREIGN_ERRORS as error:
         raise InputError(
-            f"weight file {path} is damaged or not of OpenCLIP model {model} ({first_line(error)}); name its "
+            f"weight file {path} is damaged or not of OpenCLIP model {model} ({first_line(error)}); give its "
             f"architecture with --encoder-model, or {REMEDY}"
         ) from None
     try:
         tokenizer = open_clip.get_tokenizer(model)
-    except Exception as error:  # a download's client raises types of its own, which have nothing in common
+    except Exception as error:  # download clients raise exceptions without a common base class
         raise FileNotFoundError(
-            f"the tokenizer of OpenCLIP model {model} cannot be had ({first_line(error)}); go online once, "
+            f"the tokenizer of OpenCLIP model {model} cannot be loaded ({first_line(error)}); go online once, "
             f"use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that needs "
             "none: --encoder colour"
         ) from None

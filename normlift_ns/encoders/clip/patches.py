@@ -1,9 +1,9 @@
-"""Features of patches of OpenCLIP's vision transformers.
+"""Patch features of OpenCLIP's vision transformers.
 
-The last layer of CLIP mixes all patches into one vector. As in MaskCLIP (Zhou, Loy and Dai, ECCV 2022), it is left out
-but for its value path: the patch tokens of the layer before go through the layer's first norm, its value and output
-projections, the final norm and the projection into the joint space. The image is scaled, with its shape kept, to a
-whole number of patches; the position embeddings are interpolated to that.
+The last layer of CLIP mixes all patches into one vector. As in MaskCLIP (Zhou, Loy and Dai, ECCV 2022), only the value
+path of that layer is used. Patch tokens of the preceding layer pass through the last layer's first norm, its value and
+output projections, the final norm, and the joint-space projection. The image is scaled to a whole number of patches,
+preserving its aspect ratio, and position embeddings are interpolated to that grid.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from normlift_ns.encoders.clip.architectures import model_config
 
 
 def why_not_dense(model: str) -> str | None:
-    """Why an OpenCLIP architecture has no value path to follow; None if it has one."""
+    """Return why an OpenCLIP architecture has no value path to follow; None if it has one."""
     vision = (model_config(model) or {"vision_cfg": {}})["vision_cfg"]
     if "timm_model_name" in vision:
         return "its image encoder is timm's"
@@ -30,11 +30,11 @@ def why_not_dense(model: str) -> str | None:
 
 @torch.no_grad()
 def dense_tokens(visual: Any, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
-    """Patch tokens in the joint space, row by row, not normalised.
+    """Return patch tokens in the joint space, row by row, not normalized.
 
     Args:
         visual: open_clip's VisionTransformer.
-        pixels: normalised, of a whole number of patches.
+        pixels: Normalized images of a whole number of patches.
     """
     tokens = visual.conv1(pixels)
     rows, columns = tokens.shape[2:]
@@ -51,7 +51,7 @@ def dense_tokens(visual: Any, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor,
 
 
 def _positions(visual: Any, rows: int, columns: int) -> Float[Tensor, "n d"]:
-    """Position embeddings of the class token and of a grid of patches, bicubic between those learned."""
+    """Return position embeddings of the class token and of a grid of patches, interpolated bicubically."""
     learned = visual.positional_embedding.float()
     grid = learned[1:].reshape(*visual.grid_size, -1).permute(2, 0, 1)[None]
     grid = interpolate(grid, (rows, columns), mode="bicubic", antialias=True, align_corners=False)

@@ -1,8 +1,8 @@
-"""The text tower of CLIP in plain torch, for a question that nobody has asked before.
+"""The CLIP text tower in plain torch, for prompts that are not cached.
 
-Most architectures of open_clip have one kind of text tower: a causal transformer over byte pairs, read at the end of
-the text. Those are computed here, from the same weights, with open_clip's own tokenizer, so that nobody waits for the
-rest of it; other kinds are left to open_clip.
+Most architectures of open_clip share one kind of text tower: a causal transformer over byte pairs, read out at the end
+of the text. This module computes those from the same weights with open_clip's own tokenizer, which avoids importing the
+rest of open_clip. Other kinds are left to open_clip.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from normlift_ns.encoders.texts.prompts import check_prompts
 from normlift_ns.encoders.texts.templates import check_template, templates_of
 from normlift_ns.encoders.weights import FOREIGN_ERRORS, hub_file
 
-_PLAIN = {"context_length", "vocab_size", "width", "heads", "layers"}
-"""What the configuration of a plain text tower says; any other key means another kind."""
-_BATCH = 64
+_PLAIN_KEYS = {"context_length", "vocab_size", "width", "heads", "layers"}
+"""Configuration keys of a plain text tower; any other key indicates another kind."""
+_TEXT_BATCH_SIZE = 64
 
 
 @dataclass(frozen=True)
@@ -35,36 +35,36 @@ class TextTower:
 
     tokenizer: Callable[[Sequence[str]], Int64[Tensor, "b length"]]
     templates: Sequence[Callable[[str], str]]
-    """What the network reads for a text; its vector is the mean of theirs."""
+    """Functions that fill the prompt templates; the embedding of a text is the mean over them."""
     weights: Mapping[str, Float32[Tensor, ...]]
-    """By their names in the state of the model."""
+    """Weights by their names in the model's state dict."""
     heads: int
     layers: int
     quick_gelu: bool
     device: str
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """One unit row per prompt, on the CPU.
+        """Return one unit row per prompt, on the CPU.
 
         Raises:
-            ValueError: no prompt, or an empty one.
+            ValueError: If `prompts` or a prompt is empty.
         """
         check_prompts(prompts)
         tokens = self.tokenizer([template(prompt) for prompt in prompts for template in self.templates])
-        rows = torch.cat([self._rows(part.to(self.device)) for part in tokens.split(_BATCH)])
+        rows = torch.cat([self._rows(part.to(self.device)) for part in tokens.split(_TEXT_BATCH_SIZE)])
         return normalize(rows.unflatten(0, (len(prompts), len(self.templates))).mean(dim=1), dim=1).cpu()
 
     @torch.no_grad()
     def _rows(self, tokens: Int64[Tensor, "b length"]) -> Float32[Tensor, "b d"]:
-        end = tokens.argmax(dim=1)  # the end of a text has the largest number
-        tokens = tokens[:, : int(end.max()) + 1]  # nothing looks at what comes later
+        end = tokens.argmax(dim=1)  # the end-of-text token has the largest id
+        tokens = tokens[:, : int(end.max()) + 1]  # causal attention ignores later tokens
         x = self.weights["token_embedding.weight"][tokens] + self.weights["positional_embedding"][: tokens.shape[1]]
         for i in range(self.layers):
             block = f"transformer.resblocks.{i}."
             qkv = self._linear(self._norm(x, f"{block}ln_1"), f"{block}attn.in_proj_")
             q, k, v = qkv.unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-            heard = scaled_dot_product_attention(q, k, v, is_causal=True)
-            x = x + self._linear(heard.transpose(1, 2).flatten(2), f"{block}attn.out_proj.")
+            attended = scaled_dot_product_attention(q, k, v, is_causal=True)
+            x = x + self._linear(attended.transpose(1, 2).flatten(2), f"{block}attn.out_proj.")
             hidden = self._linear(self._norm(x, f"{block}ln_2"), f"{block}mlp.c_fc.")
             hidden = hidden * torch.sigmoid(1.702 * hidden) if self.quick_gelu else gelu(hidden)
             x = x + self._linear(hidden, f"{block}mlp.c_proj.")
@@ -79,16 +79,18 @@ class TextTower:
 
 
 def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
-    """The text tower of an OpenCLIP model; None where it is not of the plain kind, where its weights are not on this
-    machine, or where anything is not as expected: `OpenClipEncoder` knows what to do then, or says what is wrong.
+    """Load the text tower of an OpenCLIP model.
+
+    Return None if it is not of the plain kind, its weights are not on this machine, or anything is unexpected.
+    `OpenClipEncoder` then handles the model, or reports what is wrong.
     """
     try:
         config = model_config(model) or {}
         sizes = config["text_cfg"]
-        found = _weights_at_hand(model, pretrained)
-        if found is None or not set(sizes) <= _PLAIN or config.get("custom_text"):
+        local = _find_local_weights(model, pretrained)
+        if local is None or not set(sizes) <= _PLAIN_KEYS or config.get("custom_text"):
             return None
-        path, published = found
+        path, published = local
         shapes = _shapes(config["embed_dim"], **sizes)
         weights = _read(path, shapes)
         check_template(template)
@@ -103,8 +105,8 @@ def load_text_tower(model: str, pretrained: str, template: str, device: str = "c
     return TextTower(tokenizer, templates, weights, sizes["heads"], sizes["layers"], quick_gelu, device)
 
 
-def _weights_at_hand(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:
-    """The weight file, and what open_clip knows of its training; None where it is not on this machine."""
+def _find_local_weights(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:
+    """Return the weight file and open_clip's description of its training; None if it is not on this machine."""
     if os.path.isfile(pretrained):
         return Path(pretrained), {}
     published = open_clip_part("pretrained").get_pretrained_cfg(model, pretrained)
@@ -113,7 +115,7 @@ def _weights_at_hand(model: str, pretrained: str) -> tuple[Path, Mapping[str, An
 
 
 def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Some tensors of a weight file; what else it holds is not read. Errors are those of `FOREIGN_ERRORS`."""
+    """Read the named tensors of a weight file and nothing else. Raises exceptions in `FOREIGN_ERRORS`."""
     if path.suffix == ".safetensors":
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in names}
@@ -126,7 +128,7 @@ def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
 def _shapes(
     embed_dim: int, context_length: int, vocab_size: int, width: int, heads: int, layers: int
 ) -> dict[str, tuple[int, ...]]:
-    """Every weight of a plain text tower."""
+    """Return the shapes of all weights of a plain text tower."""
     block = {
         "ln_1.weight": (width,), "ln_1.bias": (width,), "ln_2.weight": (width,), "ln_2.bias": (width,),
         "attn.in_proj_weight": (3 * width, width), "attn.in_proj_bias": (3 * width,),
@@ -135,11 +137,11 @@ def _shapes(
         "mlp.c_proj.weight": (width, 4 * width), "mlp.c_proj.bias": (width,),
     }  # fmt: skip
     blocks = {f"transformer.resblocks.{i}.{name}": shape for i in range(layers) for name, shape in block.items()}
-    whole = {
+    shapes = {
         "token_embedding.weight": (vocab_size, width),
         "positional_embedding": (context_length, width),
         "ln_final.weight": (width,),
         "ln_final.bias": (width,),
         "text_projection": (width, embed_dim),
     }
-    return {**whole, **blocks}
+    return {**shapes, **blocks}

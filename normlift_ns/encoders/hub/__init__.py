@@ -1,1 +1,1 @@
-"""Networks of the transformers library, in the format of the Hugging Face hub: SigLIP, SigLIP 2, MetaCLIP 2."""
+"""Encoders with networks of the transformers library, in Hugging Face hub format: SigLIP, SigLIP 2, MetaCLIP 2."""

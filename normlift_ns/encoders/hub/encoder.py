@@ -1,4 +1,4 @@
-"""Networks of transformers as encoders: masked square crops of regions, or patches, against texts."""
+"""Encoder with networks of transformers: masked square crops of regions, or patches, compared with text."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from normlift_ns.encoders.texts.templates import check_template, templates_of
 from normlift_ns.errors import InputError
 from normlift_ns.options import Fill
 
-_BATCH = {"cuda": 128, "cpu": 8}
+_BATCH_SIZE = {"cuda": 128, "cpu": 8}
 
 
 @dataclass(frozen=True)
 class HubEncoder:
-    """SigLIP, SigLIP 2 or MetaCLIP 2 on masked crops. The weights are loaded at the first use: in half precision on a
-    GPU, in float32 elsewhere; vectors are normalised in float32.
+    """SigLIP, SigLIP 2 or MetaCLIP 2 features of masked crops. The weights are loaded at their first use, in half
+    precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
 
     Raises:
-        ValueError: a name that is neither a folder nor one of the hub, an unknown fill, a template without a place for
-            the text.
-        FileNotFoundError: a folder that does not exist.
+        ValueError: If the model is neither a folder nor a hub name, the fill is unknown, or the template has no
+            placeholder for the text.
+        FileNotFoundError: If the folder does not exist.
     """
 
     kind: str
@@ -44,65 +44,66 @@ class HubEncoder:
     model: str
     """Folder, or name on the hub."""
     fill: Fill = "black"
-    """What the pixels outside of a region become."""
+    """Color of the pixels outside of a region."""
     device: str = "cpu"
-    """Where the network runs; results are on the CPU anyway."""
+    """Device of the network; results are always on the CPU."""
     template: str = "{}"
-    """What the network reads for a text, which takes the place of {}; "ensemble": the mean of open_clip's seven."""
+    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
 
     def __post_init__(self) -> None:
         if self.fill not in get_args(Fill):
-            raise InputError(f"fill of crops must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
+            raise InputError(f"crop fill must be one of {', '.join(get_args(Fill))}; got {self.fill!r}")
         check_template(self.template)
         check_name(self.model, self.family)
 
     @property
     def family(self) -> Family:
-        """How its networks are trained."""
+        """The family of the network."""
         return FAMILIES[self.kind]
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The network counts by the content of its files, wherever they lie; what is not here is downloaded."""
+        """Settings of the image features. The network is identified by the content of its files, which are downloaded
+        if missing."""
         return {"kind": self.kind, "weights": self._digest, "fill": self.fill}
 
     @property
     def why_not_dense(self) -> None:
-        """All of them have patches."""
+        """None, because all networks of these families have patches."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
-        """As in `Encoder`.
+        """Return one unit row per region; see `Encoder.encode`.
 
         Raises:
-            FileNotFoundError: the network cannot be downloaded.
-            ValueError: a folder that is damaged or of another architecture.
-            MemoryError: the memory of the device does not hold a single crop.
+            FileNotFoundError: If the network cannot be downloaded.
+            ValueError: If the folder is damaged or of another architecture.
+            MemoryError: If not even one crop fits into the memory of the device.
         """
         return next(self.encode_each([(image, labels)]))
 
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        """As in `Encoder`: crops of several views fill a batch; raises as `encode`."""
+        """Yield the features of several views; their crops share batches. Raises as `encode`."""
         network = CropNetwork(lambda: self.network.size, self._image_rows, lambda: self.network.width)
         return crop_features(views, network, self._crops, self.fill, self.device)
 
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
-        """As in `DenseEncoder`; formulas in `hub.network`."""
+        """Return one unit row per patch, see `DenseEncoder.patches`; formulas in `hub.network`."""
         side = self.network.patch
         pixels = scaled(image.to(self.device), rows * side, columns * side)
         return normalize(self.network.patches(pixels)[0].float(), dim=1).cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """One unit row per prompt; raises as `encode`, and ValueError for an empty prompt or none."""
+        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
         check_prompts(prompts)
         templates = templates_of(self.template)
         texts = [self.family.read(template(prompt)) for prompt in prompts for template in templates]
         empty = [i for i, text in enumerate(texts) if not text.strip()]
         if len(empty) > 0:
             raise InputError(
-                f"text {prompts[empty[0] // len(templates)]!r} has no letter or number, and {self.family.title} reads "
-                "nothing else; say it in words"
+                f"text {prompts[empty[0] // len(templates)]!r} has no letters or digits, and {self.family.title} "
+                "ignores everything else; use words"
             )
         rows = torch.cat(list(self._texts(self._text_rows, texts)))
         return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
@@ -123,13 +124,13 @@ class HubEncoder:
 
     @cached_property
     def network(self) -> HubNetwork:
-        """The network with its weights, loaded at the first use; raises as `encode`."""
+        """The network with its weights, loaded at its first use; raises as `encode`."""
         return load_network(self._folder, self.family, self.device)
 
     @cached_property
     def _crops(self) -> Batches:
-        return Batches(_BATCH[torch.device(self.device).type])
+        return Batches(_BATCH_SIZE[torch.device(self.device).type])
 
     @cached_property
     def _texts(self) -> Batches:
-        return Batches(_BATCH[torch.device(self.device).type])
+        return Batches(_BATCH_SIZE[torch.device(self.device).type])

@@ -1,4 +1,4 @@
-"""Families of networks: what their folders say of themselves, and what they read for a text. Imports nothing heavy."""
+"""Model families: their identifiers in configurations, and their text preprocessing. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -10,57 +10,62 @@ from dataclasses import dataclass
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
 
 
-def lower(text: str) -> str:
-    """SigLIP 2 was trained on lower case; not every tokenizer that is published with it sees to that."""
+def _lowercase(text: str) -> str:
+    """Convert to lower case, which SigLIP 2 was trained on. Not every tokenizer that is published with it does so."""
     return text.lower()
 
 
-def canonical(text: str) -> str:
-    """SigLIP was trained on lower case without punctuation, as `SiglipTokenizer.canonicalize_text` makes it.
+def _canonicalize(text: str) -> str:
+    """Convert to lower case without punctuation, which SigLIP was trained on, like `SiglipTokenizer.canonicalize_text`.
 
-    >>> canonical("A red mug,  on the table!")
+    >>> _canonicalize("A red mug,  on the table!")
     'a red mug on the table'
     """
     return re.sub(r"\s+", " ", text.lower().translate(_PUNCTUATION)).strip()
 
 
-def bare(text: str) -> str:
-    """MetaCLIP 2 reads texts as they are."""
+def _unchanged(text: str) -> str:
+    """Return the text unchanged, as MetaCLIP 2 expects it."""
     return text
 
 
 @dataclass(frozen=True)
 class Family:
-    """Networks that are trained alike."""
+    """Networks with the same training and preprocessing."""
 
     name: str
-    """That `--encoder` takes."""
+    """Value of `--encoder`."""
     title: str
+    """Name in messages."""
     model_types: tuple[str, ...]
-    """What config.json may call them. SigLIP 2 of fixed resolution has the architecture of SigLIP, and says so."""
+    """Values of "model_type" in config.json. Fixed-resolution SigLIP 2 models have the architecture of SigLIP and use
+    its name."""
     default: str
-    """Name on the hub."""
+    """Hub name of the default model."""
     read: Callable[[str], str]
-    """What the tokenizer gets for a text."""
+    """Prepares a text for the tokenizer."""
     pad: str
-    """Token that fills a text up to its full length, where the tokenizer's configuration names none."""
+    """Token that pads texts to full length, if the tokenizer's configuration names none."""
     tokenizers: tuple[str, ...]
-    """What the names of its tokenizers contain."""
+    """Substrings of the class names of its tokenizers."""
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    """Mean of pixels in 0..1, if the configuration names none."""
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Of pixels in 0..1, where the configuration names none."""
+    """Standard deviation of pixels in 0..1, if the configuration names none."""
 
 
 FAMILIES = {
     family.name: family
     for family in (
-        Family("siglip", "SigLIP", ("siglip",), "google/siglip-base-patch16-224", canonical, "</s>", ("Siglip", "T5")),
+        Family(
+            "siglip", "SigLIP", ("siglip",), "google/siglip-base-patch16-224", _canonicalize, "</s>", ("Siglip", "T5")
+        ),
         Family(
             "siglip2",
             "SigLIP 2",
             ("siglip", "siglip2"),
             "google/siglip2-base-patch16-224",
-            lower,
+            _lowercase,
             "<pad>",
             ("Siglip2", "Gemma"),
         ),
@@ -69,7 +74,7 @@ FAMILIES = {
             "MetaCLIP 2",
             ("metaclip_2",),
             "facebook/metaclip-2-worldwide-huge-quickgelu",
-            bare,
+            _unchanged,
             "<pad>",
             ("XLMRoberta",),
             (0.48145466, 0.4578275, 0.40821073),
@@ -77,11 +82,11 @@ FAMILIES = {
         ),
     )
 }
-"""By their names."""
+"""Families by name."""
 
 
 def of_tokenizer(name: str) -> Family | None:
-    """The family that a tokenizer belongs to; None: any.
+    """Return the family of a tokenizer class; None if it may belong to any family.
 
     >>> of_tokenizer("GemmaTokenizerFast").title, of_tokenizer("SiglipTokenizer").title
     ('SigLIP 2', 'SigLIP')

@@ -1,10 +1,12 @@
-"""`--encoder siglip`, `siglip2` and `metaclip2`: what is known of them before torch is loaded.
+"""Registration of `--encoder siglip`, `siglip2` and `metaclip2`, without torch.
 
-SigLIP is trained with a sigmoid: what a text and an image have in common is sigmoid(scale * cosine + bias), with one
-scale > 0 and one bias for all. Of two texts the one of larger cosine has the larger sigmoid too, whatever scale and
-bias are; so LERF's comparison with negatives applies as it does to a softmax, and its draw, 0.5, is where the sigmoids
-of text and negative are equal. That rule and that threshold are the defaults. The sigmoid itself is no default: its 0.5
-is the odds of one right caption among the tens of thousands of a batch, which hardly any crop of a region reaches.
+SigLIP is trained with a sigmoid. The match of a text and an image is sigmoid(scale * cosine + bias), with one scale > 0
+and one bias for all pairs. Of two texts, the one with the larger cosine also has the larger sigmoid, whatever scale and
+bias are. LERF's comparison with negatives therefore applies as with a softmax, and its tie, 0.5, is where the sigmoids
+of text and negative are equal. That rule and that threshold are the defaults.
+
+The sigmoid itself is not a suitable default. Its 0.5 stands for one right caption among the tens of thousands of a
+batch, odds that crops of regions hardly ever reach.
 """
 
 from __future__ import annotations
@@ -21,11 +23,11 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.source import Encoder
 
 
-def _always(options: SourceOptions) -> bool:
+def _has_patches(options: SourceOptions) -> bool:
     return True
 
 
-def _kind(family: Family) -> EncoderKind:
+def _make_kind(family: Family) -> EncoderKind:
     def make(options: SourceOptions, device: str) -> Encoder:
         from normlift_ns.encoders.hub.encoder import HubEncoder  # noqa: PLC0415 (needs torch)
 
@@ -33,7 +35,7 @@ def _kind(family: Family) -> EncoderKind:
         return HubEncoder(family.name, model_of(options, family), options.crop_fill, device, options.text_template)
 
     check = partial(check_options, family=family)
-    return EncoderKind(make, check=check, has_patches=_always, paths=("encoder_model",))
+    return EncoderKind(make, check=check, has_patches=_has_patches, paths=("encoder_model",))
 
 
-SIGLIP, SIGLIP2, METACLIP2 = (_kind(FAMILIES[name]) for name in ("siglip", "siglip2", "metaclip2"))
+SIGLIP, SIGLIP2, METACLIP2 = (_make_kind(FAMILIES[name]) for name in ("siglip", "siglip2", "metaclip2"))

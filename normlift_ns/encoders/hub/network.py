@@ -1,11 +1,13 @@
-"""A network of transformers with its weights on a device: images, patches and texts to rows in its joint space.
+"""Networks of transformers with their weights on a device: embeddings of images, patches and texts in a joint space.
 
-Patches. SigLIP pools the tokens of all patches by attention: one learned query looks at them. As MaskCLIP (Zhou, Loy
-and Dai, ECCV 2022) does with the attention pooling of CLIP's ResNets, that is replaced by its value path: every token,
-after the final norm, goes through the value and output projections of the pooling as if the query looked at it alone,
-then through the rest of the head. MetaCLIP 2 has CLIP's class token instead: of the last layer nothing is left but its
-first norm, value and output projections (MaskCLIP's rule for vision transformers), then come the final norm and the
-projection into the joint space. Position embeddings are interpolated as transformers does.
+SigLIP pools the tokens of all patches by attention with one learned query. As MaskCLIP (Zhou, Loy and Dai, ECCV 2022)
+does for the attention pooling of CLIP's ResNets, patch features replace that pooling by its value path. After the final
+norm, every token passes through the pooling's value and output projections as if the query attended to it alone. The
+rest of the head follows.
+
+MetaCLIP 2 has CLIP's class token instead. Of the last layer, only the first norm and the value and output projections
+are used (MaskCLIP's rule for vision transformers). The final norm and the projection into the joint space follow.
+Position embeddings are interpolated as in transformers.
 """
 
 from __future__ import annotations
@@ -28,13 +30,13 @@ from normlift_ns.encoders.weights import first_line
 from normlift_ns.errors import InputError
 
 _CLASSES = {"siglip": "Siglip", "siglip2": "Siglip2", "metaclip_2": "MetaClip2"}
-"""How the names of the classes in transformers begin, by the architecture."""
+"""Prefixes of class names in transformers, by architecture."""
 
 
 @dataclass
 class HubNetwork:
-    """A network in half precision on a GPU, in float32 elsewhere. Where numbers are too large for half precision, it
-    goes over to float32 by itself."""
+    """A network in half precision on a GPU, in float32 elsewhere. If values overflow in half precision, the network
+    switches to float32."""
 
     model: Any
     tokenizer: Any
@@ -44,7 +46,7 @@ class HubNetwork:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the images that it was trained on."""
+        """Height and width of the training images."""
         count = self.folder.pixels.patches
         side = self.model.config.vision_config.image_size if count is None else patch_side(count) * self.patch
         return side, side
@@ -56,7 +58,7 @@ class HubNetwork:
 
     @property
     def width(self) -> int:
-        """D."""
+        """Embedding dimension D."""
         config = self.model.config
         return config.projection_dim if self._is_clip else config.vision_config.hidden_size
 
@@ -65,38 +67,40 @@ class HubNetwork:
         return self.folder.model_type == "metaclip_2"
 
     def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Pixels, 0..255, on the device, as the model expects them."""
-        found = (pixels.to(self.mean.dtype) * self.folder.pixels.factor - self.mean) / self.std
-        return found.to(self.model.logit_scale.dtype)
+        """Return pixels, 0..255, on the device, normalized for the model."""
+        normalized = (pixels.to(self.mean.dtype) * self.folder.pixels.factor - self.mean) / self.std
+        return normalized.to(self.model.logit_scale.dtype)
 
     def images(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
-        """Rows of images, 0..255, of `size`, on the device; not normalised."""
+        """Return unnormalized embeddings of images, 0..255, of `size`, on the device."""
         return self._finite(lambda: self._pooled(pixels))
 
     def patches(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
-        """Rows of all patches, row by row, as the top of this file describes it; not normalised.
+        """Return unnormalized embeddings of all patches, row by row; see the module docstring.
 
         Args:
-            pixels: images, 0..255, of a whole number of patches, on the device.
+            pixels: Images, 0..255, of a whole number of patches, on the device.
         """
         return self._finite(lambda: self._value_path(pixels))
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
-        """Rows of texts that the family reads; not normalised."""
+        """Return unnormalized embeddings of texts that the family has preprocessed."""
         encoded = self.tokenizer.encode_batch(list(texts))
-        known, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
-        if largest >= known:
-            raise InputError(f"{TOKENS} in {self.folder.path} has the token {largest}, the network {known} in all")
+        vocab_size, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
+        if largest >= vocab_size:
+            raise InputError(
+                f"{TOKENS} in {self.folder.path} has the token {largest}, but the network only has {vocab_size} tokens"
+            )
         inputs = {"input_ids": torch.tensor([text.ids for text in encoded], device=self.mean.device)}
         if self.folder.tokens.masked:
             inputs["attention_mask"] = torch.tensor([x.attention_mask for x in encoded], device=self.mean.device)
-        return self._finite(lambda: _pooled_of(self.model.get_text_features(**inputs)))
+        return self._finite(lambda: _pooled_output(self.model.get_text_features(**inputs)))
 
     def _pooled(self, pixels: Tensor) -> Tensor:
-        return _pooled_of(self.model.get_image_features(**self._seen(pixels)))
+        return _pooled_output(self.model.get_image_features(**self._vision_inputs(pixels)))
 
-    def _seen(self, pixels: Tensor) -> dict[str, Any]:
-        """What the vision transformer is given for images."""
+    def _vision_inputs(self, pixels: Tensor) -> dict[str, Any]:
+        """Return the inputs of the vision transformer."""
         pixels, side = self.normalized(pixels), self.patch
         if self.folder.model_type != "siglip2":
             return {"pixel_values": pixels, "interpolate_pos_encoding": pixels.shape[2:] != self.size}
@@ -110,72 +114,80 @@ class HubNetwork:
         }
 
     def _value_path(self, pixels: Tensor) -> Tensor:
+        """Return patch embeddings by the value path; see the module docstring."""
         vision = self.model.vision_model
         if self._is_clip:
             last = vision.encoder.layers[-1]
-            tokens = last.layer_norm1(self._before(last, pixels)[:, 1:])
+            tokens = last.layer_norm1(self._input_of(last, pixels)[:, 1:])
             mixed = last.self_attn.out_proj(last.self_attn.v_proj(tokens))
             return self.model.visual_projection(vision.post_layernorm(mixed))
         head = vision.head
-        tokens = self._before(head, pixels)
+        tokens = self._input_of(head, pixels)
         weight, bias = (x.chunk(3)[2] for x in (head.attention.in_proj_weight, head.attention.in_proj_bias))
         mixed = head.attention.out_proj(linear(tokens, weight, bias))
         return mixed + head.mlp(head.layernorm(mixed))
 
-    def _before(self, module: Any, pixels: Tensor) -> Tensor:
-        """What a module is given while the network looks at images."""
-        with _listening(module) as heard:
+    def _input_of(self, module: Any, pixels: Tensor) -> Tensor:
+        """Return the input of a module while the network processes images."""
+        with _record_inputs(module) as recorded:
             self._pooled(pixels)
-        return heard[0]
+        return recorded[0]
 
     @torch.no_grad()
     def _finite(self, compute: Callable[[], Tensor]) -> Tensor:
+        """Compute embeddings, in float32 if half precision overflows; raise InputError if they are not finite."""
         rows = compute()
         if rows.dtype == torch.float16 and not bool(rows.isfinite().all()):
             self.model.float()
             rows = compute()
         if not bool(rows.isfinite().all()):
-            raise InputError(f"the network in {self.folder.path} gives vectors that are not finite; download it again")
+            raise InputError(
+                f"the network in {self.folder.path} returns vectors that are not finite; download it again"
+            )
         return rows
 
 
 @contextmanager
-def _listening(module: Any) -> Iterator[list[Tensor]]:
-    """Collects the first argument of every call of a module."""
-    heard: list[Tensor] = []
-    hook = module.register_forward_pre_hook(lambda _, inputs: heard.append(inputs[0]))
+def _record_inputs(module: Any) -> Iterator[list[Tensor]]:
+    """Collect the first argument of every call of a module."""
+    recorded: list[Tensor] = []
+    hook = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0]))
     try:
-        yield heard
+        yield recorded
     finally:
         hook.remove()
 
 
-def _pooled_of(found: Any) -> Tensor:
-    """transformers 4 returns the rows, 5 an output that holds them."""
-    return found if isinstance(found, Tensor) else found.pooler_output
+def _pooled_output(output: Any) -> Tensor:
+    """Return the embeddings: transformers 4 returns them directly, transformers 5 inside an output object."""
+    return output if isinstance(output, Tensor) else output.pooler_output
 
 
 def load_network(folder: Folder, family: Family, device: str) -> HubNetwork:
-    """The network of a folder.
+    """Load the network of a model folder.
 
     Raises:
-        InputError: it is damaged or not what its configuration says, or transformers does not know it.
+        InputError: If the folder is damaged or does not match its configuration, or transformers does not know the
+            network.
     """
-    remedy = f"give --encoder-model another folder, or a name such as {family.default}; or use --encoder open_clip"
+    remedy = f"give another folder with --encoder-model, or a name such as {family.default}; or use --encoder open_clip"
     try:
-        model = _model(folder)
-        tokenizer = _tokenizer(folder, model.config.text_config)
+        model = _build_model(folder)
+        tokenizer = _load_tokenizer(folder, model.config.text_config)
     except MemoryError:
         raise
-    except Exception as error:  # transformers and tokenizers raise types of their own
-        raise InputError(f"{folder.path} is damaged or not of {family.title} ({first_line(error)}); {remedy}") from None
+    except Exception as error:  # transformers and tokenizers define their own exceptions
+        raise InputError(
+            f"{folder.path} is damaged or not a {family.title} network ({first_line(error)}); {remedy}"
+        ) from None
     half = torch.device(device).type == "cuda"
     model = model.to(device, torch.float16 if half else torch.float32).eval().requires_grad_(False)
     mean, std = (torch.tensor(x, device=device)[:, None, None] for x in (folder.pixels.mean, folder.pixels.std))
     return HubNetwork(model, tokenizer, folder, mean, std)
 
 
-def _model(folder: Folder) -> Any:
+def _build_model(folder: Folder) -> Any:
+    """Build the model from the checked sizes and load its weights in float32."""
     transformers = importlib.import_module("transformers")
     name = _CLASSES[folder.model_type]
     config = getattr(transformers, f"{name}Config")(
@@ -183,28 +195,30 @@ def _model(folder: Folder) -> Any:
     )
     vision, pixels = config.vision_config, folder.pixels
     if pixels.side is not None and pixels.side != vision.image_size:
-        raise InputError(f"images are prepared at {pixels.side} pixels, but the network takes {vision.image_size}")
+        raise InputError(
+            f"images are preprocessed to {pixels.side} pixels, but the network expects {vision.image_size}"
+        )
     with torch.device("meta"):
         model = getattr(transformers, f"{name}Model")(config)
     state = {name: value for file in folder.weights for name, value in load_file(file).items()}
     state = {name: value for name, value in state.items() if not name.endswith(".position_ids")}
-    whole = [name for name, value in state.items() if not value.is_floating_point()]
-    if len(whole) > 0:
-        raise InputError(f"the weight {whole[0]} is of type {state[whole[0]].dtype}, expected floats")
+    integers = [name for name, value in state.items() if not value.is_floating_point()]
+    if len(integers) > 0:
+        raise InputError(f"the weight {integers[0]} is of type {state[integers[0]].dtype}, expected floats")
     model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
-    for name, buffer in [*model.named_buffers()]:  # position_ids, which files do not hold
+    for name, buffer in [*model.named_buffers()]:  # position_ids, which weight files do not contain
         owner = model.get_submodule(name.rpartition(".")[0])
         setattr(owner, name.rpartition(".")[2], torch.arange(buffer.shape[-1])[None])
     return model
 
 
-def _tokenizer(folder: Folder, config: Any) -> Any:
-    """The tokenizer, which fills texts up to the length of training and cuts longer ones."""
+def _load_tokenizer(folder: Folder, config: Any) -> Any:
+    """Load the tokenizer; it pads texts to the length used in training, and truncates longer ones."""
     tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / TOKENS))
     length, tokens = cast(int, config.max_position_embeddings), folder.tokens
-    number = tokenizer.token_to_id(tokens.pad)
-    if number is None:
-        raise InputError(f"{TOKENS} does not know the token {tokens.pad!r:.40}, which fills up texts")
+    pad_id = tokenizer.token_to_id(tokens.pad)
+    if pad_id is None:
+        raise InputError(f"{TOKENS} does not contain the padding token {tokens.pad!r:.40}")
     tokenizer.enable_truncation(length)
-    tokenizer.enable_padding(direction=tokens.side, pad_id=number, pad_token=tokens.pad, length=length)
+    tokenizer.enable_padding(direction=tokens.side, pad_id=pad_id, pad_token=tokens.pad, length=length)
     return tokenizer

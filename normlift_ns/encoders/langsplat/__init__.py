@@ -1,1 +1,1 @@
-"""Regions and features in the files of LangSplat's preprocessing."""
+"""Import and export of regions and features in the format of LangSplat's preprocessing."""

@@ -1,1 +1,1 @@
-"""Vectors of texts without torch: colour names, files of vectors, and texts that a network has read before."""
+"""Text embeddings without torch: color names, files of embeddings, and a cache of earlier prompts."""

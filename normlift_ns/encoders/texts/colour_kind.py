@@ -1,4 +1,4 @@
-"""`--encoder colour`: what is known of it before anything is loaded."""
+"""Registration of `--encoder colour`, without torch."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ if TYPE_CHECKING:
     from normlift_ns.encoders.texts.colours import ColourTexts
 
 
-def _make(options: SourceOptions, device: str) -> Encoder:
+def _make_color_encoder(options: SourceOptions, device: str) -> Encoder:
     from normlift_ns.encoders.colour import ColourEncoder  # noqa: PLC0415 (needs torch)
 
-    _texts(options, device, None, {})
+    _make_color_texts(options, device, None, {})
     return ColourEncoder()
 
 
-def _texts(options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]) -> ColourTexts:
+def _make_color_texts(
+    options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
+) -> ColourTexts:
     from normlift_ns.encoders.texts.colours import ColourTexts, refuse_template  # noqa: PLC0415 (needs numpy)
 
     refuse_template(options.text_template)
     return ColourTexts()
 
 
-COLOUR = EncoderKind(_make, rule="cosine", negatives=(), texts=_texts, learned=False)
-"""Mean colours against colour names: a neighbouring shade has a cosine of 0.9, another colour less than 0.5."""
+COLOUR = EncoderKind(_make_color_encoder, rule="cosine", negatives=(), texts=_make_color_texts, learned=False)
+"""Mean colors compared with color names: a neighboring shade has a cosine of 0.9, another color less than 0.5."""

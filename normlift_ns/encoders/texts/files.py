@@ -1,4 +1,4 @@
-"""Vectors of texts from a file, for features whose text encoder is not at hand."""
+"""Text embeddings in a file, for features whose text encoder is not available."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from normlift_ns.errors import InputError, shortened
 if TYPE_CHECKING:
     from torch import Tensor
 
-_LARGEST_VECTOR, _LARGEST_FILE = 2**20, 2**30
-"""Bytes; few bytes of an archive can hold any number of equal ones."""
-_SEAL = b"normlift_ns "
-"""How the comment begins of an archive that we wrote; the digest follows. Those of NumPy have none."""
+_MAX_VECTOR_BYTES, _MAX_FILE_BYTES = 2**20, 2**30
+"""In bytes; a small archive can decompress to any number of equal bytes."""
+_COMMENT_PREFIX = b"normlift_ns "
+"""Prefix of the comment of archives that this package writes; the digest follows. NumPy's archives have no comment."""
 
 
 @dataclass(frozen=True)
 class TextVectors:
-    """Texts are looked up in an NPZ file that holds one vector [D] per text, under the text as its name.
+    """Text embeddings from an NPZ file that holds one vector [D] per text, with the text as the name of the array.
 
     Raises:
-        FileNotFoundError: no such file.
+        FileNotFoundError: If the file does not exist.
     """
 
     file: Path
@@ -45,43 +45,43 @@ class TextVectors:
     def __post_init__(self) -> None:
         if not os.path.isfile(self.file):
             if os.path.lexists(self.file):
-                raise InputError(f"{self.file} is no file of text vectors; give an NPZ file with --text-vectors")
+                raise InputError(f"{self.file} is not a file of text vectors; give an NPZ file with --text-vectors")
             raise FileNotFoundError(
-                f"file of text vectors {self.file} does not exist; say where it is with --text-vectors, an NPZ file "
-                "with one vector per text"
+                f"file of text vectors {self.file} does not exist; give an NPZ file with one vector per text with "
+                "--text-vectors"
             )
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The file counts by its content, wherever it lies."""
+        """A digest of the content of the file, independent of its path."""
         return {"kind": "text_vectors", "content": blake2b(self.file.read_bytes(), digest_size=16).hexdigest()}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The texts that can be asked.
+        """The texts that have an embedding.
 
         Raises:
-            ValueError: a file that is damaged, or holds anything but vectors of one length.
+            ValueError: If the file is damaged, or holds anything but vectors of one length.
         """
         return tuple(self._vectors)
 
     @property
     def dimension(self) -> int | None:
-        """D; None in an empty file. Raises as `names`."""
+        """Length D of the embeddings; None for an empty file. Raises as `names`."""
         return next((len(vector) for vector in self._vectors.values()), None)
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
-        """One unit row per prompt.
+        """Return one unit row per prompt.
 
         Raises:
-            ValueError: no prompt, an empty one, or one that is not in the file; a file as in `names`.
+            ValueError: If `prompts` or a prompt is empty, or one is not in the file; and as `names`.
         """
-        import torch  # noqa: PLC0415 (a question that needs no more is asked without)
+        import torch  # noqa: PLC0415 (queries can do without torch)
 
         return torch.from_numpy(self.rows(prompts))
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """As `text`, without torch."""
+        """Return `text` as a NumPy array, without torch."""
         check_prompts(prompts)
         return look_up(prompts, self._vectors, str(self.file))
 
@@ -90,15 +90,15 @@ class TextVectors:
         try:
             with zipfile.ZipFile(self.file) as archive:
                 arrays, comment = dict(_entries(archive)), archive.comment
-            expected = _seal(arrays)
-            if comment.startswith(_SEAL) and comment != expected:
-                raise InputError(f"its content has {expected.decode()!r}, expected {comment.decode('latin1')!r}")
-        except (  # what zipfile and zlib raise
+            expected = _digest_comment(arrays)
+            if comment.startswith(_COMMENT_PREFIX) and comment != expected:
+                raise InputError(f"its digest is {expected.decode()!r}, expected {comment.decode('latin1')!r}")
+        except (  # exceptions of zipfile and zlib
             OSError, ValueError, LookupError, EOFError, RuntimeError, NotImplementedError, OverflowError,
             zipfile.BadZipFile, zlib.error, struct.error,
         ) as error:  # fmt: skip
             raise InputError(
-                f"file of text vectors {self.file} is damaged or no NPZ file ({error}); write it again with "
+                f"file of text vectors {self.file} is damaged or not an NPZ file ({error}); write it again with "
                 "numpy.savez(file, **{text: vector, ...})"
             ) from None
         lengths = {array.shape for array in arrays.values()}
@@ -114,61 +114,59 @@ class TextVectors:
 
 
 def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
-    """Texts and vectors, unchecked. What an entry says of its size is held against bounds before it is read.
+    """Yield texts and vectors, unchecked. Declared sizes are compared with the limits before data is read.
 
     Raises:
-        ValueError: two entries of one name, entries that are too large or no arrays; and what zipfile raises.
+        ValueError: If two entries have the same name, or an entry is too large or not an array; and as zipfile.
     """
     entries = archive.infolist()
-    if sum(entry.file_size for entry in entries) > _LARGEST_FILE:
-        raise InputError(f"its vectors would take more than {_LARGEST_FILE:,} bytes")
-    seen: set[str] = set()
+    if sum(entry.file_size for entry in entries) > _MAX_FILE_BYTES:
+        raise InputError(f"its vectors would take more than {_MAX_FILE_BYTES:,} bytes")
+    names: set[str] = set()
     for entry in entries:
         name = entry.filename.removesuffix(".npy")
-        if name in seen:
-            raise InputError(f"it has two vectors of {name!r}")
-        seen.add(name)
-        if entry.file_size > _LARGEST_VECTOR:
-            raise InputError(f"the vector of {name!r} takes {entry.file_size:,} bytes, at most {_LARGEST_VECTOR:,}")
+        if name in names:
+            raise InputError(f"it has two vectors for {name!r}")
+        names.add(name)
+        if entry.file_size > _MAX_VECTOR_BYTES:
+            raise InputError(f"the vector of {name!r} has {entry.file_size:,} bytes, more than {_MAX_VECTOR_BYTES:,}")
         try:
             yield name, read_array(archive.read(entry))
         except InputError as error:
-            raise InputError(f"the vector of {name!r} is none: {error}") from None
+            raise InputError(f"the entry {name!r} is not a valid vector: {error}") from None
 
 
 def look_up(prompts: Sequence[str], vectors: Mapping[str, Any], where: str) -> Float32[np.ndarray, "q d"]:
-    """One unit row per prompt.
+    """Return one unit row per prompt.
 
     Args:
-        vectors: arrays, or tensors on the CPU.
-        where: the vectors come from, for the message.
+        vectors: Arrays, or tensors on the CPU.
+        where: Origin of the vectors, for the message.
     Raises:
-        ValueError: a prompt without a vector.
+        ValueError: If a prompt has no vector.
     """
     for prompt in prompts:
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
-            hint = (
-                f"which holds {len(vectors)}; near names: {', '.join(near)}" if len(vectors) > 0 else "which holds none"
-            )
+            hint = f"which holds {len(vectors)}; closest: {', '.join(near)}" if len(vectors) > 0 else "which is empty"
             raise InputError(f"text {shortened(prompt)!r} has no vector in {where}, {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
 def write_text_vectors(file: Path, vectors: Mapping[str, Any]) -> None:
-    """Writes what `TextVectors` reads, as unit vectors in float32, complete or not at all, with a digest.
+    """Write unit vectors in float32 and a digest, atomically, in the format that `TextVectors` reads.
 
     Raises:
-        FileExistsError, OSError: as `new_file`.
+        FileExistsError, OSError: As `new_file`.
     """
     units = {text: unit_rows(vector) for text, vector in vectors.items()}
     with new_file(file) as draft, zipfile.ZipFile(draft, "w") as archive:
-        for text, unit in units.items():  # numpy.savez takes no text that is called "file"
+        for text, unit in units.items():  # numpy.savez does not accept a text named "file"
             with archive.open(f"{text}.npy", "w") as entry:
                 np.lib.format.write_array(entry, unit, allow_pickle=False)
-        archive.comment = _seal(units)
+        archive.comment = _digest_comment(units)
 
 
-def _seal(vectors: Mapping[str, np.ndarray]) -> bytes:
-    """The comment of an archive of ours, with its digest."""
-    return _SEAL + array_digest(vectors, {}).encode()
+def _digest_comment(vectors: Mapping[str, np.ndarray]) -> bytes:
+    """Return the archive comment, with the digest of the vectors."""
+    return _COMMENT_PREFIX + array_digest(vectors, {}).encode()

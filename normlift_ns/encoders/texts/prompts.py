@@ -1,4 +1,4 @@
-"""Checks of texts, and vectors at unit length."""
+"""Validation of prompts, and normalization of vectors."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from jaxtyping import Float32
 from normlift_ns.errors import InputError
 
 UNIT_TOLERANCE = 1e-3
-"""Rows of this length, 1 give or take, are unit vectors: half precision leaves 5e-4."""
+"""Largest deviation from length 1 of a unit vector; half precision leaves 5e-4."""
 
 
 def check_prompts(prompts: Sequence[str]) -> None:
-    """Raises ValueError unless `prompts` is a list of at least one text, none of them empty."""
+    """Raise ValueError unless `prompts` is a list of at least one text, none of them empty."""
     if isinstance(prompts, str):
         raise InputError(f"prompts must be a list of texts, got the single text {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
-        raise InputError('no text given; name at least one thing to look for, such as --text "orange"')
+        raise InputError('no text given; name at least one object to search for, such as --text "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or "\0" in prompt:
-            raise InputError(f"a text must be of type str and without NUL characters, got {prompt!r:.60}")
+            raise InputError(f"a text must be a str without NUL characters, got {prompt!r:.60}")
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
         raise InputError(
-            f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or say what to look "
-            "for in words"
+            f"text {empty[0] + 1} of {len(prompts)} is empty ({prompts[empty[0]]!r}); remove it, or describe what "
+            "to search for"
         )
 
 
 def unit_rows(vectors: Any) -> Float32[np.ndarray, "*n d"]:
-    """Vectors at unit length, however long or short they are; they must be finite and not zero.
+    """Return vectors normalized to unit length, without overflow or underflow; they must be finite and not zero.
 
     >>> unit_rows(np.array([3e-320, 4e-320])), unit_rows(np.array([3e38, 3e38], np.float32))
     (array([0.6, 0.8], dtype=float32), array([0.70710677, 0.70710677], dtype=float32))

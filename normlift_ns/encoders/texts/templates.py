@@ -1,4 +1,4 @@
-"""Sentences that an encoder reads for a text."""
+"""Prompt templates: the sentences that an encoder embeds for a text."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Callable, Sequence
 from normlift_ns.errors import InputError
 
 ENSEMBLE = "ensemble"
-"""Name of open_clip's seven templates."""
+"""Name of the set of open_clip's seven templates."""
 
 
 def check_template(template: str) -> None:
-    """Raises InputError for a template without a place for the text."""
+    """Raise InputError if a template has no placeholder for the text."""
     if template != ENSEMBLE and "{}" not in template:
         raise InputError(
-            f"text template {template!r} has no {{}} where the text belongs; write it like "
-            f'"a photo of a {{}}", or {ENSEMBLE} for the mean of several'
+            f"text template {template!r} has no placeholder {{}} for the text; write it like "
+            f'"a photo of a {{}}", or give {ENSEMBLE} for the mean of several templates'
         )
 
 
 def templates_of(template: str) -> Sequence[Callable[[str], str]]:
-    """What is read for a text; its vector is the mean of theirs.
+    """Return the functions that fill the templates; the embedding of a text is the mean over them.
 
     >>> [make("mug") for make in templates_of("a {}, a big {}")]
     ['a mug, a big mug']
