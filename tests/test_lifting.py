@@ -17,7 +17,17 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns import Camera, GaussianScene, InputError, LiftOptions, RasterSettings, RefineConfig, lifting, observing, rehearsal
+from normlift_ns import (
+    Camera,
+    GaussianScene,
+    InputError,
+    LiftOptions,
+    RasterSettings,
+    RefineConfig,
+    lifting,
+    observing,
+    rehearsal,
+)
 from normlift_ns.core.consensus import consensus
 from normlift_ns.encoders import LangSplat, RegionFeatures
 from normlift_ns.encoders.colour import ColourEncoder

@@ -50,8 +50,8 @@ class Kind:
 
 
 _SAM2_NESTED = (("vision_config.backbone_config", "sam2_hiera_det_model"),)
-_SAM3_CONFIGS = ("vision_config", "text_config", "geometry_encoder_config", "detr_encoder_config", "detr_decoder_config",
-         "mask_decoder_config")  # fmt: skip
+_SAM3_CONFIGS = ("vision_config", "text_config", "geometry_encoder_config", "detr_encoder_config",
+                 "detr_decoder_config", "mask_decoder_config")  # fmt: skip
 _SAM3_NESTED = (("vision_config.backbone_config", "sam3_vit_model"), ("text_config", "clip_text_model"))
 SAM = Kind("SAM", "SamModel", "SamConfig", _SAM_CONFIGS)
 _SAM2 = Kind("SAM 2", "Sam2Model", "Sam2Config", _SAM_CONFIGS, _SAM2_NESTED, since="4.56")
@@ -195,7 +195,7 @@ def _drop_other_entries(value: Any) -> Any:
 
 
 def check_sizes(values: Any, name: str = "config.json", depth: int = 0) -> None:
-    """Raise InputError for implausible sizes: transformers builds any network that a config describes, however large."""
+    """Raise InputError for implausible sizes, because transformers builds a network of any size from its config."""
     if depth > _MAX_DEPTH or (isinstance(values, Mapping | list) and len(values) > _MAX_PARTS):
         raise InputError(f"{name} is nested too deeply, or has more than {_MAX_PARTS} entries")
     if isinstance(values, Mapping):
