@@ -17,7 +17,7 @@ _CHANNELS = 8
 
 @triton.jit
 def _composite(
-    splats, members, offsets, seen, values, image, out_alpha, width, height, channels, cells_across,
+    splats, members, offsets, gaussians, values, image, out_alpha, width, height, channels, cells_across,
     max_alpha, min_alpha, min_transmittance,
     CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr, CHANNELS: tl.constexpr,
 ):  # fmt: skip
@@ -37,7 +37,7 @@ def _composite(
             inside_list = i < stop
             m = tl.load(members + i, mask=inside_list, other=0).to(tl.int64)
             u, v, a, c, b, o = load_splat(splats, m, inside_list)
-            gaussian = tl.load(seen + m)
+            gaussian = tl.load(gaussians + m)
             weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
             value = tl.load(values + gaussian * channels + channel, mask=channel < channels, other=0.0)
             color += weight[:, :, None] * value
@@ -53,7 +53,7 @@ def _composite(
 def composite(
     splats: Float32[Tensor, "m 8"],
     lists: Lists,
-    seen: Int64[Tensor, " m"],
+    gaussians: Int64[Tensor, " m"],
     values: Float32[Tensor, "n c"],
     grid: Grid,
     limits: Limits,
@@ -63,7 +63,7 @@ def composite(
     Args:
         splats: Projected Gaussians; see `SPLAT`.
         lists: Splats by cell.
-        seen: Gaussian of every splat.
+        gaussians: Gaussian of every splat.
         values: Values of every Gaussian.
         grid: Cells of the image.
         limits: Limits of alpha and transmittance.
@@ -75,7 +75,7 @@ def composite(
         return image, alpha
     block = min(_CHANNELS, triton.next_power_of_2(max(1, channels)))
     _composite[(grid.cells, max(1, triton.cdiv(channels, block)))](
-        splats.view(torch.int64), lists.members, lists.offsets, seen, values.contiguous(), image, alpha,
+        splats.view(torch.int64), lists.members, lists.offsets, gaussians, values.contiguous(), image, alpha,
         grid.width, grid.height, channels, grid.across, *limits, CELL_W=grid.cell_width, CELL_H=grid.cell_height,
         UNROLL=UNROLL, CHANNELS=block, num_warps=1,
     )  # fmt: skip

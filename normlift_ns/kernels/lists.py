@@ -68,7 +68,7 @@ class Lists(NamedTuple):
 
 @triton.jit
 def _pairs(
-    splats, order, seen, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
+    splats, order, keys, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
     tiles_across, tiles_down, cells_across, cells_down,
     TILE: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, CULL: tl.constexpr, WRITE: tl.constexpr,
     SPLAT: tl.constexpr, BLOCK: tl.constexpr,
@@ -114,7 +114,7 @@ def _pairs(
     total = tl.zeros([BLOCK], tl.int32)
     if WRITE:
         place, end = tl.load(starts + i, mask=valid, other=0), tl.load(ends + i, mask=valid, other=0)
-        view = (tl.load(seen + e, mask=valid, other=0) % views).to(tl.int32) * (cells_across * cells_down)
+        view = (tl.load(keys + e, mask=valid, other=0) % views).to(tl.int32) * (cells_across * cells_down)
     for k in range(tl.max(y1 - y0, axis=0)):
         y = y0 + k
         top = (y * CELL_H).to(tl.float64) + 0.5 - v
@@ -141,19 +141,19 @@ def _pairs(
         tl.store(out_count + i, total, mask=valid)
 
 
-def list_cells(seen: Splats, views: int, grid: Grid, min_alpha: float, *, cull: bool = True) -> Lists:
+def list_cells(projected: Splats, views: int, grid: Grid, min_alpha: float, *, cull: bool = True) -> Lists:
     """Return the splats of every cell of all views.
 
     Args:
-        seen: Splats of all views.
+        projected: Splats of all views.
         views: Number of views.
         grid: Cells of an image.
         min_alpha: Threshold of alpha.
         cull: Whether to omit a splat from cells in which alpha stays below the threshold. Other entries of the lists
             do not depend on it.
     """
-    device, entries, tile = seen.depth.device, len(seen.depth), grid.tile
-    order = seen.depth.sort(stable=True).indices  # equal depths stay in the order of the Gaussians
+    device, entries, tile = projected.depth.device, len(projected.depth), grid.tile
+    order = projected.depth.sort(stable=True).indices  # equal depths stay in the order of the Gaussians
     count = torch.empty(entries, dtype=torch.int32, device=device)
     launch = (triton.cdiv(entries, _BLOCK),)
     sizes = (entries, views, grid.width, grid.height, min_alpha, -(-grid.width // tile), -(-grid.height // tile))
@@ -163,7 +163,8 @@ def list_cells(seen: Splats, views: int, grid: Grid, min_alpha: float, *, cull: 
     unused = count
     if entries > 0:
         _pairs[launch](
-            seen.splats, order, seen.seen, unused, unused, count, unused, unused, *sizes, WRITE=False, **options
+            projected.splats, order, projected.seen, unused, unused, count, unused, unused, *sizes,
+            WRITE=False, **options,
         )  # fmt: skip
     ends = count.cumsum(0)
     pairs = int(ends[-1]) if entries > 0 else 0
@@ -175,7 +176,7 @@ def list_cells(seen: Splats, views: int, grid: Grid, min_alpha: float, *, cull: 
     if pairs > 0:
         starts = ends - count
         _pairs[launch](
-            seen.splats, order, seen.seen, starts, ends, count, cell, member, *sizes, WRITE=True, **options
+            projected.splats, order, projected.seen, starts, ends, count, cell, member, *sizes, WRITE=True, **options
         )  # fmt: skip
     cell, by_cell = cell.sort(stable=True)
     bounds = torch.arange(end + 1, dtype=dtype, device=device)

@@ -175,7 +175,7 @@ def _splat(
 
 
 @triton.jit
-def _find_seen(
+def _find_visible(
     means, quats, scales, opacities, drawable, cameras, out, gaussians, views, width, height,
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, BLOCK: tl.constexpr,
@@ -199,14 +199,14 @@ def _find_seen(
 
 
 @triton.jit
-def _project_seen(
-    means, quats, scales, opacities, cameras, seen, out_splat, out_depth, count, views, width, height,
+def _project_visible(
+    means, quats, scales, opacities, cameras, keys, out_splat, out_depth, count, views, width, height,
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, SPLAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = e < count
-    key = tl.load(seen + e, mask=valid, other=0)
+    key = tl.load(keys + e, mask=valid, other=0)
     i = key // views
     # Every lane has its own camera.
     camera = cameras + (key - i * views) * CAMERA
@@ -267,15 +267,15 @@ def project(
     options = {"ANTIALIASED": antialiased, "PER_AXIS": per_axis, "CAMERA": CAMERA, "BLOCK": _BLOCK, "num_warps": 4}
     options["enable_fp_fusion"] = False
     if n > 0:
-        _find_seen[(triton.cdiv(n, _BLOCK),)](
+        _find_visible[(triton.cdiv(n, _BLOCK),)](
             *scene, drawable.view(torch.int8), cameras, flags.view(torch.int8), n, views, width, height, *rules,
             **options,
         )  # fmt: skip
-    seen = flags.nonzero().squeeze(1)
-    splats = torch.empty(len(seen), SPLAT, device=device)
-    depth = torch.empty(len(seen), device=device)
-    if len(seen) > 0:
-        _project_seen[(triton.cdiv(len(seen), _BLOCK),)](
-            *scene, cameras, seen, splats, depth, len(seen), views, width, height, *rules, SPLAT=SPLAT, **options
+    keys = flags.nonzero().squeeze(1)
+    splats = torch.empty(len(keys), SPLAT, device=device)
+    depth = torch.empty(len(keys), device=device)
+    if len(keys) > 0:
+        _project_visible[(triton.cdiv(len(keys), _BLOCK),)](
+            *scene, cameras, keys, splats, depth, len(keys), views, width, height, *rules, SPLAT=SPLAT, **options
         )
-    return Splats(seen, splats, depth)
+    return Splats(keys, splats, depth)

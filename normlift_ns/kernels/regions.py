@@ -241,12 +241,12 @@ def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, in
 
 
 @triton.jit
-def _places(key, seen, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
+def _places(key, splat_keys, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count
     k = tl.load(key + i, mask=valid, other=0)
     splat = k // columns
-    gaussian_view = tl.load(seen + splat, mask=valid, other=0)
+    gaussian_view = tl.load(splat_keys + splat, mask=valid, other=0)
     gaussian = gaussian_view // views
     column = tl.load(first + (gaussian_view - gaussian * views), mask=valid, other=0) + (k - splat * columns).to(
         tl.int32
@@ -256,19 +256,19 @@ def _places(key, seen, first, out_gaussian, out_column, count, columns, views, B
 
 
 def places(
-    key: Int[Tensor, " m"], seen: Int64[Tensor, " splats"], first: Int32[Tensor, " views_plus_1"], columns: int
+    key: Int[Tensor, " m"], splat_keys: Int64[Tensor, " splats"], first: Int32[Tensor, " views_plus_1"], columns: int
 ) -> tuple[Int32[Tensor, " m"], Int32[Tensor, " m"]]:
     """Return the Gaussian and the column of every sum.
 
     Args:
         key: Keys as in `RegionSums`.
-        seen: Keys gaussian * views + view of every splat.
+        splat_keys: Keys gaussian * views + view of every splat.
         first: First column of every view.
         columns: Columns per row in `key`.
     """
     gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))
     if len(key) > 0:
         _places[(triton.cdiv(len(key), _PLACES),)](
-            key, seen, first, gaussian, column, len(key), columns, len(first) - 1, BLOCK=_PLACES, num_warps=4
+            key, splat_keys, first, gaussian, column, len(key), columns, len(first) - 1, BLOCK=_PLACES, num_warps=4
         )
     return gaussian, column

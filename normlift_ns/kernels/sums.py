@@ -100,7 +100,7 @@ def _store_norms(
 @triton.jit
 def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
-    dimension, cancelled, many, BLOCK: tl.constexpr,
+    dimension, min_share, max_entries, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Compute one row per program. If float32 has lost digits to cancellation or rounding, sum again in float64."""
     j = tl.program_id(0)
@@ -133,7 +133,7 @@ def _row_norms(
                 norm = view_weight  # of a single unit row
                 if e - first > 1:
                     norm = tl.sqrt(tl.sum(view_total * view_total, axis=0)).to(tl.float64)
-                    if (norm < cancelled * view_weight) | (e - first > many):
+                    if (norm < min_share * view_weight) | (e - first > max_entries):
                         exact = _exact_sum(column, weight, table, first, e, dimension, BLOCK)
                         norm = tl.sqrt(tl.sum(exact * exact, axis=0))
                 by_view += norm
@@ -148,7 +148,7 @@ def _row_norms(
             view_weight += w.to(tl.float64)
             view = entry_view
         norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
-        if (norm < cancelled * all_weight) | (stop - start > many):
+        if (norm < min_share * all_weight) | (stop - start > max_entries):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
             norm = tl.sqrt(tl.sum(exact * exact, axis=0))
         _store_norms(
@@ -162,8 +162,8 @@ def row_norms(
     weight: Float32[Tensor, " nnz"],
     column_view: Int32[Tensor, " s"],
     table: Float32[Tensor, "s d"],
-    cancelled: float,
-    many: int,
+    min_share: float,
+    max_entries: int,
 ) -> RowNorms:
     """Return the norms that the lift needs, in one pass over E and without an [N, D] array.
 
@@ -173,8 +173,8 @@ def row_norms(
         weight: Weights of the entries.
         column_view: View of every column.
         table: Unit rows F.
-        cancelled: A sum is repeated in float64 if its norm is below this share of its weight.
-        many: A sum is repeated in float64 if it has more entries than this.
+        min_share: A sum is repeated in float64 if its norm is below this share of its weight.
+        max_entries: A sum is repeated in float64 if it has more entries than this.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
     out = RowNorms(
@@ -182,27 +182,29 @@ def row_norms(
         torch.empty(n, dtype=torch.int32, device=device),
     )
     _row_norms[(n,)](
-        offsets, column, weight, column_view, table, *out, dimension, cancelled, many,
+        offsets, column, weight, column_view, table, *out, dimension, min_share, max_entries,
         BLOCK=triton.next_power_of_2(dimension), num_warps=1,
     )  # fmt: skip
     return out
 
 
 @triton.jit
-def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, cancelled, many, BLOCK: tl.constexpr):
+def _unit_sums(
+    rows, offsets, column, weight, table, norms, out, dimension, min_share, max_entries, BLOCK: tl.constexpr
+):
     j = tl.load(rows + tl.program_id(0))
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     d = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float32)
     all_weight = tl.zeros([], tl.float32)
-    if tl.load(known + j) > 0:
+    if tl.load(norms + j) > 0:
         for e in range(start, stop):
             w = tl.load(weight + e)
             row = tl.load(column + e).to(tl.int64) * dimension + d
             total += w * tl.load(table + row, mask=d < dimension, other=0.0)
             all_weight += w
         norm = tl.sqrt(tl.sum(total * total, axis=0))
-        if (norm < cancelled * all_weight) | (stop - start > many):
+        if (norm < min_share * all_weight) | (stop - start > max_entries):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
             total = (exact / tl.sqrt(tl.sum(exact * exact, axis=0))).to(tl.float32)
         else:
@@ -216,17 +218,29 @@ def unit_sums(
     column: Int32[Tensor, " nnz"],
     weight: Float32[Tensor, " nnz"],
     table: Float32[Tensor, "s d"],
-    known: Float32[Tensor, " n"],
+    norms: Float32[Tensor, " n"],
     dtype: torch.dtype,
-    cancelled: float,
-    many: int,
+    min_share: float,
+    max_entries: int,
 ) -> Float[Tensor, "m d"]:
-    """Return sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 if `known` is 0."""
+    """Return sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 if the norm is 0.
+
+    Args:
+        rows: Rows j.
+        offsets: Row offsets of E.
+        column: Columns of the entries.
+        weight: Weights of the entries.
+        table: Unit rows F.
+        norms: Norm of every row of E.
+        dtype: Precision of the result.
+        min_share: As in `row_norms`.
+        max_entries: As in `row_norms`.
+    """
     dimension = table.shape[1]
     out = torch.empty(len(rows), dimension, dtype=dtype, device=table.device)
     if len(rows) > 0:
         _unit_sums[(len(rows),)](
-            rows, offsets, column, weight, table, known, out, dimension, cancelled, many,
+            rows, offsets, column, weight, table, norms, out, dimension, min_share, max_entries,
             BLOCK=triton.next_power_of_2(dimension), num_warps=1,
         )  # fmt: skip
     return out

@@ -23,8 +23,8 @@ def _gelu(x):
 
 @triton.jit
 def _upscale(
-    keys, first, first_bias, scale, shift, second, second_bias, wanted, masks, positions, side, channels, middle, last,
-    eps, MASKS: tl.constexpr, BLOCK: tl.constexpr, C: tl.constexpr, M: tl.constexpr, L: tl.constexpr,
+    keys, first, first_bias, scale, shift, second, second_bias, mask_channels, masks, positions, side, channels, middle,
+    last, eps, MASKS: tl.constexpr, BLOCK: tl.constexpr, C: tl.constexpr, M: tl.constexpr, L: tl.constexpr,
 ):  # fmt: skip
     """Write masks[prompt, mask, 4 y + row, 4 x + column] of some positions (y, x), with row and column in 0..3."""
     prompt = tl.program_id(1).to(tl.int64)
@@ -53,7 +53,7 @@ def _upscale(
             row, column = 2 * (i // 2) + j // 2, 2 * (i % 2) + j % 2
             for mask in tl.static_range(MASKS):
                 plane = prompt * MASKS + mask
-                channels_of_mask = tl.load(wanted + plane * last + o, mask=valid_o, other=0.0).to(tl.float32)
+                channels_of_mask = tl.load(mask_channels + plane * last + o, mask=valid_o, other=0.0).to(tl.float32)
                 logit = tl.sum(upscaled_o * channels_of_mask[None, :], axis=1)
                 out = masks + plane * (16 * positions) + corner + row * (4 * side) + column
                 tl.store(out, logit.to(masks.dtype.element_ty), mask=valid)
@@ -64,7 +64,7 @@ def upscaled_masks(
     weights: tuple[Float[Tensor, "four_m c"], Float[Tensor, "four_o m"]],
     biases: tuple[Float[Tensor, " m"], Float[Tensor, " o"]],
     norm: tuple[Float[Tensor, " m"], Float[Tensor, " m"], float],
-    wanted: Float[Tensor, "p k o"],
+    mask_channels: Float[Tensor, "p k o"],
     side: int,
 ) -> Float[Tensor, "p k y x"]:
     """Return the logits of masks, 4 x 4 for every position of an image with `side` columns.
@@ -74,15 +74,15 @@ def upscaled_masks(
         weights: Weights of both convolutions; a position becomes four, row by row.
         biases: Biases of both convolutions.
         norm: Weight, bias and epsilon of the layer norm after the first convolution.
-        wanted: Channels of the masks.
+        mask_channels: Channels of the masks.
         side: Columns of the image.
     """
     (prompts, positions, channels), middle, last = keys.shape, len(biases[0]), len(biases[1])
-    masks = keys.new_empty(prompts, wanted.shape[1], 4 * (positions // side), 4 * side)
+    masks = keys.new_empty(prompts, mask_channels.shape[1], 4 * (positions // side), 4 * side)
     padded = [max(16, triton.next_power_of_2(size)) for size in (channels, middle, last)]  # sizes for tensor cores
     _upscale[(triton.cdiv(positions, _BLOCK), prompts)](
-        keys.contiguous(), weights[0], biases[0], norm[0], norm[1], weights[1], biases[1], wanted.contiguous(), masks,
-        positions, side, channels, middle, last, norm[2],
-        MASKS=wanted.shape[1], BLOCK=_BLOCK, C=padded[0], M=padded[1], L=padded[2], num_warps=_WARPS,
+        keys.contiguous(), weights[0], biases[0], norm[0], norm[1], weights[1], biases[1], mask_channels.contiguous(),
+        masks, positions, side, channels, middle, last, norm[2],
+        MASKS=mask_channels.shape[1], BLOCK=_BLOCK, C=padded[0], M=padded[1], L=padded[2], num_warps=_WARPS,
     )  # fmt: skip
     return masks

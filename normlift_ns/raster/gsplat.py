@@ -156,20 +156,20 @@ def installed_version() -> str:
         raise InputError("gsplat is not installed; install it with: pip install gsplat") from error
 
 
-def rules_named(wanted: str, recorded: str | None) -> str:
+def rules_named(rules: str, recorded: str | None) -> str:
     """Return the version of gsplat whose rules apply to a scene.
 
     Args:
-        wanted: One of `GsplatRules`.
+        rules: One of `GsplatRules`.
         recorded: Version that trained the scene; None: unknown, which means 1.4, the version of nerfstudio 1.1.5.
 
     Raises:
-        ValueError: If `wanted` is "installed" and gsplat is not installed.
+        ValueError: If `rules` is "installed" and gsplat is not installed.
     """
-    if wanted == "auto":
+    if rules == "auto":
         return recorded or KNOWN_RULES[0]
-    if wanted != "installed":
-        return wanted
+    if rules != "installed":
+        return rules
     return ".".join(installed_version().split(".")[:2])
 
 

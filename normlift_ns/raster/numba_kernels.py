@@ -1,7 +1,7 @@
 """Compiled compositing of the CPU rasterizer, tile by tile, and its sums by (Gaussian, region).
 
 The rows of a tile are processed LANES pixels at a time and without branches, which the compiler turns into vector
-instructions. Every thread writes to its own memory. So there are no locks, and the sums are the same on every run and
+instructions. Every thread writes to its own memory. So locks are not needed, and the sums are the same on every run and
 with any number of threads.
 """
 

@@ -84,20 +84,20 @@ def import_transformers() -> Any:
         ) from None
 
 
-def kind_of(folder: Path, known: Mapping[str, Kind]) -> Kind:
+def kind_of(folder: Path, kinds: Mapping[str, Kind]) -> Kind:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If it is not one of the known networks, or if the installed torch or transformers cannot run it.
-        OSError: If there is no config.json.
+        ValueError: If it is not one of `kinds`, or if the installed torch or transformers cannot run it.
+        OSError: If config.json is missing.
     """
     model_type = _config(folder).get("model_type")
-    kind = known.get(model_type) if isinstance(model_type, str) else None
+    kind = kinds.get(model_type) if isinstance(model_type, str) else None
     if kind is None:
-        other = (TEXT_KINDS if known is MASK_KINDS else MASK_KINDS).get(str(model_type))
-        hint = "" if other is None else f" ({other.name} takes {'text prompts' if known is MASK_KINDS else 'points'}: "
-        hint += "" if other is None else f"--regions {'sam3' if known is MASK_KINDS else 'sam'})"
-        expected = ", ".join(f"{name!r}" for name in known)
+        other = (TEXT_KINDS if kinds is MASK_KINDS else MASK_KINDS).get(str(model_type))
+        hint = "" if other is None else f" ({other.name} takes {'text prompts' if kinds is MASK_KINDS else 'points'}: "
+        hint += "" if other is None else f"--regions {'sam3' if kinds is MASK_KINDS else 'sam'})"
+        expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
     _check_supported(kind)
     return kind

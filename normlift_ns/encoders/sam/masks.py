@@ -12,7 +12,7 @@ own:
 4. Small holes are filled and small pieces dropped, then boxes are suppressed again (unchanged masks first).
 5. LangSplat's suppression compares masks, scored by stability times predicted IoU; see `mask_nms`.
 
-The masks that remain keep the order of steps 3 and 4. Where masks overlap, the later one counts.
+The masks that remain keep the order of steps 3 and 4. If masks overlap, the later one counts.
 """
 
 from __future__ import annotations

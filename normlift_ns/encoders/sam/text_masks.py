@@ -142,10 +142,10 @@ def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto"
 class Sam3Masks:
     """Regions that SAM 3 finds for text prompts; every instance is a region. The weights are loaded at the first use.
 
-    Where instances overlap, the one with the higher score counts. Pixels without an instance are unlabeled.
+    If instances overlap, the one with the higher score counts. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: If there is no prompt, a prompt is empty or given twice, transformers is not installed, or the
+        ValueError: If no prompt is given, a prompt is empty or given twice, transformers is not installed, or the
             checkpoint is of another network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """

@@ -158,7 +158,7 @@ def folder_of(path: Path) -> Path | None:
 
 
 @contextmanager
-def told_of(path: Path, what: str = "SAM") -> Iterator[None]:
+def told_of(path: Path, title: str = "SAM") -> Iterator[None]:
     """Turn errors of other libraries into an InputError that names the checkpoint."""
     try:
         yield
@@ -167,7 +167,7 @@ def told_of(path: Path, what: str = "SAM") -> Iterator[None]:
     except Exception as error:  # the configs of transformers raise their own exception types for invalid values
         reason = str(error) if isinstance(error, InputError) else first_line(error)
         raise InputError(
-            f"{what} checkpoint {path} is damaged or not a checkpoint of {what} ({reason}); {_REMEDIES[what]}"
+            f"{title} checkpoint {path} is damaged or not a checkpoint of {title} ({reason}); {_REMEDIES[title]}"
         ) from None
 
 
