@@ -24,7 +24,7 @@ _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
 _P3, _P4, _P5, _ONE = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1), _F(1)
 
 
-def _cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return `numba.njit` with a cache on disk, if a cache folder is writable."""
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -36,10 +36,10 @@ def _cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-kernel = _cached_njit()
-fused_kernel = _cached_njit(fastmath={"contract"})
+kernel = cached_njit()
+fused_kernel = cached_njit(fastmath={"contract"})
 """Decorator that allows fused multiply-add, which rounds once, as on a GPU."""
-parallel_kernel = _cached_njit(parallel=True)
+parallel_kernel = cached_njit(parallel=True)
 
 
 def exp(x: float) -> float:
