@@ -1,8 +1,8 @@
 """Exact lists of the splats that touch each cell of an image, nearest first, built by two stable sorts.
 
-A cell is one of gsplat's tiles or a part of one. A splat is in the list of a cell under two conditions: its rectangle
-touches the tile, as gsplat decides, and alpha can reach its threshold in a pixel of the cell. The second condition is
-computed in float64 with a margin for all float32 rounding of alpha. So the sums equal those with gsplat's own lists.
+A cell is one of gsplat's tiles or a part of one. A splat is in the list of a cell if its rectangle touches the tile, as
+in gsplat, and alpha can reach its threshold in a pixel of the cell. The second condition is computed in float64 with a
+margin for all float32 rounding of alpha. So the sums equal those with gsplat's own lists.
 """
 
 from __future__ import annotations

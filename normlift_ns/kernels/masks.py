@@ -97,8 +97,8 @@ def measure_masks(
         offset: Distance of the thresholds from 0.
 
     Returns:
-        The number of pixels above the offset, the number above minus the offset, and the box (x0, y0, x1, y1) of the
-        pixels above 0. x1 and y1 are inclusive, and an empty box is zeros.
+        The number of pixels above the offset, the number above minus the offset, and the box of the pixels above 0.
+        Boxes are (x0, y0, x1, y1), with x1 and y1 inclusive, or zeros for an empty mask.
     """
     count, height, width = len(logits), len(row_first), len(column_first)
     num_parts, block = triton.cdiv(height, _ROWS), triton.next_power_of_2(width)

@@ -1,7 +1,7 @@
 """Exact nearest neighbors on the GPU: a balanced k-d tree, one warp per leaf of 32 points.
 
-All points of a leaf search together. They walk through the tree from their own leaf outward and skip every subtree
-whose box is farther than the worst candidate of each of them. Candidates, a few more than requested, are kept by
+All points of a leaf search together. They walk through the tree from their own leaf outward. A subtree is skipped if
+its box is farther than the worst candidate of every point. Candidates, a few more than requested, are kept by
 float32 distance, and finally ranked by float64 distance and index. The result is certified: if a dropped point could
 be as near as the last kept one, the query is reported as uncertain.
 """

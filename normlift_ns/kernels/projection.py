@@ -1,8 +1,8 @@
 """gsplat's projection of Gaussians into cameras, one thread per Gaussian.
 
 The arithmetic is that of gsplat 1.4.0's fully_fused_projection_fwd.cu as nvcc 13.0 compiles it for sm_90 with gsplat's
-flags (-O3 --use_fast_math). The code below spells out which products of a sum are rounded and which are fused, as read
-from that machine code; the compiler may not fuse anything else. Divisions, square roots and reciprocals are the
+flags (-O3 --use_fast_math). The code spells out which products of a sum are rounded and which are fused, as read from
+that machine code. The compiler may not fuse anything else. Divisions, square roots and reciprocals are the
 approximate ones of both compilers. So every number is the same bit for bit, except numbers below 2 ** -126.
 """
 
@@ -21,8 +21,8 @@ CAMERA = 16
 SPLAT = 8
 """Values per splat, read as four pairs.
 
-They are the center u, v in pixels, half of xx and half of yy of the inverse covariance, its xy, the opacity, and half
-width and half height of the rectangle.
+These are the center u, v in pixels; half of xx, half of yy, and xy of the inverse covariance; the opacity; half width
+and half height of the rectangle.
 """
 _BLOCK = 128
 _ENORMOUS = tl.constexpr(2.0**60)

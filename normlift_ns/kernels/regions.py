@@ -19,7 +19,7 @@ from torch import Tensor
 from normlift_ns.kernels.lists import Grid, Lists
 
 UNROLL = 4
-"""Splats between two checks whether a cell is finished."""
+"""Number of splats between checks whether a cell is finished."""
 _MOST_SLOTS = 2**26
 """Largest number of slots in a chunk, of 8 or 12 bytes each."""
 _COPIED = 128

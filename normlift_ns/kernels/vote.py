@@ -189,8 +189,8 @@ def vote(
         gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.
         delta: Lead that a neighbor needs over the Gaussian itself.
-        own: Evidence of each Gaussian itself in a posterior vote against `prior` views; None: the paper's vote.
-        prior: Views that the neighbors count as in a posterior vote.
+        own: Views that agree on each Gaussian's own direction, for a posterior vote (None: the paper's vote).
+        prior: Weight of the neighbors in a posterior vote, in views.
         precision: Precision of the products of float32 directions. "halves": two halves of 11 bits each. "certified":
             the same winners, computed from the first halves if these decide. "first": only writes winners that the
             first halves decide. "tf32", "tf32x3", "ieee": rounded to 11 bits, in three such parts, or not rounded.

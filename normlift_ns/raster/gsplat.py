@@ -29,7 +29,7 @@ _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
 """Constants in gsplat's compiled code."""
 _EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
-"""More such constants; but later versions of gsplat also accept squares, which gsplat computes up to 1.4."""
+"""More such constants. They may differ if the scene uses squares, as up to gsplat 1.4: later versions accept these."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
@@ -220,7 +220,7 @@ def composite(
 def _gradients(job: Job, camera: Camera, labels: Tensor, count: int) -> Iterator[tuple[int, Float32[Tensor, "n c"]]]:
     """Yield (first column, sums of A_ij by column) for 32 columns at a time; column 0 holds the unlabeled pixels.
 
-    The compiled functions are called like in gsplat's own autograd function (cuda/_wrapper.py). Its backward pass
+    The compiled functions are called as in gsplat's own autograd function (cuda/_wrapper.py). Its backward pass
     starts from 1 - alpha, which has lost up to 3e-4 of a transmittance near 1e-4. All weights of a pixel are multiples
     of it. So the ratio of the true transmittance to it corrects the weights; a black scene on a white background
     renders the true transmittance.

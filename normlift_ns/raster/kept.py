@@ -1,6 +1,6 @@
 """Cache of the evidence of rasterized views. A file holds several views, and each view is looked up on its own.
 
-A file is named after the keys of its views, and its header lists them. So a view is found whatever its neighbors are:
+A file is named after the keys of its views, and its header lists them. So a view is found whichever views surround it:
 if images are added between old ones, only the new images are rasterized.
 """
 

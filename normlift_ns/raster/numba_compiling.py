@@ -17,7 +17,7 @@ from numba.extending import overload
 
 _F = np.float32
 _MAGIC32, _MAGIC64 = _F(1.5 * 2**23), 1.5 * 2**52
-"""Adding a number near 0 rounds it to an integer, which is then in the last bits of the sum."""
+"""Adding a number near 0 rounds it to an integer, which then occupies the last bits of the sum."""
 _LOG2_E32, _LN2_HIGH32, _LN2_LOW32, _LEAST32 = _F(1.44269504088896341), _F(0.693359375), _F(-2.12194440e-4), _F(-87)
 _LOG2_E64, _LN2_HIGH64, _LN2_LOW64 = 1.44269504088896341, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)

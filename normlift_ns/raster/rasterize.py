@@ -55,7 +55,7 @@ def rasterize_evidence(
         backend: "torch" (reference; any device and precision), "numba" (compiled; CPU), "triton" (fast; GPU, float32),
             "gsplat" (stock gsplat; GPU, float32, weight_power 1, rules of the installed version or older) or "auto"
             (the fastest for the device of the scene and the precision).
-        rasterize_mode: splatfacto's `rasterize_mode` that trained the scene.
+        rasterize_mode: `rasterize_mode` of splatfacto in the training of the scene.
         weight_power: Exponent of the summed A_ij. 1: the paper. 2: the code of SFS. 0: number of pixels that a Gaussian
             contributes to.
         settings: Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`.
@@ -64,9 +64,9 @@ def rasterize_evidence(
         progress: Function called after every view with (views done, number of views or None).
 
     Raises:
-        ValueError: If an option is unknown, labels do not have the size of their camera or are not integers, an id is
-            below -2 or not below its `num_regions`, or the iterables have different lengths. The message names the
-            view.
+        ValueError: If an option is unknown, labels are not integers or differ from their camera in size, or an id is
+            below -2 or not below its `num_regions`. Also if the iterables have different lengths. The message names
+            the view.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence

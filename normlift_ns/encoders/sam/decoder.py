@@ -5,7 +5,7 @@ thousands per point, are in the precision of the decoder.
 
 * Until a layer has attended to the tokens, all points share the image, so its embedding is not copied per point.
 * Attention between tokens and image does not project the image. q . (W_k x) is (W_k^T q) . x, and the mean of W_v x is
-  W_v times the mean of x, so the matrices of a head move to the token side. Two products with 56 columns, one per token
+  W_v times the mean of x. So the matrices of a head move to the token side. Two products with 56 columns, one per token
   and head, remain for each position. The bias of the keys is the same for all positions and cancels.
 * Transposed convolutions of 2 x 2 with stride 2 are matrix products. Pixels are reordered once, at the end, when they
   consist of three logits each.
@@ -32,7 +32,8 @@ class MaskDecoder:
     """Mask decoder of a SAM model, on the device of the model."""
 
     def __init__(self, model: Any, dtype: torch.dtype) -> None:
-        """
+        """Prepare the decoder of a model.
+
         Args:
             model: SamModel of transformers.
             dtype: Precision of the image in the decoder and of the logits.

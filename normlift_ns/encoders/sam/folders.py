@@ -1,4 +1,4 @@
-"""Model folders in the format of transformers: detection of the network, and its model.
+"""Detection and loading of networks from model folders in the format of transformers.
 
 Only the sizes of the parts are read from config.json, so it cannot name code, kernels or other weights.
 """

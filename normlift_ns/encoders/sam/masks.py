@@ -122,7 +122,7 @@ class SamMasks:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Identify the regions by the content of the checkpoint files, not by their path."""
+        """Description of the regions, with the content of the checkpoint files instead of their path."""
         precision = resolve_precision(self.precision, self.device)
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
@@ -251,7 +251,7 @@ def crop_boxes(height: int, width: int, overlap: float) -> list[CropBox]:
 
 
 def near_crop_edge(boxes: Int64[Tensor, "n 4"], crop: CropBox, size: tuple[int, int], edge: int) -> Bool[Tensor, " n"]:
-    """Return a mask of the boxes with a side within `edge` pixels of the crop's, but not of the image's.
+    """Return a mask of the boxes with a side within `edge` pixels of that side of the crop, but not of the image.
 
     Args:
         boxes: Boxes in the image, as `boxes_of` returns them.

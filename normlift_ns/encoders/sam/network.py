@@ -36,9 +36,12 @@ class PromptedNetwork(ABC):
     """Network that turns each point on an image into three masks, on one device and in one precision."""
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
-        """
+        """Move a model to a device.
+
         Args:
             model: Model of transformers, in float32.
+            device: Device of the network.
+            precision: Precision of the network.
         """
         self._model = model.to(device)
         self._device = torch.device(device)

@@ -80,8 +80,8 @@ def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
     """Check a checkpoint by name, without loading or downloading anything.
 
     Raises:
-        ValueError: If transformers is not installed, the checkpoint is neither a path nor a name of the form
-            OWNER/NAME, or its folder is of another network or of one that the installed torch cannot run.
+        ValueError: If transformers is not installed, or the checkpoint is neither a path nor a name of the form
+            OWNER/NAME. Also if its folder is of another network, or the installed torch cannot run it.
         FileNotFoundError: If the checkpoint looks like a path but does not exist.
     """
     import_transformers()
