@@ -159,7 +159,7 @@ STEPS = {
     "decode": (SamNetwork, "decode"),
     "measure": (SamNetwork, "measure"),
     "distinct": (sam_module, "_distinct"),
-    "whole": (SamMasks, "_whole"),
+    "whole": (SamMasks, "_image_masks"),
     "clean": (sam_module, "clean_masks"),
     "nms": (sam_module, "mask_nms"),
     "stack": (sam_module, "stack_masks"),

@@ -1,4 +1,4 @@
-"""Products of a sparse matrix with its transpose, a block of dense rows at a time, and row maxima."""
+"""Products of two sparse matrices, in blocks of dense rows, and row maxima."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 _ROWS = 128
 _WIDTH = 64
-"""Entries of a row that are added at a time."""
+"""Entries of a row that are added in one step."""
 
 
 class Rows(Protocol):
-    """`core.sparse.SparseRows`."""
+    """Interface of `core.sparse.SparseRows`."""
 
     @property
     def offsets(self) -> Tensor: ...  # noqa: D102
@@ -43,7 +43,7 @@ def _row_max(offsets, column, value, out, rows, ROWS: tl.constexpr):
 def row_max(
     offsets: Int64[Tensor, " n_plus_1"], column: Int32[Tensor, " nnz"], value: Float64[Tensor, " s"]
 ) -> Float64[Tensor, " n"]:
-    """max of value[column] over every row, of values >= 0; 0 for an empty row."""
+    """Return the maximum of value[column] over every row, for values >= 0; 0 for an empty row."""
     out = torch.empty(len(offsets) - 1, dtype=torch.float64, device=value.device)
     _row_max[(triton.cdiv(len(out), _ROWS),)](offsets, column, value, out, len(out), ROWS=_ROWS, num_warps=4)
     return out
@@ -51,11 +51,12 @@ def row_max(
 
 @triton.jit
 def _products(a_offsets, a_column, a_weight, b_offsets, b_column, b_weight, out, first, columns, WIDTH: tl.constexpr):
-    """One row of A B per program, which owns that row of the result: rows of B are added one after the other, always in
-    the same order. Columns within a row of B are distinct.
+    """Compute one row of A B per program. Rows of B are added one after another, always in the same order.
+
+    Columns within a row of B are distinct.
     """
     block = tl.program_id(0).to(tl.int64)
-    mine = out + block * columns
+    row_start = out + block * columns
     for e in range(tl.load(a_offsets + first + block), tl.load(a_offsets + first + block + 1)):
         j = tl.load(a_column + e)
         factor = tl.load(a_weight + e)
@@ -63,15 +64,15 @@ def _products(a_offsets, a_column, a_weight, b_offsets, b_column, b_weight, out,
         for i in range(start, stop, WIDTH):
             entry = i + tl.arange(0, WIDTH)
             inside = entry < stop
-            place = mine + tl.load(b_column + entry, mask=inside, other=0)
+            pointer = row_start + tl.load(b_column + entry, mask=inside, other=0)
             value = tl.load(b_weight + entry, mask=inside, other=0.0)
-            before = tl.load(place, mask=inside, other=0.0)
-            tl.store(place, before + factor * value, mask=inside)
+            before = tl.load(pointer, mask=inside, other=0.0)
+            tl.store(pointer, before + factor * value, mask=inside)
         tl.debug_barrier()  # the next row of B may hold the same columns
 
 
 def products(a: Rows, b: Rows, columns: int, first: int, last: int) -> Float32[Tensor, "rows columns"]:
-    """Rows first..last - 1 of the product A B, dense, in float32; the same bits on every run."""
+    """Return rows first..last - 1 of the product A B, dense, in float32; bitwise the same on every run."""
     out = torch.zeros(last - first, columns, device=a.weight.device)
     arrays = (a.offsets, a.column, a.weight.float(), b.offsets, b.column, b.weight.float())
     _products[(last - first,)](*arrays, out, first, columns, WIDTH=_WIDTH, num_warps=1, num_stages=1)

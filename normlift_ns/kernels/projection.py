@@ -1,9 +1,9 @@
-"""Which Gaussians some cameras see, and where in the image: gsplat's projection, one thread per Gaussian.
+"""gsplat's projection of Gaussians into cameras, one thread per Gaussian.
 
 The arithmetic is that of gsplat 1.4.0's fully_fused_projection_fwd.cu as nvcc 13.0 compiles it for sm_90 with gsplat's
-flags (-O3 --use_fast_math): which product of a sum is rounded and which ones are fused is written out here as read from
-that machine code, and the compiler is told to fuse nothing else. Divisions, square roots and reciprocals are the
-approximate ones of both compilers. Every number is so the same, bit for bit, but for those below 2 ** -126.
+flags (-O3 --use_fast_math). The code spells out which products of a sum are rounded and which are fused, as read from
+that machine code. The compiler may not fuse anything else. Divisions, square roots and reciprocals are the
+approximate ones of both compilers. So every number is the same bit for bit, except numbers below 2 ** -126.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 CAMERA = 16
-"""Numbers of a camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
+"""Values per camera: the rows (r, r, r, t) of its pose, fx, fy, cx, cy."""
 SPLAT = 8
-"""Numbers of a splat: centre u, v in pixels, half of xx and of yy of the inverse covariance and its xy, opacity, half
-sides of the rectangle. A splat is read as four pairs."""
+"""Values per splat, read as four pairs.
+
+These are the center u, v in pixels; half of xx, half of yy, and xy of the inverse covariance; the opacity; half width
+and half height of the rectangle.
+"""
 _BLOCK = 128
 _ENORMOUS = tl.constexpr(2.0**60)
 """Covariance in square pixels above which determinants are computed in larger units."""
@@ -28,7 +31,7 @@ _LARGEST = tl.constexpr(3.4028234e38)
 
 
 class Rules(NamedTuple):
-    """Numbers that decide what is drawn: fields of the rasterizer's settings."""
+    """Fields of the rasterizer's settings that the projection uses."""
 
     near_plane: float
     far_plane: float
@@ -41,18 +44,18 @@ class Rules(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Gaussians that some cameras see."""
+    """Visible Gaussians of some cameras."""
 
     seen: Int64[Tensor, " m"]
-    """gaussian * views + view, ascending."""
+    """Keys gaussian * views + view, ascending."""
     splats: Float32[Tensor, "m 8"]
-    """See `SPLAT`."""
+    """Values described at `SPLAT`."""
     depth: Float32[Tensor, " m"]
 
 
 @triton.jit
 def _camera_axis(camera, axis: tl.constexpr, x, y, z):
-    """One camera coordinate, rounded as CUDA rounds R p + t."""
+    """Return one camera coordinate, rounded as CUDA rounds R p + t."""
     a, b = tl.load(camera + 4 * axis), tl.load(camera + 4 * axis + 1)
     c, t = tl.load(camera + 4 * axis + 2), tl.load(camera + 4 * axis + 3)
     return tl.fma(z, c, tl.fma(x, a, b * y)) + t
@@ -64,15 +67,15 @@ def _dot(ax, ay, az, bx, by, bz):
 
 
 @triton.jit
-def _covariance(quats, scales, i, there):
-    """R diag(scale ** 2) R^T: xx, xy, xz, yy, yz, zz."""
-    w = tl.load(quats + 4 * i, mask=there, other=1.0)
-    x = tl.load(quats + 4 * i + 1, mask=there, other=0.0)
-    y = tl.load(quats + 4 * i + 2, mask=there, other=0.0)
-    z = tl.load(quats + 4 * i + 3, mask=there, other=0.0)
-    sx = tl.load(scales + 3 * i, mask=there, other=0.0)
-    sy = tl.load(scales + 3 * i + 1, mask=there, other=0.0)
-    sz = tl.load(scales + 3 * i + 2, mask=there, other=0.0)
+def _covariance(quats, scales, i, valid):
+    """Return the covariance R diag(scale ** 2) R^T as xx, xy, xz, yy, yz, zz."""
+    w = tl.load(quats + 4 * i, mask=valid, other=1.0)
+    x = tl.load(quats + 4 * i + 1, mask=valid, other=0.0)
+    y = tl.load(quats + 4 * i + 2, mask=valid, other=0.0)
+    z = tl.load(quats + 4 * i + 3, mask=valid, other=0.0)
+    sx = tl.load(scales + 3 * i, mask=valid, other=0.0)
+    sy = tl.load(scales + 3 * i + 1, mask=valid, other=0.0)
+    sz = tl.load(scales + 3 * i + 2, mask=valid, other=0.0)
     inverse = tl.rsqrt(tl.fma(w, w, _dot(x, y, z, x, y, z)))
     x, y, z, w = x * inverse, y * inverse, z * inverse, w * inverse
     y2, z2, wx, wy, wz = y * y, z * z, w * x, w * y, w * z
@@ -92,13 +95,13 @@ def _covariance(quats, scales, i, there):
 
 @triton.jit
 def _row_times(a, b, c, xx, xy, xz, yy, yz, zz):
-    """A row of the pose times the covariance; its last number is summed in another order, in gsplat too."""
+    """Return a row of the pose times the covariance; the last entry is summed in another order, as in gsplat."""
     return _dot(a, b, c, xx, xy, xz), _dot(a, b, c, xy, yy, yz), tl.fma(c, zz, tl.fma(b, yz, a * xz))
 
 
 @triton.jit
-def _turned(camera, xx, xy, xz, yy, yz, zz):
-    """The covariance C in the axes of a camera, row by row but for the last number: C_ij and C_ji are rounded apart."""
+def _rotate_covariance(camera, xx, xy, xz, yy, yz, zz):
+    """Return the nine entries of the covariance C in camera axes, row by row; C_ij and C_ji are rounded differently."""
     a, b, c = tl.load(camera), tl.load(camera + 1), tl.load(camera + 2)
     d, e, f = tl.load(camera + 4), tl.load(camera + 5), tl.load(camera + 6)
     g, h, k = tl.load(camera + 8), tl.load(camera + 9), tl.load(camera + 10)
@@ -118,13 +121,13 @@ def _splat(
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr,
 ):  # fmt: skip
-    """(whether the image can show it, u, v, conic xx, xy, yy, opacity, half width, half height, depth)."""
+    """Return (visible in the image, u, v, conic xx, xy, yy, opacity, half width, half height, depth)."""
     fx, fy = tl.load(camera + 12), tl.load(camera + 13)
     cx, cy = tl.load(camera + 14), tl.load(camera + 15)
     xc, yc, depth = _camera_axis(camera, 0, x, y, z), _camera_axis(camera, 1, x, y, z), _camera_axis(camera, 2, x, y, z)
-    seen = (depth >= near_plane) & (depth <= far_plane)
-    zc = tl.where(seen, depth, 1.0)
-    c00, c01, c02, c10, c11, c12, c20, c21, c22 = _turned(camera, xx, xy, xz, yy, yz, zz)
+    visible = (depth >= near_plane) & (depth <= far_plane)
+    zc = tl.where(visible, depth, 1.0)
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = _rotate_covariance(camera, xx, xy, xz, yy, yz, zz)
 
     half_x, half_y = 0.5 * width / fx, 0.5 * height / fy
     rz = 1.0 / zc
@@ -146,87 +149,87 @@ def _splat(
     sharp = tl.fma(c, a, -square)
     a, c = a + unit * eps2d, c + unit * eps2d
     det = tl.fma(c, a, -square)
-    seen &= det > 0
-    det = tl.where(seen, det, 1.0)
+    visible &= det > 0
+    det = tl.where(visible, det, 1.0)
     inverse = 1.0 / det
     if ANTIALIASED:
         opacity *= tl.sqrt(tl.maximum(min_compensation * min_compensation, sharp * inverse))
     conic_x, conic_xy, conic_y = unit * (c * inverse), unit * (-b * inverse), unit * (a * inverse)
-    seen &= (tl.abs(conic_x) <= _LARGEST) & (tl.abs(conic_xy) <= _LARGEST) & (tl.abs(conic_y) <= _LARGEST)
+    visible &= (tl.abs(conic_x) <= _LARGEST) & (tl.abs(conic_xy) <= _LARGEST) & (tl.abs(conic_y) <= _LARGEST)
 
     if PER_AXIS:
-        seen &= opacity >= min_alpha
+        visible &= opacity >= min_alpha
         reach = tl.sqrt(2.0 * tl.log(tl.maximum(opacity / min_alpha, 1.0)))
         sigmas = tl.minimum(radius_sigmas, reach)
         half_width, half_height = tl.ceil(sigmas * tl.sqrt(a / unit)), tl.ceil(sigmas * tl.sqrt(c / unit))
-        seen &= (half_width > 0) & (half_height > 0)
+        visible &= (half_width > 0) & (half_height > 0)
     else:
         mean = 0.5 * (a + c)
         larger = mean + tl.sqrt(tl.maximum(unit * unit * min_discriminant, tl.fma(mean, mean, -det)))
         half_width = tl.ceil(radius_sigmas * tl.sqrt(larger / unit))
         half_height = half_width
-    seen &= (half_width <= _LARGEST) & (half_height <= _LARGEST)
+    visible &= (half_width <= _LARGEST) & (half_height <= _LARGEST)
     u, v = tl.fma(rz, fx * xc, cx), tl.fma(rz, fy * yc, cy)
-    seen &= (u + half_width > 0) & (u - half_width < width) & (v + half_height > 0) & (v - half_height < height)
-    return seen, u, v, conic_x, conic_xy, conic_y, opacity, half_width, half_height, depth
+    visible &= (u + half_width > 0) & (u - half_width < width) & (v + half_height > 0) & (v - half_height < height)
+    return visible, u, v, conic_x, conic_xy, conic_y, opacity, half_width, half_height, depth
 
 
 @triton.jit
-def _find_seen(
+def _find_visible(
     means, quats, scales, opacities, drawable, cameras, out, gaussians, views, width, height,
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """out[gaussian, view]: whether the image can show it, and its opacity is not too small for any pixel."""
+    """Write to out[gaussian, view] whether the image can show the Gaussian with an opacity of at least min_alpha."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < gaussians
-    there = tl.load(drawable + i, mask=inside, other=0) != 0
-    x = tl.load(means + 3 * i, mask=there, other=0.0)
-    y = tl.load(means + 3 * i + 1, mask=there, other=0.0)
-    z = tl.load(means + 3 * i + 2, mask=there, other=0.0)
-    opacity = tl.load(opacities + i, mask=there, other=0.0)
-    xx, xy, xz, yy, yz, zz = _covariance(quats, scales, i, there)
+    valid = tl.load(drawable + i, mask=inside, other=0) != 0
+    x = tl.load(means + 3 * i, mask=valid, other=0.0)
+    y = tl.load(means + 3 * i + 1, mask=valid, other=0.0)
+    z = tl.load(means + 3 * i + 2, mask=valid, other=0.0)
+    opacity = tl.load(opacities + i, mask=valid, other=0.0)
+    xx, xy, xz, yy, yz, zz = _covariance(quats, scales, i, valid)
     for view in range(views):
-        seen, _, _, _, _, _, found, _, _, _ = _splat(
+        visible, _, _, _, _, _, scaled_opacity, _, _, _ = _splat(
             cameras + view * CAMERA, width, height, x, y, z, xx, xy, xz, yy, yz, zz, opacity,
             near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
             ANTIALIASED, PER_AXIS,
         )  # fmt: skip
-        tl.store(out + i * views + view, (seen & there & (found >= min_alpha)).to(tl.int8), mask=inside)
+        tl.store(out + i * views + view, (visible & valid & (scaled_opacity >= min_alpha)).to(tl.int8), mask=inside)
 
 
 @triton.jit
-def _project_seen(
-    means, quats, scales, opacities, cameras, seen, out_splat, out_depth, count, views, width, height,
+def _project_visible(
+    means, quats, scales, opacities, cameras, keys, out_splat, out_depth, count, views, width, height,
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
     ANTIALIASED: tl.constexpr, PER_AXIS: tl.constexpr, CAMERA: tl.constexpr, SPLAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    there = e < count
-    place = tl.load(seen + e, mask=there, other=0)
-    i = place // views
-    # Every lane has a camera of its own.
-    camera = cameras + (place - i * views) * CAMERA
-    x = tl.load(means + 3 * i, mask=there, other=0.0)
-    y = tl.load(means + 3 * i + 1, mask=there, other=0.0)
-    z = tl.load(means + 3 * i + 2, mask=there, other=1.0)
-    opacity = tl.load(opacities + i, mask=there, other=0.0)
-    xx, xy, xz, yy, yz, zz = _covariance(quats, scales, i, there)
+    valid = e < count
+    key = tl.load(keys + e, mask=valid, other=0)
+    i = key // views
+    # Every lane has its own camera.
+    camera = cameras + (key - i * views) * CAMERA
+    x = tl.load(means + 3 * i, mask=valid, other=0.0)
+    y = tl.load(means + 3 * i + 1, mask=valid, other=0.0)
+    z = tl.load(means + 3 * i + 2, mask=valid, other=1.0)
+    opacity = tl.load(opacities + i, mask=valid, other=0.0)
+    xx, xy, xz, yy, yz, zz = _covariance(quats, scales, i, valid)
     _, u, v, a, b, c, opacity, half_width, half_height, depth = _splat(
         camera, width, height, x, y, z, xx, xy, xz, yy, yz, zz, opacity,
         near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
         ANTIALIASED, PER_AXIS,
     )  # fmt: skip
     row = out_splat + SPLAT * e
-    tl.store(row, u, mask=there)
-    tl.store(row + 1, v, mask=there)
-    tl.store(row + 2, 0.5 * a, mask=there)
-    tl.store(row + 3, 0.5 * c, mask=there)
-    tl.store(row + 4, b, mask=there)
-    tl.store(row + 5, opacity, mask=there)
-    tl.store(row + 6, half_width, mask=there)
-    tl.store(row + 7, half_height, mask=there)
-    tl.store(out_depth + e, depth, mask=there)
+    tl.store(row, u, mask=valid)
+    tl.store(row + 1, v, mask=valid)
+    tl.store(row + 2, 0.5 * a, mask=valid)
+    tl.store(row + 3, 0.5 * c, mask=valid)
+    tl.store(row + 4, b, mask=valid)
+    tl.store(row + 5, opacity, mask=valid)
+    tl.store(row + 6, half_width, mask=valid)
+    tl.store(row + 7, half_height, mask=valid)
+    tl.store(out_depth + e, depth, mask=valid)
 
 
 def project(
@@ -243,11 +246,20 @@ def project(
     antialiased: bool,
     per_axis: bool,
 ) -> Splats:
-    """What some cameras of one size see of a scene. Nothing is stored of the rest but a byte.
+    """Project a scene into cameras of one size. Invisible Gaussians take only one byte per view.
 
     Args:
-        cameras: see `CAMERA`.
-        per_axis: a rectangle as gsplat draws it from 1.5 on instead of a square.
+        means: Centers of the Gaussians.
+        quats: Rotations.
+        scales: Standard deviations.
+        opacities: Opacities.
+        drawable: Mask of the Gaussians to project.
+        cameras: Values described at `CAMERA`.
+        width: Width of the images in pixels.
+        height: Height of the images in pixels.
+        rules: Constants of the projection.
+        antialiased: Whether to scale opacities like splatfacto's rasterize_mode "antialiased".
+        per_axis: Whether to use a rectangle, as gsplat does from 1.5 on, instead of a square.
     """
     views, n, device = len(cameras), len(means), means.device
     scene = [x.contiguous() for x in (means, quats, scales, opacities)]
@@ -255,15 +267,15 @@ def project(
     options = {"ANTIALIASED": antialiased, "PER_AXIS": per_axis, "CAMERA": CAMERA, "BLOCK": _BLOCK, "num_warps": 4}
     options["enable_fp_fusion"] = False
     if n > 0:
-        _find_seen[(triton.cdiv(n, _BLOCK),)](
+        _find_visible[(triton.cdiv(n, _BLOCK),)](
             *scene, drawable.view(torch.int8), cameras, flags.view(torch.int8), n, views, width, height, *rules,
             **options,
         )  # fmt: skip
-    seen = flags.nonzero().squeeze(1)
-    splats = torch.empty(len(seen), SPLAT, device=device)
-    depth = torch.empty(len(seen), device=device)
-    if len(seen) > 0:
-        _project_seen[(triton.cdiv(len(seen), _BLOCK),)](
-            *scene, cameras, seen, splats, depth, len(seen), views, width, height, *rules, SPLAT=SPLAT, **options
+    keys = flags.nonzero().squeeze(1)
+    splats = torch.empty(len(keys), SPLAT, device=device)
+    depth = torch.empty(len(keys), device=device)
+    if len(keys) > 0:
+        _project_visible[(triton.cdiv(len(keys), _BLOCK),)](
+            *scene, cameras, keys, splats, depth, len(keys), views, width, height, *rules, SPLAT=SPLAT, **options
         )
-    return Splats(seen, splats, depth)
+    return Splats(keys, splats, depth)

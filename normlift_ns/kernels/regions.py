@@ -1,8 +1,8 @@
-"""Sums of compositing weights by (splat, region): one program of a single warp per cell, no atomics.
+"""Sums of compositing weights by (splat, region): one single-warp program per cell, without atomics.
 
-A program holds the pixels of its cell in registers and walks through its splats, nearest first, with the arithmetic of
-gsplat's rasterize_to_pixels_fwd.cu. Every cell owns as much of the output as it can need and fills it from the start,
-so that the result does not depend on the order in which programs run.
+A program holds the pixels of its cell in registers and iterates over its splats, nearest first, with the arithmetic of
+gsplat's rasterize_to_pixels_fwd.cu. Every cell has its own part of the output, large enough for any result, and fills
+it from the start. So the result does not depend on the order in which programs run.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from torch import Tensor
 from normlift_ns.kernels.lists import Grid, Lists
 
 UNROLL = 4
-"""Splats between two looks at whether a cell is finished."""
+"""Number of splats between checks whether a cell is finished."""
 _MOST_SLOTS = 2**26
-"""Slots at once, of 8 or 12 bytes each."""
+"""Largest number of slots in a chunk, of 8 or 12 bytes each."""
 _COPIED = 128
-"""Sums that a program moves at once."""
+"""Sums that a program moves in one step."""
 _PLACES = 512
+"""Sums per program that decodes keys."""
 
 
 class Limits(NamedTuple):
-    """Numbers that decide what a pixel draws: fields of the rasterizer's settings."""
+    """Fields of the rasterizer's settings that compositing uses."""
 
     max_alpha: float
     min_alpha: float
@@ -36,55 +37,58 @@ class Limits(NamedTuple):
 
 
 class RegionSums(NamedTuple):
-    """Nonzero sums, one per cell, splat and region, ordered by cell: places occur as often as cells show them."""
+    """Nonzero sums, one per cell, splat and region, ordered by cell; a key can occur in several cells."""
 
     key: Int[Tensor, " m"]
-    """row of the splat * columns + label + 1."""
+    """Keys row * columns + label + 1, with the row of the splat."""
     weight: Float32[Tensor, " m"]
 
 
 @triton.jit
 def cell_pixels(cell, cells_across, CELL_W: tl.constexpr, CELL_H: tl.constexpr):
-    """Rows [CELL_H, 1] and columns [1, CELL_W] of the image."""
+    """Return the rows [CELL_H, 1] and columns [1, CELL_W] of a cell in the image."""
     y = (cell // cells_across) * CELL_H + tl.arange(0, CELL_H)[:, None]
     x = (cell % cells_across) * CELL_W + tl.arange(0, CELL_W)[None, :]
     return y, x
 
 
 @triton.jit
-def _two_floats(pair):
-    """The float32 numbers that stand in the low and in the high half of an int64."""
+def _unpack_floats(pair):
+    """Return the float32 numbers in the low and in the high half of an int64."""
     return pair.to(tl.int32).to(tl.float32, bitcast=True), (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
 
 
 @triton.jit
-def load_splat(splats, m, there):
-    """u, v, half of xx, half of yy, xy, opacity of a splat; of none: opacity 0."""
+def load_splat(splats, m, valid):
+    """Return u, v, half of xx, half of yy, xy and opacity of a splat; an invalid splat has opacity 0."""
     row = splats + 4 * m.to(tl.int64)
-    u, v = _two_floats(tl.load(row, mask=there, other=0))
-    a, c = _two_floats(tl.load(row + 1, mask=there, other=0))
-    b, opacity = _two_floats(tl.load(row + 2, mask=there, other=0))
+    u, v = _unpack_floats(tl.load(row, mask=valid, other=0))
+    a, c = _unpack_floats(tl.load(row + 1, mask=valid, other=0))
+    b, opacity = _unpack_floats(tl.load(row + 2, mask=valid, other=0))
     return u, v, a, c, b, opacity
 
 
 @triton.jit
 def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
-    """(A_ij, transmittance behind) of one splat in all pixels; a finished pixel has transmittance 0."""
+    """Return (A_ij, transmittance after it) of one splat in all pixels; a finished pixel has transmittance 0."""
     dx, dy = u - px, v - py
-    # As nvcc fuses it in rasterize_to_pixels_fwd.cu.
+    # Fused as by nvcc in rasterize_to_pixels_fwd.cu.
     sigma = tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
     alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
-    felt = (sigma >= 0) & (alpha >= min_alpha)
+    visible = (sigma >= 0) & (alpha >= min_alpha)
     after = T * (1.0 - alpha)
-    goes_on = after > min_transmittance
-    return tl.where(felt & goes_on, alpha * T, 0.0), tl.where(felt, tl.where(goes_on, after, 0.0), T)
+    continues = after > min_transmittance
+    return tl.where(visible & continues, alpha * T, 0.0), tl.where(visible, tl.where(continues, after, 0.0), T)
 
 
 @triton.jit
 def _number_labels(
     labels, local, table, counts, width, height, cells_across, cells, CELL_W: tl.constexpr, CELL_H: tl.constexpr
 ):
-    """Numbers the labels >= -1 of a cell in ascending order: local[cell, pixel], -1 for none; table[cell, number]."""
+    """Number the labels >= -1 of a cell in ascending order.
+
+    The numbers are written to local[cell, pixel], -1 for none, and the labels to table[cell, number].
+    """
     cell = tl.program_id(0).to(tl.int64)
     view = cell // cells
     y, x = cell_pixels((cell % cells).to(tl.int32), cells_across, CELL_W, CELL_H)
@@ -119,11 +123,11 @@ def _sum_regions(
         px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
         pixel = tl.arange(0, CELL_H)[:, None] * CELL_W + tl.arange(0, CELL_W)[None, :]
         number = tl.load(local + cell * CELL_W * CELL_H + pixel).to(tl.int32)
-        only = tl.load(table + cell * CELL_W * CELL_H) + 1
+        only_column = tl.load(table + cell * CELL_W * CELL_H) + 1
         T = tl.where(number >= 0, 1.0, 0.0)
         i = start
         alive = 1
-        # Numbers of the next splat are on their way while the present one is computed.
+        # The next splat is loaded while the current one is computed.
         m = tl.load(members + i)
         u, v, a, c, b, o = load_splat(splats, m, i < stop)
         later = tl.load(members + i + 1, mask=i + 1 < stop, other=0)
@@ -140,10 +144,10 @@ def _sum_regions(
                     weight = tl.where(weight > 0, 1.0, 0.0)
                 total = tl.sum(weight)
                 if total > 0:
-                    place = m.to(out_key.dtype.element_ty) * columns
+                    base_key = m.to(out_key.dtype.element_ty) * columns
                     if count == 1:
                         tl.store(out_weight + slot, total)
-                        tl.store(out_key + slot, place + only)
+                        tl.store(out_key + slot, base_key + only_column)
                         slot += 1
                     else:
                         for r in range(count):
@@ -151,7 +155,7 @@ def _sum_regions(
                             if part > 0:
                                 label = tl.load(table + cell * CELL_W * CELL_H + r) + 1
                                 tl.store(out_weight + slot, part)
-                                tl.store(out_key + slot, place + label)
+                                tl.store(out_key + slot, base_key + label)
                                 slot += 1
                 i += 1
                 m, u, v, a, c, b, o = next_m, next_u, next_v, next_a, next_c, next_b, next_o
@@ -161,7 +165,7 @@ def _sum_regions(
 
 @triton.jit
 def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED: tl.constexpr):
-    """Moves the used slots of a cell behind those of the cells before it."""
+    """Move the used slots of a cell directly behind those of the previous cells."""
     cell = tl.program_id(0).to(tl.int64)
     count = tl.load(used + cell)
     source, target = tl.load(base + cell) - first_slot, tl.load(ends + cell) - count
@@ -181,11 +185,16 @@ def region_sums(
     limits: Limits,
     weight_power: int,
 ) -> RegionSums:
-    """Sums of A_ij ** weight_power over the pixels of each region in each cell, for views of one size.
+    """Return the sums of A_ij ** weight_power over the pixels of each region in each cell, for views of one size.
 
     Args:
-        labels: region of every pixel; -1: unlabelled, summed like a region; below -1: no pixel.
-        columns: more than the largest label + 1.
+        splats: Projected Gaussians; see `SPLAT`.
+        lists: Splats by cell.
+        labels: Region of every pixel. -1 means unlabeled and is summed like a region; pixels below -1 are ignored.
+        grid: Cells of an image.
+        columns: A number above the largest label + 1.
+        limits: Limits of alpha and transmittance.
+        weight_power: Exponent of A_ij.
     """
     views, device, pixels = len(labels), splats.device, grid.cell_width * grid.cell_height
     cells = views * grid.cells
@@ -196,11 +205,11 @@ def region_sums(
     _number_labels[(cells,)](
         labels, local, table, counts, grid.width, grid.height, grid.across, grid.cells, **shape
     )  # fmt: skip
-    slots = torch.cat([counts.new_zeros(1), counts * lists.offsets.diff().long()]).cumsum(0)  # the first of each cell
-    kind = torch.int32 if len(splats) * columns < 2**31 else torch.int64  # of half the width: half the work to sort
-    parts = [RegionSums(torch.zeros(0, dtype=kind, device=device), torch.zeros(0, device=device))]
+    slots = torch.cat([counts.new_zeros(1), counts * lists.offsets.diff().long()]).cumsum(0)  # first slot of each cell
+    dtype = torch.int32 if len(splats) * columns < 2**31 else torch.int64  # int32 takes half the time to sort
+    parts = [RegionSums(torch.zeros(0, dtype=dtype, device=device), torch.zeros(0, device=device))]
     for first, last, low, high in _chunks(slots):
-        key = torch.empty(high - low, dtype=kind, device=device)
+        key = torch.empty(high - low, dtype=dtype, device=device)
         weight = torch.empty(high - low, device=device)
         used = torch.empty(last - first, dtype=torch.int32, device=device)
         _sum_regions[(last - first,)](
@@ -217,7 +226,10 @@ def region_sums(
 
 
 def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, int]]:
-    """Runs of cells of at most _MOST_SLOTS slots, or of one cell: first and last cell, first and last slot."""
+    """Return ranges of cells with at most _MOST_SLOTS slots, or of a single cell: (first, last) cell and slot.
+
+    The last cell and slot are exclusive.
+    """
     total = int(slots[-1])
     if total <= _MOST_SLOTS:
         return [(0, len(slots) - 1, 0, total)] if total > 0 else []
@@ -229,31 +241,34 @@ def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, in
 
 
 @triton.jit
-def _places(key, seen, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
+def _places(key, splat_keys, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    there = i < count
-    k = tl.load(key + i, mask=there, other=0)
+    valid = i < count
+    k = tl.load(key + i, mask=valid, other=0)
     splat = k // columns
-    place = tl.load(seen + splat, mask=there, other=0)
-    gaussian = place // views
-    column = tl.load(first + (place - gaussian * views), mask=there, other=0) + (k - splat * columns).to(tl.int32)
-    tl.store(out_gaussian + i, gaussian.to(tl.int32), mask=there)
-    tl.store(out_column + i, column, mask=there)
+    gaussian_view = tl.load(splat_keys + splat, mask=valid, other=0)
+    gaussian = gaussian_view // views
+    column = tl.load(first + (gaussian_view - gaussian * views), mask=valid, other=0) + (k - splat * columns).to(
+        tl.int32
+    )
+    tl.store(out_gaussian + i, gaussian.to(tl.int32), mask=valid)
+    tl.store(out_column + i, column, mask=valid)
 
 
 def places(
-    key: Int[Tensor, " m"], seen: Int64[Tensor, " splats"], first: Int32[Tensor, " views_plus_1"], columns: int
+    key: Int[Tensor, " m"], splat_keys: Int64[Tensor, " splats"], first: Int32[Tensor, " views_plus_1"], columns: int
 ) -> tuple[Int32[Tensor, " m"], Int32[Tensor, " m"]]:
-    """Gaussian and column of sums.
+    """Return the Gaussian and the column of every sum.
 
     Args:
-        key: as in `RegionSums`.
-        seen: gaussian * views + view of every splat.
-        first: first column of every view.
+        key: Keys as in `RegionSums`.
+        splat_keys: Keys gaussian * views + view of every splat.
+        first: First column of every view.
+        columns: Columns per row in `key`.
     """
     gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))
     if len(key) > 0:
         _places[(triton.cdiv(len(key), _PLACES),)](
-            key, seen, first, gaussian, column, len(key), columns, len(first) - 1, BLOCK=_PLACES, num_warps=4
+            key, splat_keys, first, gaussian, column, len(key), columns, len(first) - 1, BLOCK=_PLACES, num_warps=4
         )
     return gaussian, column

@@ -1,4 +1,4 @@
-"""Sums over the rows of a sparse matrix: of the weights themselves, and of weighted rows of a table."""
+"""Sums over the rows of a sparse matrix: sums of weights, and weighted sums of table rows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ROWS = 128
 
 
 class RowNorms(NamedTuple):
-    """Of every row j of a matrix E whose columns s belong to views v, with a table of unit rows F."""
+    """Norms and sums of every row j of a matrix E with columns s in views v, for a table of unit rows F."""
 
     total: Float64[Tensor, " n"]
     """||sum_s E_js F_s||"""
@@ -25,7 +25,7 @@ class RowNorms(NamedTuple):
     weight_squared: Float64[Tensor, " n"]
     """sum_v (sum_{s in v} E_js) ** 2"""
     views: Int32[Tensor, " n"]
-    """Views with an entry."""
+    """Number of views with a positive weight."""
 
 
 @triton.jit
@@ -40,7 +40,10 @@ def _segment_sum(values, offsets, out, segments, ROWS: tl.constexpr):
 
 
 def segment_sum(values: Float[Tensor, " m"], offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
-    """Sums of values[offsets[i]:offsets[i + 1]], each from left to right in float64. For many short segments."""
+    """Return the sums of values[offsets[i]:offsets[i + 1]], from left to right in float64.
+
+    This is fast for many short segments.
+    """
     out = torch.empty(len(offsets) - 1, dtype=torch.float64, device=values.device)
     _segment_sum[(triton.cdiv(len(out), _ROWS),)](values, offsets, out, len(out), ROWS=_ROWS, num_warps=4)
     return out
@@ -65,7 +68,7 @@ def product(
     weight: Float[Tensor, " nnz"],
     vector: Float[Tensor, " s"],
 ) -> Float[Tensor, " n"]:
-    """E x, added up in float64, in the precision of x. For many short rows."""
+    """Return E x in the precision of x, summed in float64. This is fast for many short rows."""
     out = torch.empty(len(offsets) - 1, dtype=vector.dtype, device=vector.device)
     grid = (triton.cdiv(len(out), _ROWS),)
     _product[grid](offsets, column, weight, vector, out, len(out), ROWS=_ROWS, num_warps=4)
@@ -74,7 +77,7 @@ def product(
 
 @triton.jit
 def _exact_sum(column, weight, table, start, stop, dimension, BLOCK: tl.constexpr):
-    """sum of weighted rows in float64."""
+    """Return the sum of weighted rows in float64."""
     d = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float64)
     for e in range(start, stop):
@@ -97,55 +100,55 @@ def _store_norms(
 @triton.jit
 def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
-    dimension, cancelled, many, BLOCK: tl.constexpr,
+    dimension, min_share, max_entries, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One row per program. Where float32 digits have cancelled or worn away, the sum is taken again in float64."""
+    """Compute one row per program. If float32 has lost digits to cancellation or rounding, sum again in float64."""
     j = tl.program_id(0)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
-    if stop - start <= 1:  # no sum of vectors: rows of the table are unit vectors
+    if stop - start <= 1:  # no vector sum is needed: rows of the table are unit vectors
         only = tl.load(weight + start, mask=start < stop, other=0.0).to(tl.float64)
         _store_norms(out_total, out_by_view, out_weight, out_squared, out_views, j, only, only, only, only * only,
                      tl.where(only > 0, 1, 0))  # fmt: skip
     else:
         d = tl.arange(0, BLOCK)
         zero = tl.zeros([BLOCK], tl.float32)
-        total, of_view = zero, zero
+        total, view_total = zero, zero
         all_weight = tl.zeros([], tl.float64)
         view_weight, squared, by_view = all_weight, all_weight, all_weight
         views, first = 0, start
         view = -1
-        # On their way while an entry is added: the row of the next one, and the column of the next but one.
+        # While an entry is added, the row of the next entry and the column of the one after it are loaded.
         s = tl.load(column + start)
-        later = tl.load(column + start + 1)
+        next_column = tl.load(column + start + 1)
         next_view, next_w = tl.load(column_view + s), tl.load(weight + start)
         next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
         for e in range(start, stop + 1):
-            here, w, row = next_view, next_w, next_row
-            s, following = later, tl.minimum(e + 1, stop - 1)
-            later = tl.load(column + tl.minimum(e + 2, stop - 1))
+            entry_view, w, row = next_view, next_w, next_row
+            s, following = next_column, tl.minimum(e + 1, stop - 1)
+            next_column = tl.load(column + tl.minimum(e + 2, stop - 1))
             next_view = tl.where(e + 1 < stop, tl.load(column_view + s), -2)
             next_w = tl.where(e + 1 < stop, tl.load(weight + following), 0.0)
             next_row = tl.load(table + s.to(tl.int64) * dimension + d, mask=d < dimension, other=0.0)
-            if (here != view) & (view != -1):  # the entries of a view end here
+            if (entry_view != view) & (view != -1):  # the entries of a view end here
                 norm = view_weight  # of a single unit row
                 if e - first > 1:
-                    norm = tl.sqrt(tl.sum(of_view * of_view, axis=0)).to(tl.float64)
-                    if (norm < cancelled * view_weight) | (e - first > many):
+                    norm = tl.sqrt(tl.sum(view_total * view_total, axis=0)).to(tl.float64)
+                    if (norm < min_share * view_weight) | (e - first > max_entries):
                         exact = _exact_sum(column, weight, table, first, e, dimension, BLOCK)
                         norm = tl.sqrt(tl.sum(exact * exact, axis=0))
                 by_view += norm
                 all_weight += view_weight
                 squared += view_weight * view_weight
                 views += tl.where(view_weight > 0, 1, 0)
-                total += of_view
-                of_view = zero
+                total += view_total
+                view_total = zero
                 view_weight = tl.zeros([], tl.float64)
                 first = e
-            of_view += w * row  # behind the last entry 0
+            view_total += w * row  # 0 after the last entry
             view_weight += w.to(tl.float64)
-            view = here
+            view = entry_view
         norm = tl.sqrt(tl.sum(total * total, axis=0)).to(tl.float64)
-        if (norm < cancelled * all_weight) | (stop - start > many):
+        if (norm < min_share * all_weight) | (stop - start > max_entries):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
             norm = tl.sqrt(tl.sum(exact * exact, axis=0))
         _store_norms(
@@ -159,15 +162,19 @@ def row_norms(
     weight: Float32[Tensor, " nnz"],
     column_view: Int32[Tensor, " s"],
     table: Float32[Tensor, "s d"],
-    cancelled: float,
-    many: int,
+    min_share: float,
+    max_entries: int,
 ) -> RowNorms:
-    """All that the lift needs of E, in one pass and without any [N, D] array.
+    """Return the norms that the lift needs, in one pass over E and without an [N, D] array.
 
     Args:
-        column: ascending in each row, so that entries of a view follow each other.
-        cancelled, many: sums shorter than this share of their weight, and sums of more entries than this, are taken
-            again in float64.
+        offsets: Row offsets of E.
+        column: Columns of the entries, ascending in each row, so that the entries of a view are consecutive.
+        weight: Weights of the entries.
+        column_view: View of every column.
+        table: Unit rows F.
+        min_share: A sum is repeated in float64 if its norm is below this share of its weight.
+        max_entries: A sum is repeated in float64 if it has more entries than this.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
     out = RowNorms(
@@ -175,27 +182,29 @@ def row_norms(
         torch.empty(n, dtype=torch.int32, device=device),
     )
     _row_norms[(n,)](
-        offsets, column, weight, column_view, table, *out, dimension, cancelled, many,
+        offsets, column, weight, column_view, table, *out, dimension, min_share, max_entries,
         BLOCK=triton.next_power_of_2(dimension), num_warps=1,
     )  # fmt: skip
     return out
 
 
 @triton.jit
-def _unit_sums(rows, offsets, column, weight, table, known, out, dimension, cancelled, many, BLOCK: tl.constexpr):
+def _unit_sums(
+    rows, offsets, column, weight, table, norms, out, dimension, min_share, max_entries, BLOCK: tl.constexpr
+):
     j = tl.load(rows + tl.program_id(0))
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     d = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float32)
     all_weight = tl.zeros([], tl.float32)
-    if tl.load(known + j) > 0:
+    if tl.load(norms + j) > 0:
         for e in range(start, stop):
             w = tl.load(weight + e)
             row = tl.load(column + e).to(tl.int64) * dimension + d
             total += w * tl.load(table + row, mask=d < dimension, other=0.0)
             all_weight += w
         norm = tl.sqrt(tl.sum(total * total, axis=0))
-        if (norm < cancelled * all_weight) | (stop - start > many):
+        if (norm < min_share * all_weight) | (stop - start > max_entries):
             exact = _exact_sum(column, weight, table, start, stop, dimension, BLOCK)
             total = (exact / tl.sqrt(tl.sum(exact * exact, axis=0))).to(tl.float32)
         else:
@@ -209,17 +218,29 @@ def unit_sums(
     column: Int32[Tensor, " nnz"],
     weight: Float32[Tensor, " nnz"],
     table: Float32[Tensor, "s d"],
-    known: Float32[Tensor, " n"],
+    norms: Float32[Tensor, " n"],
     dtype: torch.dtype,
-    cancelled: float,
-    many: int,
+    min_share: float,
+    max_entries: int,
 ) -> Float[Tensor, "m d"]:
-    """sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 where `known` is 0."""
+    """Return sum_s E_js F_s of some rows j as unit vectors of `dtype`; 0 if the norm is 0.
+
+    Args:
+        rows: Rows j.
+        offsets: Row offsets of E.
+        column: Columns of the entries.
+        weight: Weights of the entries.
+        table: Unit rows F.
+        norms: Norm of every row of E.
+        dtype: Precision of the result.
+        min_share: As in `row_norms`.
+        max_entries: As in `row_norms`.
+    """
     dimension = table.shape[1]
     out = torch.empty(len(rows), dimension, dtype=dtype, device=table.device)
     if len(rows) > 0:
         _unit_sums[(len(rows),)](
-            rows, offsets, column, weight, table, known, out, dimension, cancelled, many,
+            rows, offsets, column, weight, table, norms, out, dimension, min_share, max_entries,
             BLOCK=triton.next_power_of_2(dimension), num_warps=1,
         )  # fmt: skip
     return out

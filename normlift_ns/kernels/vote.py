@@ -1,12 +1,14 @@
-"""The vote of one Gaussian per program: the cosines among its neighbours are one small matrix product.
+"""Vote of one Gaussian per program; the cosines among its neighbors are one small matrix product.
 
-Rows u of float32 are halved: u = h + l, both of 11 bits, so that three products of tensor cores at their fastest rate,
-h h + h l + l h, give a cosine to 22 bits. Most votes need only the first. With e the largest |l| in the group, all
-products and sums exact but for roundings of 2**-23 of at most 1 each, |<h_j, h_k> - <u_j, u_k>| <= t, where
-t = 2.02 e + (D + 16) 2**-23. As d/dc log(g (1 - g)) is at most 1 / gamma, a sigmoid g whose cosine is off by t is off
-by at most f g (1 - g), f = exp(t / gamma) - 1. By Jensen's inequality the sum A of g with weights of sum W is then off
-by at most f A (1 - A / W). Where these intervals, and 3e-5 for the rounding of the sums, leave one winner, it is the
-winner; everything else adds the other products and compares again.
+Float32 rows u are split into u = h + l, with 11 bits each. Three products on tensor cores at their fastest rate,
+h h + h l + l h, then give a cosine to 22 bits. Most votes need only the first product.
+
+Let e be the largest |l| in the group, and let all products and sums be exact except for roundings of 2**-23 of at most
+1 each. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. As d/dc log(g (1 - g)) is at most
+1 / gamma, an error t of the cosine changes a sigmoid g by at most f g (1 - g), f = exp(t / gamma) - 1. By Jensen's
+inequality, the sum A of g with weights of sum W then has an error of at most f A (1 - A / W). If these intervals, plus
+3e-5 for the rounding of the sums, leave one winner, it is the result. All other votes add the remaining products and
+compare again.
 """
 
 from __future__ import annotations
@@ -24,17 +26,17 @@ Precision = Literal["certified", "first", "halves", "tf32", "tf32x3", "ieee"]
 
 
 class Tuning(NamedTuple):
-    """How one program runs."""
+    """Launch parameters of one program."""
 
     columns: int
-    """Of rows, held at a time."""
+    """Columns of the rows loaded per step."""
     columns_later: int
-    """The same, where both halves of a row are."""
+    """Columns loaded per step when both halves of the rows are loaded."""
     stages: int
-    """Parts of rows on their way."""
+    """Pipeline stages of the loads."""
     warps: int
     registers: int | None = None
-    """Most of a thread: with fewer, more programs run at once."""
+    """Largest number of registers per thread; with fewer, more programs run simultaneously."""
 
 
 _HALVES = Tuning(columns=64, columns_later=32, stages=3, warps=4, registers=128)
@@ -43,24 +45,24 @@ _ROWS = 16
 
 
 @triton.jit
-def _winner(score, member, slot, there, i, delta):
+def _winner(score, member, slot, valid, i, delta):
     own = tl.sum(tl.where(slot == 0, score, 0.0), axis=0)
-    others = tl.where((slot > 0) & there, score, -1.0)
+    others = tl.where((slot > 0) & valid, score, -1.0)
     best, winner = tl.max(others, axis=0, return_indices=True, return_indices_tie_break_left=True)
-    chosen = tl.sum(tl.where(slot == winner, member, 0), axis=0)
-    return tl.where(best > own + delta, chosen, i)
+    winner_member = tl.sum(tl.where(slot == winner, member, 0), axis=0)
+    return tl.where(best > own + delta, winner_member, i)
 
 
 @triton.jit
-def _certain(agreed, r, weight, slot, there, spread, delta):
-    """Whether no scores within their errors have another winner; see above. Not where anything is not a number."""
+def _certain(agreed, r, weight, slot, valid, spread, delta):
+    """Return whether the winner is the same for all scores within their errors (see above); false for NaN."""
     share = agreed / tl.sum(weight, axis=0)  # A / W
     score = r * agreed
     error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
     low, high = score - error, score + error
     own_low = tl.sum(tl.where(slot == 0, low, 0.0), axis=0)
     own_high = tl.sum(tl.where(slot == 0, high, 0.0), axis=0)
-    other = (slot > 0) & there
+    other = (slot > 0) & valid
     _, winner = tl.max(tl.where(other, score, -1.0), axis=0, return_indices=True, return_indices_tie_break_left=True)
     best_low = tl.sum(tl.where(slot == winner, low, 0.0), axis=0)
     rest_high = tl.max(tl.where(other & (slot != winner), high, -1.0), axis=0)
@@ -77,56 +79,56 @@ def _vote(
     POSTERIOR: tl.constexpr,
 ):  # fmt: skip
     i = tl.load(voters + tl.program_id(0)).to(tl.int64)
-    slot = tl.arange(0, GROUP)  # 0: i itself
+    slot = tl.arange(0, GROUP)  # slot 0 is i itself
     listed = (slot > 0) & (slot <= k)
     member = tl.load(neighbors + i * k + slot - 1, mask=listed, other=-1).to(tl.int64)
     member = tl.where(slot == 0, i, member)
-    there = member >= 0
-    r = tl.load(reliability + member, mask=there, other=0.0)
-    d = tl.load(distance + i * k + slot - 1, mask=listed & there, other=0.0).to(tl.float32) / width
-    place = tl.load(row_of + member, mask=there, other=0).to(tl.int64)
+    valid = member >= 0
+    r = tl.load(reliability + member, mask=valid, other=0.0)
+    d = tl.load(distance + i * k + slot - 1, mask=listed & valid, other=0.0).to(tl.float32) / width
+    row_index = tl.load(row_of + member, mask=valid, other=0).to(tl.int64)
     if POSTERIOR:
-        seen = tl.load(own + i)
-    if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else nobody can win
+        own_views = tl.load(own + i)
+    if tl.max(tl.where(slot > 0, r, 0.0), axis=0) > 0:  # else no neighbor can win
         if CERTIFY:
-            lacks = tl.load(rough + place, mask=there & (r > 0), other=0.0)
-        row = place * dimension
+            residual = tl.load(rough + row_index, mask=valid & (r > 0), other=0.0)
+        row = row_index * dimension
         cosine = tl.zeros([GROUP, GROUP], tl.float32)
         for first in tl.range(0, dimension, COLUMNS, num_stages=STAGES):
             column = first + tl.arange(0, COLUMNS)
-            inside = there[:, None] & (column < dimension)[None, :]
+            inside = valid[:, None] & (column < dimension)[None, :]
             part = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
             cosine = tl.dot(part, tl.trans(part), cosine, input_precision=PRECISION)
         votes = (r > 0) & (slot > 0) if POSTERIOR else r > 0
         nearest = tl.min(tl.where(votes, d, float("inf")), axis=0)
-        beyond = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product rounds
-        weight = r * tl.exp(-0.5 * beyond)
+        excess = tl.maximum(d - nearest, 0.0) * (d + nearest)  # d * d - nearest ** 2, which a fused product would round
+        weight = r * tl.exp(-0.5 * excess)
         if POSTERIOR:
             near = tl.where(slot > 0, weight, 0.0)
-            weight = tl.where(slot > 0, near / tl.sum(near, axis=0) * prior, seen)
-        else:  # in the units of these weights, which leave out how far the nearest one is
+            weight = tl.where(slot > 0, near / tl.sum(near, axis=0) * prior, own_views)
+        else:  # scaled like these weights, which omit the distance of the nearest one
             delta = tl.where(delta > 0, delta * tl.exp(0.5 * nearest * nearest), 0.0)
         undecided = True
         if CERTIFY:
             agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
-            spread = tl.exp((2.02 * tl.max(lacks, axis=0) + (dimension + 16) * 1.1920929e-7) / gamma) - 1
-            certain = _certain(agreed, r, weight, slot, there, spread, delta)
+            spread = tl.exp((2.02 * tl.max(residual, axis=0) + (dimension + 16) * 1.1920929e-7) / gamma) - 1
+            certain = _certain(agreed, r, weight, slot, valid, spread, delta)
             undecided = certain == 0
             if certain:
-                tl.store(source + i, _winner(r * agreed, member, slot, there, i, delta).to(tl.int32))
-        if FINISH:  # noqa: SIM102 (known when the kernel is compiled, unlike the other)
+                tl.store(source + i, _winner(r * agreed, member, slot, valid, i, delta).to(tl.int32))
+        if FINISH:  # noqa: SIM102 (this condition is known at compile time, the next one is not)
             if undecided:
                 if HALVES:
                     cross = tl.zeros([GROUP, GROUP], tl.float32)
                     for first in tl.range(0, dimension, COLUMNS_LATER, num_stages=STAGES):
                         column = first + tl.arange(0, COLUMNS_LATER)
-                        inside = there[:, None] & (column < dimension)[None, :]
-                        some = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
-                        other = tl.load(low + row[:, None] + column[None, :], mask=inside, other=0.0)
-                        cross = tl.dot(some, tl.trans(other), cross)
+                        inside = valid[:, None] & (column < dimension)[None, :]
+                        high_part = tl.load(high + row[:, None] + column[None, :], mask=inside, other=0.0)
+                        low_part = tl.load(low + row[:, None] + column[None, :], mask=inside, other=0.0)
+                        cross = tl.dot(high_part, tl.trans(low_part), cross)
                     cosine += (cross + tl.trans(cross)) * (1 / 2048)
                 agreed = tl.sum(tl.sigmoid((cosine - tau) / gamma) * weight[None, :], axis=1)
-                tl.store(source + i, _winner(r * agreed, member, slot, there, i, delta).to(tl.int32))
+                tl.store(source + i, _winner(r * agreed, member, slot, valid, i, delta).to(tl.int32))
 
 
 @triton.jit
@@ -135,18 +137,18 @@ def _halve(rows, high, low, rough, dimension, BLOCK: tl.constexpr):
     inside = column < dimension
     u = tl.load(rows + j * dimension + column, mask=inside, other=0.0)
     h = u.to(tl.float16)
-    rest = u - h.to(tl.float32)
+    residual = u - h.to(tl.float32)
     tl.store(high + j * dimension + column, h, mask=inside)
-    tl.store(low + j * dimension + column, (rest * 2048).to(tl.float16), mask=inside)
+    tl.store(low + j * dimension + column, (residual * 2048).to(tl.float16), mask=inside)
     length = tl.sum(u * u, axis=0)
-    error = tl.sqrt(tl.sum(rest * rest, axis=0)) * 1.001
+    error = tl.sqrt(tl.sum(residual * residual, axis=0)) * 1.001
     tl.store(rough + j, tl.where(length < 1.01, error, float("inf")))
 
 
 def halve(
     rows: Float32[Tensor, "m d"],
 ) -> tuple[Float16[Tensor, "m d"], Float16[Tensor, "m d"], Float32[Tensor, " m"]]:
-    """h, 2048 l and |l| of unit rows u = h + l; inf where a row is longer than that."""
+    """Return h, 2048 l and |l| of unit rows u = h + l; |l| is inf for rows longer than 1."""
     high, low = (torch.empty_like(rows, dtype=torch.float16) for _ in range(2))
     rough = torch.empty(len(rows), device=rows.device)
     if len(rows) > 0:
@@ -173,18 +175,26 @@ def vote(
     prior: float = 0.0,
     precision: Precision = "certified",
 ) -> None:
-    """Writes to `source` whose direction each of the voters takes; formulas in `core.refine`.
+    """Write the index of the Gaussian whose direction each voter takes to `source`; formulas in `core.refine`.
 
     Args:
-        voters: neighbours in space should stand near each other, since they read the same.
-        neighbors: nearest first, -1 for none; at most MOST_NEIGHBORS.
-        directions: unit rows or 0, multiplied on tensor cores and added in float32.
-        row_of: the row of a Gaussian's direction; those of voters and their neighbours are read.
+        voters: Gaussians that vote. Neighbors in space should be close in this list, because they read the same rows.
+        neighbors: Neighbors of every Gaussian, nearest first, -1 for none; at most MOST_NEIGHBORS.
+        distance: Distances of the neighbors.
+        directions: Rows that are unit vectors or 0, multiplied on tensor cores and added in float32.
+        row_of: Row of every Gaussian's direction; read for the voters and their neighbors.
+        reliability: Reliability of every Gaussian.
+        source: Output.
+        tau: Threshold of the sigmoid.
+        gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.
-        own: evidence of a posterior vote against `prior` views; without it the vote is the paper's.
-        precision: of products of float32 directions. "halves": of two halves of 11 bits each. "certified": the same
-            winners, by the first halves alone where these decide. "first": writes only the latter. "tf32", "tf32x3",
-            "ieee": rounded to 11 bits, in three such parts, or unrounded. Half-precision directions are not rounded.
+        delta: Lead that a neighbor needs over the Gaussian itself.
+        own: Views that agree on each Gaussian's own direction, for a posterior vote (None: the paper's vote).
+        prior: Weight of the neighbors in a posterior vote, in views.
+        precision: Precision of the products of float32 directions. "halves": two halves of 11 bits each. "certified":
+            the same winners, computed from the first halves if these decide. "first": only writes winners that the
+            first halves decide. "tf32", "tf32x3", "ieee": rounded to 11 bits, in three such parts, or not rounded.
+            Half-precision directions are not rounded.
     """
     if len(voters) == 0:
         return
@@ -203,41 +213,41 @@ def vote(
 
 
 @triton.jit
-def _find_reliable(neighbors, reliability, found, n, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
+def _find_reliable(neighbors, reliability, out, n, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     row, slot = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
     inside = (row < n)[:, None] & (slot < k)[None, :]
     index = tl.load(neighbors + row[:, None] * k + slot[None, :], mask=inside, other=-1)
     reliable = tl.load(reliability + index, mask=index >= 0, other=0.0) > 0
-    tl.store(found + row, tl.max(reliable.to(tl.int8), axis=1), mask=row < n)
+    tl.store(out + row, tl.max(reliable.to(tl.int8), axis=1), mask=row < n)
 
 
 def any_reliable(neighbors: Int32[Tensor, "m k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
-    """Whether a neighbour of each Gaussian has R > 0."""
+    """Return a mask of the Gaussians with a neighbor that has R > 0."""
     n, k = neighbors.shape
-    found = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
+    mask = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
     if n > 0:
         _find_reliable[(triton.cdiv(n, _ROWS),)](
-            neighbors, reliability, found, n, k, ROWS=_ROWS, SLOTS=triton.next_power_of_2(k)
+            neighbors, reliability, mask, n, k, ROWS=_ROWS, SLOTS=triton.next_power_of_2(k)
         )
-    return found.bool()
+    return mask.bool()
 
 
 @triton.jit
-def _mark(voters, neighbors, read, count, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
+def _mark(voters, neighbors, out, count, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     row, slot = tl.program_id(0) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
     i = tl.load(voters + row, mask=row < count, other=0).to(tl.int64)
-    tl.store(read + i, tl.full([ROWS], 1, tl.int8), mask=row < count)
+    tl.store(out + i, tl.full([ROWS], 1, tl.int8), mask=row < count)
     inside = (row < count)[:, None] & (slot < k)[None, :]
     index = tl.load(neighbors + i[:, None] * k + slot[None, :], mask=inside, other=-1)
-    tl.store(read + index, tl.full([ROWS, SLOTS], 1, tl.int8), mask=index >= 0)
+    tl.store(out + index, tl.full([ROWS, SLOTS], 1, tl.int8), mask=index >= 0)
 
 
 def members(voters: Int[Tensor, " v"], neighbors: Int32[Tensor, "r k"], n: int) -> Int64[Tensor, " m"]:
-    """The voters and their neighbours, of n Gaussians, each once, ascending."""
+    """Return the distinct indices of the voters and their neighbors among n Gaussians, ascending."""
     k = neighbors.shape[1]
-    read = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
+    mask = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
     if len(voters) > 0:
         _mark[(triton.cdiv(len(voters), _ROWS),)](
-            voters, neighbors, read, len(voters), k, ROWS=_ROWS, SLOTS=triton.next_power_of_2(k)
+            voters, neighbors, mask, len(voters), k, ROWS=_ROWS, SLOTS=triton.next_power_of_2(k)
         )
-    return read.nonzero().squeeze(1)
+    return mask.nonzero().squeeze(1)

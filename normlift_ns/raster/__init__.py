@@ -1,1 +1,1 @@
-"""Compositing weights as the rasterizer that trained the scene gives them."""
+"""Rasterization with the compositing weights of the rasterizer that trained the scene."""

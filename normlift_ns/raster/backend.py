@@ -1,4 +1,4 @@
-"""What every way to rasterize looks like. The table of all of them is in `raster.backends`."""
+"""Interface of the rasterization backends. `raster.backends` has the table of all backends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from normlift_ns.raster.settings import RasterSettings
 
 @dataclass(frozen=True)
 class Job:
-    """What all views of one call have in common."""
+    """Inputs that all views of one call share."""
 
     scene: GaussianScene
     antialiased: bool
@@ -28,32 +28,32 @@ class Job:
     dtype: torch.dtype
     """Precision of the computation."""
     weight_power: int = 1
-    """Evidence sums A_ij ** weight_power."""
+    """Exponent p of the evidence, the sums of A_ij ** p."""
 
     @cached_property
     def world(self) -> World:
-        """The drawable Gaussians, ready for any camera."""
+        """The drawable Gaussians, prepared for any camera."""
         return to_world(self.scene, self.dtype)
 
     def seen_by(self, camera: Camera) -> tuple[Projected, Tiles]:
-        """What a camera sees of them, and in which tiles."""
+        """Project the Gaussians into a camera and list them by tile."""
         projected = project(self.world, camera, self.settings, self.antialiased)
         return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
 
 
 def check_gpu(backend: str, job: Job) -> None:
-    """Raises ValueError for a job that is not in float32 on a GPU."""
+    """Raise ValueError if a job is not in float32 on a GPU."""
     means = job.scene.means
     if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
         other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
         raise InputError(
-            f'backend "{backend}" computes in float32 on a GPU, not in {other} on {means.device.type}: leave the '
-            "backend out, and the fastest that can do it is taken"
+            f'backend "{backend}" computes in float32 on a GPU, not in {other} on {means.device.type}; omit the '
+            "backend to use the fastest one that can"
         )
 
 
 class Batch(NamedTuple):
-    """Some views of one size."""
+    """Views of one size that are rasterized together."""
 
     cameras: Sequence[Camera]
     labels: Sequence[Int32[Tensor, "h w"]]
@@ -61,45 +61,44 @@ class Batch(NamedTuple):
 
 
 class Backend(Protocol):
-    """One way to rasterize. `raster.numba`, `raster.gsplat` and `raster.triton` are backends as they stand, as
-    modules.
-    """
+    """Rasterization backend. The modules `raster.numba`, `raster.gsplat` and `raster.triton` implement it directly."""
 
     def check(self, job: Job, *, pictures: bool) -> None:
-        """Raises ValueError, with what to use instead, where the backend cannot do the job.
+        """Raise ValueError, with an alternative, if the backend cannot do the job.
 
         Args:
-            pictures: the job is to composite values; False: to sum evidence.
+            job: Inputs of the call.
+            pictures: Whether to composite values; False: sum evidence.
         """
         ...
 
     def in_flight(self, job: Job, camera: Camera) -> int:
-        """How many views of the size of this one `views_evidence` is best given at once."""
+        """Return the best number of views of this camera's size for one call of `views_evidence`."""
         ...
 
     def views_evidence(self, job: Job, batch: Batch) -> Entries:
-        """Sums of A_ij ** weight_power by (Gaussian, region)."""
+        """Return the sums of A_ij ** weight_power by (Gaussian, region)."""
         ...
 
     def composite(
         self, job: Job, camera: Camera, values: Float[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-        """sum_j A_ij values_j and sum_j A_ij of every pixel."""
+        """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
         ...
 
 
 @dataclass(frozen=True)
 class TileBackend:
-    """A backend that goes through projected Gaussians and tile lists, one view at a time, in any precision."""
+    """Backend that uses projected Gaussians and tile lists, one view at a time, in any precision."""
 
     kernels: Any
     """Module with `view_evidence` and `composite`."""
 
     def check(self, job: Job, *, pictures: bool) -> None:
-        """Nothing to refuse: any device will do."""
+        """Accept every job on any device."""
 
     def in_flight(self, job: Job, camera: Camera) -> int:
-        """One: views are independent of each other."""
+        """Return 1: views are independent of each other."""
         return 1
 
     def views_evidence(self, job: Job, batch: Batch) -> Entries:  # noqa: D102 (as in the protocol)
@@ -110,5 +109,5 @@ class TileBackend:
         self, job: Job, camera: Camera, values: Float[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
         projected, tiles = job.seen_by(camera)
-        drawn = values[projected.gaussian].to(projected.opacities.dtype)
-        return self.kernels.composite(projected, tiles, drawn, camera.width, camera.height, job.settings)
+        visible_values = values[projected.gaussian].to(projected.opacities.dtype)
+        return self.kernels.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)

@@ -1,4 +1,4 @@
-"""The table of all ways to rasterize, and which one suits a job."""
+"""Table of the rasterization backends, and the choice of one for a job."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from normlift_ns.raster.backend import Backend, Job, TileBackend
 
 
 def _torch() -> Backend:
-    from normlift_ns.raster import reference  # noqa: PLC0415 (each backend loads where it is used)
+    from normlift_ns.raster import reference  # noqa: PLC0415 (load each backend at its first use)
 
     return TileBackend(reference)
 
@@ -34,7 +34,7 @@ def _gsplat() -> Backend:
 def _triton() -> Backend:
     if not has_triton():
         raise InputError(
-            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; leave the backend out'
+            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
         )
     from normlift_ns.raster import triton  # noqa: PLC0415
 
@@ -42,21 +42,24 @@ def _triton() -> Backend:
 
 
 BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
-"""All backends by name, in the order from the most general to the fastest."""
+"""Backends by name, from the most general to the fastest."""
 
 
 def choose_backend(name: str, job: Job, *, pictures: bool) -> tuple[str, Backend]:
-    """The backend of a name, checked; "auto": the fastest that can do the job.
+    """Return a backend and its name; "auto" selects the fastest backend that can do the job.
 
     Args:
-        pictures: composite values; False: sum evidence.
+        name: Name of the backend, or "auto".
+        job: Inputs of the call.
+        pictures: Whether to composite values; False: sum evidence.
+
     Raises:
-        ValueError: an unknown name, or a backend that cannot do the job.
+        ValueError: If the name is unknown or the backend cannot do the job.
     """
     if name == "auto":
         name = _fastest(job)
     if name not in BACKENDS:
-        raise InputError(f"unknown backend {name!r}; it is one of {', '.join(get_args(BackendName))}")
+        raise InputError(f"unknown backend {name!r}, expected one of {', '.join(get_args(BackendName))}")
     backend = BACKENDS[name]()
     backend.check(job, pictures=pictures)
     return name, backend

@@ -1,7 +1,7 @@
-"""Evidence of views that were rasterized before, in files of several views, found again view by view.
+"""Cache of the evidence of rasterized views. A file holds several views, and each view is looked up on its own.
 
-A file is named by the keys of its views, and its head lists them. So a view is found whatever views surround it now:
-photographs that are added between old ones cost no more than themselves.
+A file is named after the keys of its views, and its header lists them. So a view is found whichever views surround it:
+if images are added between old ones, only the new images are rasterized.
 """
 
 from __future__ import annotations
@@ -17,55 +17,56 @@ from normlift_ns.core.disk.arrays import read_facts
 from normlift_ns.core.evidence import Evidence
 
 _VIEWS = "views"
-"""Among the remarks of a file: the keys of its views, in their order."""
-_KNOWN = 2**14
-"""Heads of files that a process remembers."""
+"""Header entry that holds the keys of the views, in their order."""
+_CACHED_HEADERS = 2**14
+"""File headers that a process keeps in memory."""
 
 
 class Place(NamedTuple):
-    """Where the evidence of one view is."""
+    """Location of the evidence of one view."""
 
     evidence: Evidence
-    """Of several views."""
+    """Evidence of several views."""
     view: int
-    """Which of them."""
+    """Index of the view in it."""
 
 
 def keep_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
-    """Writes the evidence of some views into a folder.
+    """Write the evidence of views to a file in a folder.
 
     Args:
-        keys: digests of what each view was made from, in the order of the views.
+        evidence: Evidence of the views.
+        folder: Folder of the cache.
+        keys: Digests of the inputs of each view, in the order of the views.
+
     Raises:
-        OSError: it cannot be written, for instance because the disk is full.
+        OSError: If the file cannot be written, for instance because the disk is full.
     """
     path = _path(folder, keys)
     evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)})
 
 
 def kept_views(folder: Path, keys: Sequence[str]) -> dict[int, Place]:
-    """The views, by their numbers, whose evidence a folder holds; those in damaged files, or in files that stand under
-    the name of others, are not among them.
-    """
-    found: dict[int, Place] = {}
-    for path, there in _candidates(folder, keys):
-        wanted = [number for number, key in enumerate(keys) if number not in found and key in there]
-        evidence = _load(path, len(there)) if len(wanted) > 0 else None
+    """Return the cached views by index into `keys`; files that are damaged or have the wrong name are skipped."""
+    places: dict[int, Place] = {}
+    for path, file_keys in _candidates(folder, keys):
+        wanted = [number for number, key in enumerate(keys) if number not in places and key in file_keys]
+        evidence = _load(path, len(file_keys)) if len(wanted) > 0 else None
         if evidence is not None:
-            found.update((number, Place(evidence, there.index(keys[number]))) for number in wanted)
-        if len(found) == len(keys):
+            places.update((number, Place(evidence, file_keys.index(keys[number]))) for number in wanted)
+        if len(places) == len(keys):
             break
-    return found
+    return places
 
 
 def known_views(folder: Path, keys: Sequence[str]) -> list[bool]:
-    """Whether the heads of the files in a folder list each of the views; nothing else of them is read."""
-    listed = {key for keys in _heads(folder).values() for key in keys}
+    """Return for each view whether the header of a file in a folder lists it; only headers are read."""
+    listed = {key for keys in _headers(folder).values() for key in keys}
     return [key in listed for key in keys]
 
 
 def joined_views(places: Mapping[int, Place]) -> Evidence:
-    """The evidence of views 0, 1, …, one after the other."""
+    """Return the evidence of all views in the order of their indices."""
     runs: list[tuple[Evidence, list[int]]] = []
     for number in sorted(places):
         evidence, view = places[number]
@@ -95,31 +96,32 @@ def _load(path: Path, count: int) -> Evidence | None:
 
 
 def _candidates(folder: Path, keys: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
-    """Files that hold any of the views, with the keys of theirs: the file of just these first, then those that hold
-    most of them.
+    """Yield the files that hold any of the views, with the keys of their views.
+
+    The file of exactly these views comes first, then those that hold the most of them.
     """
-    whole = _path(folder, keys)
-    if whole.is_file():
-        yield whole, list(keys)
-    heads, wanted = _heads(folder), set(keys)
-    shares = {path: len(wanted.intersection(there)) for path, there in heads.items()}
-    some = (path for path, share in shares.items() if share > 0 and path != whole)
-    yield from ((path, heads[path]) for path in sorted(some, key=lambda path: (-shares[path], path.name)))
+    exact = _path(folder, keys)
+    if exact.is_file():
+        yield exact, list(keys)
+    headers, wanted = _headers(folder), set(keys)
+    counts = {path: len(wanted.intersection(file_keys)) for path, file_keys in headers.items()}
+    paths = (path for path, count in counts.items() if count > 0 and path != exact)
+    yield from ((path, headers[path]) for path in sorted(paths, key=lambda path: (-counts[path], path.name)))
 
 
-def _heads(folder: Path) -> dict[Path, list[str]]:
-    """The keys that the head of every file names."""
+def _headers(folder: Path) -> dict[Path, list[str]]:
+    """Return the keys that the header of each file lists."""
     try:
         with os.scandir(folder) as entries:
             files = [(entry.path, entry.stat()) for entry in entries if entry.name.endswith(".safetensors")]
     except OSError:
         return {}
-    return {Path(path): _head(path, state.st_mtime_ns, state.st_size).split() for path, state in files}
+    return {Path(path): _header(path, stat.st_mtime_ns, stat.st_size).split() for path, stat in files}
 
 
-@lru_cache(_KNOWN)
-def _head(path: str, changed: int, size: int) -> str:
-    """What a file says of its views; nothing where it is damaged."""
+@lru_cache(_CACHED_HEADERS)
+def _header(path: str, modified: int, size: int) -> str:
+    """Return the keys in the header of a file, or an empty string if it is damaged."""
     try:
         return read_facts(Path(path)).get(_VIEWS, "")
     except (FileNotFoundError, ValueError):

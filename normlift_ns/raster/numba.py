@@ -1,4 +1,4 @@
-"""The compiled CPU rasterizer: the reference's sums, one thread per tile, touching only what a Gaussian reaches."""
+"""Compiled CPU rasterizer: the sums of the reference, one thread per tile, limited to the pixels a Gaussian reaches."""
 
 from __future__ import annotations
 
@@ -20,78 +20,80 @@ from normlift_ns.raster.backend import Batch, Job
 from normlift_ns.raster.projection import Projected, project
 from normlift_ns.raster.settings import RasterSettings
 
-_Three = tuple[Any, Any, Any]
+_Triple = tuple[Any, Any, Any]
 
 
 def check(job: Job, *, pictures: bool) -> None:
-    """Raises ValueError for a scene that is not on the CPU."""
+    """Raise ValueError if a scene is not on the CPU."""
     device = job.scene.means.device
     if device.type != "cpu":
-        raise InputError(
-            f'backend "numba" needs a scene on the CPU, this one is on {device}; move it, or use backend="torch"'
-        )
+        raise InputError(f'backend "numba" needs a scene on the CPU, found {device}; move it, or use backend="torch"')
 
 
 def in_flight(job: Job, camera: Camera) -> int:
-    """One: the kernels share a view among all cores."""
+    """Return 1: the kernels distribute one view over all cores."""
     return 1
 
 
 def views_evidence(job: Job, batch: Batch) -> Entries:
-    """Entries of one view; bitwise the same on every run."""
+    """Return the entries of one view, bitwise the same on every run."""
     (camera,), (labels,), (count,) = batch
     projected = project(job.world, camera, job.settings, job.antialiased)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
     size, label_map = job.settings.tile_size, labels.int().numpy()
-    most = np.diff(offsets) * kernels.count_labels(label_map, size)
-    first_slot, used = np.cumsum(most) - most, np.zeros(len(most), np.int64)
-    slots = tuple(np.empty(most.sum(), dtype) for dtype in (np.int32, np.int32, np.float64))  # touched where used
+    capacity = np.diff(offsets) * kernels.count_labels(label_map, size)
+    first_slot, used = np.cumsum(capacity) - capacity, np.zeros(len(capacity), np.int64)
+    slots = tuple(
+        np.empty(capacity.sum(), dtype) for dtype in (np.int32, np.int32, np.float64)
+    )  # pages are allocated when written
     kernels.fill(
         *(offsets, members, *arrays, shapes, projected.gaussian.numpy(), label_map),
         *(job.weight_power, size, limits, first_slot, used, slots, numba.get_num_threads()),
     )
-    found = kernels.merge(first_slot, used, slots, len(job.scene), count + 1)
-    gaussian, column, weight = map(torch.from_numpy, found)
+    merged = kernels.merge(first_slot, used, slots, len(job.scene), count + 1)
+    gaussian, column, weight = map(torch.from_numpy, merged)
     return Entries(gaussian, column, weight.to(job.dtype), (count,))
 
 
 def composite(
     job: Job, camera: Camera, values: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """sum_j A_ij values_j and sum_j A_ij of every pixel."""
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
     projected = project(job.world, camera, job.settings, job.antialiased)
     arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
-    drawn = values[projected.gaussian].to(job.dtype).contiguous().numpy()
-    image = np.zeros((camera.height, camera.width, values.shape[1]), drawn.dtype)
-    alpha = np.zeros((camera.height, camera.width), drawn.dtype)
+    visible_values = values[projected.gaussian].to(job.dtype).contiguous().numpy()
+    image = np.zeros((camera.height, camera.width, values.shape[1]), visible_values.dtype)
+    alpha = np.zeros((camera.height, camera.width), visible_values.dtype)
     kernels.draw(
-        *(offsets, members, *arrays, shapes, drawn, image, alpha),
+        *(offsets, members, *arrays, shapes, visible_values, image, alpha),
         *(job.settings.tile_size, limits, numba.get_num_threads()),
     )
     return torch.from_numpy(image), torch.from_numpy(alpha)
 
 
-def _tiles(projected: Projected, camera: Camera, settings: RasterSettings) -> tuple[_Three, _Three, _Three]:
-    """What the kernels read: means, conics and opacities; limits of alpha and transmittance; offsets and members of the
-    tiles, and shapes of the Gaussians.
+def _tiles(projected: Projected, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
+    """Return the input of the kernels in three groups.
+
+    These are means, conics and opacities; limits of alpha and transmittance; and offsets and members of the tiles with
+    shapes of the Gaussians.
     """
     means, conics, opacities = (
         x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities)
     )
     number = means.dtype.type
-    max_alpha, min_alpha, least = settings.max_alpha, settings.min_alpha, settings.min_transmittance
+    max_alpha, min_alpha, min_transmittance = settings.max_alpha, settings.min_alpha, settings.min_transmittance
     radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
     sizes = (camera.width, camera.height, settings.tile_size)
-    found = lists.assign(
+    tile_lists = lists.assign(
         means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
     )
-    return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(least)), found
+    return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
 
 
 def warm(*dtypes: torch.dtype) -> Thread:
-    """Loads the kernels for some precisions, or compiles those that no cache holds, while other work goes on.
+    """Load the kernels for some precisions in the background, and compile those that are not in a cache.
 
-    Nobody has to wait for the thread: whoever needs a kernel that is not there yet waits for that one only.
+    Callers need not wait for the thread: a call to a kernel that is not ready waits for this kernel only.
     """
 
     def work() -> None:
@@ -105,17 +107,17 @@ def warm(*dtypes: torch.dtype) -> Thread:
 
 
 def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
-    """Every kernel that is called from here, with the types of its arguments; those that draw pictures first."""
+    """Return every kernel that this module calls with the types of its arguments; those for rendering come first."""
     number = numba.float64 if dtype == torch.float64 else numba.float32
-    whole, wholes, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
+    integer, integers, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
     labels, members, limits = numba.int32[:, ::1], numba.int32[::1], numba.types.UniTuple(number, 3)
     slots = numba.types.Tuple((numba.int32[::1], numba.int32[::1], numba.float64[::1]))
-    listed = (wholes, members, table, table, numbers, numba.float64[:, ::1])
+    tile_lists = (integers, members, table, table, numbers, numba.float64[:, ::1])
     image = number[:, :, ::1]
     return [
-        (lists.assign, (table, table, numbers, table, whole, whole, whole, number, whole)),
-        (kernels.draw, (*listed, table, image, table, whole, limits, whole)),
-        (kernels.count_labels, (labels, whole)),
-        (kernels.fill, (*listed, wholes, labels, whole, whole, limits, wholes, wholes, slots, whole)),
-        (kernels.merge, (wholes, wholes, slots, whole, whole)),
+        (lists.assign, (table, table, numbers, table, integer, integer, integer, number, integer)),
+        (kernels.draw, (*tile_lists, table, image, table, integer, limits, integer)),
+        (kernels.count_labels, (labels, integer)),
+        (kernels.fill, (*tile_lists, integers, labels, integer, integer, limits, integers, integers, slots, integer)),
+        (kernels.merge, (integers, integers, slots, integer, integer)),
     ]

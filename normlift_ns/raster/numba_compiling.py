@@ -1,8 +1,7 @@
-"""How the parts of the CPU rasterizer are compiled, and the exponential function that they share.
+"""Decorators that compile the CPU rasterizer with numba, and the exponential function that its kernels share.
 
-numba keeps what it compiled until the file of the function that is called changes, and does not look at what that
-function calls in other files: after a change here or to `numba_lists.extent`, delete the .nbi files of this folder's
-`__pycache__`.
+numba caches a compiled function until its own file changes, and ignores changes to functions that it calls in other
+files. After a change here or to `numba_lists.extent`, delete the .nbi files in the `__pycache__` of this folder.
 """
 
 from __future__ import annotations
@@ -18,39 +17,42 @@ from numba.extending import overload
 
 _F = np.float32
 _MAGIC32, _MAGIC64 = _F(1.5 * 2**23), 1.5 * 2**52
-"""A number near 0 added to these is rounded to a whole one, which then stands in the last bits of the sum."""
+"""Adding a number near 0 rounds it to an integer, which then occupies the last bits of the sum."""
 _LOG2_E32, _LN2_HIGH32, _LN2_LOW32, _LEAST32 = _F(1.44269504088896341), _F(0.693359375), _F(-2.12194440e-4), _F(-87)
 _LOG2_E64, _LN2_HIGH64, _LN2_LOW64 = 1.44269504088896341, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
 _P3, _P4, _P5, _ONE = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1), _F(1)
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit`, with what it compiles kept on disk where there is a place for that."""
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return `numba.njit` with a cache on disk, if a cache folder is writable."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
             return numba.njit(cache=True, error_model="numpy", **options)(function)
-        except RuntimeError:  # neither beside the code nor in the user's cache
+        except RuntimeError:  # neither next to the code nor in the user's cache folder
             return numba.njit(error_model="numpy", **options)(function)
 
     return decorate
 
 
-kernel = compiled()
-fused_kernel = compiled(fastmath={"contract"})
-"""A product and a sum may be rounded once, as they are on a GPU."""
-parallel_kernel = compiled(parallel=True)
+kernel = cached_njit()
+fused_kernel = cached_njit(fastmath={"contract"})
+"""Decorator that allows fused multiply-add, which rounds once, as on a GPU."""
+parallel_kernel = cached_njit(parallel=True)
 
 
 def exp(x: float) -> float:
-    """e ** x for x <= 0 in the precision of x, within 1e-7 (float32) or 4e-16; e ** -87 and e ** -700 at the least."""
+    """Return e ** x for x <= 0 in the precision of x, within 1e-7 (float32) or 4e-16 (float64).
+
+    Results are at least e ** -87 (float32) or e ** -700 (float64).
+    """
     return math.exp(x)
 
 
 @overload(exp, jit_options={"error_model": "numpy", "fastmath": {"contract"}})
 def _compiled_exp(x):  # pragma: no cover (compiled)
-    """e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomials of Cephes' expf and of Taylor."""
+    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomials of Cephes' expf and of Taylor."""
 
     def single(x):
         x = x if x > _LEAST32 else _LEAST32
@@ -77,8 +79,9 @@ def _compiled_exp(x):  # pragma: no cover (compiled)
 
 @kernel
 def interleaved(position, count, threads):  # pragma: no cover (compiled)
-    """The number, below `count` or to be skipped, at a position that a static schedule gives to one of the threads, so
-    that each of them gets every n-th.
+    """Return the work item at a position of a static schedule, so that each thread gets every n-th item.
+
+    Skip items that are not below `count`.
     """
-    share = (count + threads - 1) // threads
-    return position % share * threads + position // share
+    per_thread = (count + threads - 1) // threads
+    return position % per_thread * threads + position // per_thread

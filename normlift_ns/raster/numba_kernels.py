@@ -1,8 +1,8 @@
-"""The compiled compositing of the CPU rasterizer, tile by tile, and its sums by (Gaussian, region).
+"""Compiled compositing of the CPU rasterizer, tile by tile, and its sums by (Gaussian, region).
 
-The rows of a tile are worked on LANES pixels at a time and without branches, so that the compiler makes vector
-instructions of them. Every thread writes to places of its own: there are no locks, and sums are the same on every run
-and with any number of threads.
+The rows of a tile are processed LANES pixels at a time and without branches, which the compiler turns into vector
+instructions. Every thread writes to its own memory. So locks are not needed, and the sums are the same on every run and
+with any number of threads.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from normlift_ns.raster.numba_lists import extent
 
 LANES = 16
 _MANY_LABELS = 4
-"""Labels of a tile beyond which sums are better taken pixel by pixel."""
+"""Number of labels in a tile above which sums are taken pixel by pixel."""
 _FEW_LABELS = 32
-"""Labels of a Gaussian that are kept sorted while they are met."""
+"""Number of labels of a Gaussian up to which they are sorted on insertion."""
 
 
 @kernel
 def _tile_labels(labels, box, local, distinct):  # pragma: no cover (compiled)
-    """Numbers the labels of a tile 0, 1, ... in order of appearance; fills local[row, chunk, lane] and
-    distinct[number], returns how many.
+    """Number the labels of a tile 0, 1, ... in order of appearance, and return their count.
+
+    The numbers are written to local[row, chunk, lane], and the labels to distinct[number].
     """
     top, left, bottom, right = box
     count, number = 0, 0
@@ -45,7 +46,7 @@ def _tile_labels(labels, box, local, distinct):  # pragma: no cover (compiled)
 
 @kernel
 def _label_ranges(local, box, ranges):  # pragma: no cover (compiled)
-    """Least and greatest number of the labels of each row of a tile."""
+    """Write the least and greatest label number of each row of a tile to `ranges`."""
     top, left, bottom, right = box
     for row in range(bottom - top):
         low = high = local[row, 0, 0]
@@ -64,7 +65,7 @@ def _tile_box(tile, height, width, size):  # pragma: no cover (compiled)
 
 @parallel_kernel
 def count_labels(labels, size):  # pragma: no cover (compiled)
-    """How many labels every tile has."""
+    """Return the number of labels of every tile."""
     height, width = labels.shape
     counts = np.empty(((height + size - 1) // size) * ((width + size - 1) // size), np.int64)
     for tile in numba.prange(counts.size):
@@ -75,8 +76,8 @@ def count_labels(labels, size):  # pragma: no cover (compiled)
 
 
 @kernel
-def _open(box, transmittance):  # pragma: no cover (compiled)
-    """Sets the transmittance of a tile to 1, and that of its places beyond the image to 0."""
+def _reset_transmittance(box, transmittance):  # pragma: no cover (compiled)
+    """Set the transmittance of a tile to 1, and to 0 outside the image."""
     top, left, bottom, right = box
     transmittance[:] = 0
     for y in range(bottom - top):
@@ -85,28 +86,28 @@ def _open(box, transmittance):  # pragma: no cover (compiled)
 
 
 @kernel
-def _first_open(pixels, place):  # pragma: no cover (compiled)
-    """The first place from the given one on whose transmittance is not closed; the number of places if all are."""
-    while place < pixels.size and not pixels[place] > 0:
-        place += 1
-    return place
+def _first_active(pixels, index):  # pragma: no cover (compiled)
+    """Return the first index from `index` on with a transmittance above 0; the number of pixels if there is none."""
+    while index < pixels.size and not pixels[index] > 0:
+        index += 1
+    return index
 
 
 @fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
-    """Composites one Gaussian over a tile: weights[row, chunk, lane] = A_ij, 0 where it is not drawn.
+    """Composite one Gaussian over a tile: weights[row, chunk, lane] = A_ij, or 0 if it is not drawn.
 
-    A pixel that has stopped has its transmittance with a minus sign.
+    The transmittance of a pixel that has stopped is stored with a minus sign.
 
     Returns:
-        First row that it may reach and the one behind the last; the others are not written.
+        The range (first, stop) of rows that the Gaussian may reach; other rows are not written.
     """
     top, left, bottom, right = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
     a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
     number = means2d.dtype.type
-    half, one, none = number(0.5), number(1), number(0)
+    half, one, zero = number(0.5), number(1), number(0)
     half_a, half_c = half * a, half * c
     down = (shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3])
     above, below = extent(down, left + 0.5 - u, right - 0.5 - u)
@@ -124,25 +125,25 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
                 alpha = opacity * exp(-sigma)
                 alpha = alpha if alpha < max_alpha else max_alpha
                 after = before * (one - alpha)
-                drawn = (before > none) & (sigma >= none) & (alpha >= min_alpha)
-                goes_on = after > min_transmittance
-                weights[row, chunk, lane] = alpha * before if drawn & goes_on else none
-                transmittance[row, chunk, lane] = (after if goes_on else -before) if drawn else before
+                drawn = (before > zero) & (sigma >= zero) & (alpha >= min_alpha)
+                continues = after > min_transmittance
+                weights[row, chunk, lane] = alpha * before if drawn & continues else zero
+                transmittance[row, chunk, lane] = (after if continues else -before) if drawn else before
     return first, stop
 
 
 @kernel
-def _met_labels(ranges, first, stop):  # pragma: no cover (compiled)
-    """The least number of a label in the given rows, and the one behind the greatest."""
-    least, most = ranges[first, 0], ranges[first, 1]
+def _label_span(ranges, first, stop):  # pragma: no cover (compiled)
+    """Return the range (least, stop) of label numbers in some rows."""
+    least, greatest = ranges[first, 0], ranges[first, 1]
     for row in range(first + 1, stop):
-        least, most = min(least, ranges[row, 0]), max(most, ranges[row, 1])
-    return least, most + 1
+        least, greatest = min(least, ranges[row, 0]), max(greatest, ranges[row, 1])
+    return least, greatest + 1
 
 
 @kernel
 def _sum_by_lane(weights, local, number, first, stop, power, lanes):  # pragma: no cover (compiled)
-    """Sum of A_ij ** power over the pixels with one label in the given rows; `lanes` is 0 before and after."""
+    """Return the sum of A_ij ** power over the pixels with one label in some rows; `lanes` is 0 before and after."""
     for row in range(first, stop):
         for chunk in range(weights.shape[1]):
             if power == 1:
@@ -163,7 +164,7 @@ def _sum_by_lane(weights, local, number, first, stop, power, lanes):  # pragma: 
 
 @kernel
 def _sum_by_pixel(weights, local, first, stop, power, sums):  # pragma: no cover (compiled)
-    """The same for all labels at once, added to sums[number]."""
+    """Add A_ij ** power of the pixels in some rows to sums[number], for all labels."""
     for row in range(first, stop):
         for chunk in range(weights.shape[1]):
             for lane in range(LANES):
@@ -190,8 +191,9 @@ def fill(  # pragma: no cover (compiled)
     slots,
     threads,
 ):
-    """One slot per (tile list entry, label of the tile) with weight, (Gaussian, label, sum of A_ij ** power): those of
-    a tile from first_slot[tile] on, used[tile] of them.
+    """Write one slot (Gaussian, label, sum of A_ij ** power) per tile list entry and label with a positive weight.
+
+    The slots of a tile start at first_slot[tile], and used[tile] of them are written.
     """
     slot_gaussian, slot_label, slot_weight = slots
     tiles, wide = offsets.size - 1, (size + LANES - 1) // LANES
@@ -208,22 +210,22 @@ def fill(  # pragma: no cover (compiled)
         box = _tile_box(tile, labels.shape[0], labels.shape[1], size)
         count = _tile_labels(labels, box, local, distinct)
         _label_ranges(local, box, ranges)
-        _open(box, transmittance)
+        _reset_transmittance(box, transmittance)
         sums, lanes = np.zeros(count), np.zeros(LANES)
-        many = count > _MANY_LABELS  # whatever rows a Gaussian reaches, so that they do not change its sums
-        pixels, slot, place = transmittance.reshape(-1), first_slot[tile], 0
+        many = count > _MANY_LABELS  # independent of the rows that a Gaussian reaches, so these do not change its sums
+        pixels, slot, active = transmittance.reshape(-1), first_slot[tile], 0
         for entry in range(offsets[tile], offsets[tile + 1]):
-            place = _first_open(pixels, place)
-            if place == pixels.size:
+            active = _first_active(pixels, active)
+            if active == pixels.size:
                 break
             g = members[entry]
             first, stop = _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits)
             if first >= stop:
                 continue
-            least, behind = _met_labels(ranges, first, stop)
+            least, end = _label_span(ranges, first, stop)
             if many:
                 _sum_by_pixel(weights, local, first, stop, power, sums)
-            for number in range(least, behind):
+            for number in range(least, end):
                 if many:
                     total, sums[number] = sums[number], 0.0
                 else:
@@ -237,9 +239,9 @@ def fill(  # pragma: no cover (compiled)
 
 @kernel
 def merge(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no cover (compiled)
-    """The slots sorted by (Gaussian, label + 1), those of the same place added up in the order of the tiles.
+    """Sort the slots by (Gaussian, label + 1), and add up equal ones in the order of the tiles.
 
-    A counting sort by Gaussian; the labels of each are added up in a row of their own and sorted.
+    This is a counting sort by Gaussian; the labels of each Gaussian are added up in a dense row and sorted.
     """
     slot_gaussian, slot_label, slot_weight = slots
     end = np.zeros(num_gaussians + 1, np.int64)
@@ -252,9 +254,9 @@ def merge(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no co
     columns, weights = np.empty(total, np.int32), np.empty(total)
     for tile in range(len(used)):
         for slot in range(first_slot[tile], first_slot[tile] + used[tile]):
-            place = end[slot_gaussian[slot]]
-            columns[place], weights[place] = slot_label[slot] + 1, slot_weight[slot]
-            end[slot_gaussian[slot]] = place + 1
+            position = end[slot_gaussian[slot]]
+            columns[position], weights[position] = slot_label[slot] + 1, slot_weight[slot]
+            end[slot_gaussian[slot]] = position + 1
     rows, sums, touched = np.empty(total, np.int32), np.zeros(num_columns), np.empty(num_columns, np.int32)
     written, start = 0, 0
     for g in range(num_gaussians):
@@ -262,11 +264,11 @@ def merge(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no co
         for i in range(start, end[g]):
             column = columns[i]
             if sums[column] == 0:
-                place = count
-                while place > 0 and count < _FEW_LABELS and touched[place - 1] > column:
-                    touched[place] = touched[place - 1]
-                    place -= 1
-                touched[place] = column
+                position = count
+                while position > 0 and count < _FEW_LABELS and touched[position - 1] > column:
+                    touched[position] = touched[position - 1]
+                    position -= 1
+                touched[position] = column
                 count += 1
             sums[column] += weights[i]
         start = end[g]
@@ -284,7 +286,7 @@ def merge(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no co
 def draw(  # pragma: no cover (compiled)
     offsets, members, means2d, conics, opacities, shapes, values, image, alpha, size, limits, threads
 ):
-    """image[y, x] = sum of A_ij values[j], alpha[y, x] = sum of A_ij."""
+    """Compute image[y, x] = sum of A_ij values[j] and alpha[y, x] = sum of A_ij."""
     tiles, wide = offsets.size - 1, (size + LANES - 1) // LANES
     for position in numba.prange((tiles + threads - 1) // threads * threads):
         tile = interleaved(position, tiles, threads)
@@ -296,11 +298,11 @@ def draw(  # pragma: no cover (compiled)
         )
         box = _tile_box(tile, image.shape[0], image.shape[1], size)
         top, left, bottom, right = box
-        _open(box, transmittance)
-        pixels, place = transmittance.reshape(-1), 0
+        _reset_transmittance(box, transmittance)
+        pixels, active = transmittance.reshape(-1), 0
         for entry in range(offsets[tile], offsets[tile + 1]):
-            place = _first_open(pixels, place)
-            if place == pixels.size:
+            active = _first_active(pixels, active)
+            if active == pixels.size:
                 break
             g = members[entry]
             first, stop = _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits)

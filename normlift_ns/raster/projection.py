@@ -1,5 +1,6 @@
-"""From Gaussians and a camera to depth-sorted 2D Gaussians and tile lists, exactly as gsplat does (utils.cuh,
-isect_tiles.cu).
+"""Projection of Gaussians to depth-sorted 2D Gaussians and tile lists, exactly as in gsplat.
+
+The gsplat sources are utils.cuh and isect_tiles.cu.
 """
 
 from __future__ import annotations
@@ -14,34 +15,37 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.raster.settings import RasterSettings
 
 _ENORMOUS = 2.0**60
-"""Covariance in square pixels above which it is multiplied by 1 / _ENORMOUS."""
+"""Covariances above this, in square pixels, are multiplied by 1 / _ENORMOUS."""
 
 
 class World(NamedTuple):
-    """The drawable Gaussians of a scene, ready for any camera."""
+    """The drawable Gaussians of a scene, prepared for any camera."""
 
     gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
     means: Float[Tensor, "m 3"]
-    """In the scene's own precision, which decides the order of drawing."""
+    """Centers in the precision of the scene, which decides the drawing order."""
     covariances: Float[Tensor, "m 3 3"]
     opacities: Float[Tensor, " m"]
 
 
 class Projected(NamedTuple):
-    """The Gaussians that a camera sees, nearest first."""
+    """The Gaussians visible in a camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
     means2d: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
     """Inverse covariance in square pixels: xx, xy, yy."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
-    """Half width and height in pixels of the rectangle that selects the tiles; whole numbers."""
+    """Half width and height of the rectangle that selects the tiles, in whole pixels."""
 
 
 class Tiles(NamedTuple):
-    """Lists of Gaussians by tile, row by row of tiles; members[offsets[t]:offsets[t + 1]] index `Projected`, nearest
-    first.
+    """Gaussians by tile, with tiles row by row.
+
+    Tile t has the rows members[offsets[t]:offsets[t + 1]] of `Projected`, nearest first.
     """
 
     offsets: Int64[Tensor, " tiles_plus_1"]
@@ -49,7 +53,7 @@ class Tiles(NamedTuple):
 
 
 def to_world(scene: GaussianScene, dtype: torch.dtype) -> World:
-    """Covariances R diag(scale ** 2) R^T of the drawable Gaussians."""
+    """Return the drawable Gaussians with their covariances R diag(scale ** 2) R^T."""
     gaussian = scene.drawable.nonzero().squeeze(1)
     quats, scales, opacities = (x[gaussian].to(dtype) for x in (scene.quats, scene.scales, scene.opacities))
     w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True)).unbind(1)
@@ -66,11 +70,14 @@ def to_world(scene: GaussianScene, dtype: torch.dtype) -> World:
 
 
 def project(world: World, camera: Camera, settings: RasterSettings, antialiased: bool) -> Projected:
-    """Projects, blurs by eps2d, drops what the image cannot show, and sorts by depth (equal depths by index).
+    """Project the Gaussians, blur them by eps2d, drop invisible ones, and sort by depth (equal depths by index).
 
     Args:
-        antialiased: scale opacities by sqrt(det / det of the blurred covariance), splatfacto's rasterize_mode
-            "antialiased".
+        world: Gaussians.
+        camera: Camera of the image.
+        settings: Constants of the rasterizer.
+        antialiased: Whether to scale opacities by sqrt(det / det of the blurred covariance), like splatfacto's
+            rasterize_mode "antialiased".
     """
     dtype, device = world.opacities.dtype, world.opacities.device
     pose = camera.world_to_camera.to(device)
@@ -91,7 +98,7 @@ def project(world: World, camera: Camera, settings: RasterSettings, antialiased:
     )
     to_image = jacobian @ rotation
     covariance = to_image @ world.covariances[near] @ to_image.transpose(1, 2)
-    # Of enormous Gaussians in smaller units: their determinants are no float32 numbers. A power of two rounds nothing.
+    # Scale down enormous Gaussians, whose determinants overflow in float32. A power of two causes no rounding.
     unit = torch.where(covariance.diagonal(dim1=1, dim2=2).amax(dim=1) > _ENORMOUS, 1 / _ENORMOUS, 1.0).to(dtype)
     a, b, c = (unit * x for x in (covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]))
     det_sharp = a * c - b * b
@@ -102,7 +109,7 @@ def project(world: World, camera: Camera, settings: RasterSettings, antialiased:
         opacities = opacities * (det_sharp / det).clamp(min=settings.min_compensation**2).sqrt()
 
     if settings.per_axis:
-        # As many standard deviations as alpha >= min_alpha reaches; none is NaN, so that it is not seen.
+        # Standard deviations up to which alpha >= min_alpha; NaN if there are none, which drops the Gaussian.
         sigmas = (2 * (opacities / settings.min_alpha).log()).sqrt().clamp(max=settings.radius_sigmas)
         radii = (sigmas[:, None] * (torch.stack([a, c], 1) / unit[:, None]).sqrt()).ceil()
     else:
@@ -110,26 +117,29 @@ def project(world: World, camera: Camera, settings: RasterSettings, antialiased:
         larger = mean + torch.maximum(mean * mean - det, unit * unit * settings.min_discriminant).sqrt()
         radii = (settings.radius_sigmas * (larger / unit).sqrt()).ceil()[:, None].expand(-1, 2)
     u, v = fx * x / z + cx, fy * y / z + cy
-    seen = (det > 0) & (radii.isfinite() & (radii > 0)).all(1)
-    seen &= (u + radii[:, 0] > 0) & (u - radii[:, 0] < width) & (v + radii[:, 1] > 0) & (v - radii[:, 1] < height)
+    visible = (det > 0) & (radii.isfinite() & (radii > 0)).all(1)
+    visible &= (u + radii[:, 0] > 0) & (u - radii[:, 0] < width) & (v + radii[:, 1] > 0) & (v - radii[:, 1] < height)
     conics = unit[:, None] * (torch.stack([c, -b, a], 1) / det[:, None])
-    seen = (seen & conics.isfinite().all(1)).nonzero().squeeze(1)
+    visible = (visible & conics.isfinite().all(1)).nonzero().squeeze(1)
     return Projected(
-        world.gaussian[near[seen]], torch.stack([u, v], 1)[seen], conics[seen], opacities[seen], radii[seen]
+        world.gaussian[near[visible]],
+        torch.stack([u, v], 1)[visible],
+        conics[visible],
+        opacities[visible],
+        radii[visible],
     )
 
 
 def camera_depths(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, " m"]:
-    """Distance of every mean along the camera's axis, as gsplat rounds it."""
+    """Return the distance of every mean along the camera's axis, rounded as in gsplat."""
     return _camera_axis(means, camera.world_to_camera.to(means.device)[2])
 
 
 def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float[Tensor, " m"]:
-    """One camera coordinate of all means, rounded as CUDA rounds R p + t: b y, fused + a x, fused + c z, + t.
+    """Return one camera coordinate of all means, rounded as CUDA rounds R p + t: b y, fused + a x, fused + c z, + t.
 
-    Where Gaussians overlap at the same distance, the order of drawing hangs on the last bit. A product of two float32
-    numbers is exact in
-    float64, so that rounding its sum once is a fused multiply-add.
+    The drawing order of overlapping Gaussians at the same distance depends on the last bit. A product of two float32
+    numbers is exact in float64, so rounding its sum once is a fused multiply-add.
     """
     dtype, (x, y, z) = means.dtype, means.double().unbind(1)
     a, b, c, t = row.to(dtype).double()
@@ -140,7 +150,7 @@ def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float
 
 
 def assign_tiles(projected: Projected, width: int, height: int, tile_size: int) -> Tiles:
-    """Lists, for every tile, the Gaussians whose rectangle touches it."""
+    """List, for every tile, the Gaussians whose rectangle touches it."""
     columns, rows = -(-width // tile_size), -(-height // tile_size)
     u, v = (projected.means2d / tile_size).unbind(1)
     across, down = (projected.radii / tile_size).unbind(1)

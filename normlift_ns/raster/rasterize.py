@@ -1,4 +1,4 @@
-"""`rasterize_evidence`: a loop over views. `render`: one view. Both leave the sums to a backend."""
+"""Rasterization of evidence (`rasterize_evidence`) and of values (`render`) with a backend."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from normlift_ns.raster.backends import choose_backend
 from normlift_ns.raster.settings import RasterSettings
 
 Progress = Callable[[int, int | None], None]
-_ADVICE = "rasterize at a fraction of the resolution (ns-normlift --lift-downscale 2), or on the CPU (--device cpu)"
+_ADVICE = "rasterize at a lower resolution (ns-normlift --lift-downscale 2) or on the CPU (--device cpu)"
 
 
 def rasterize_evidence(
@@ -38,33 +38,35 @@ def rasterize_evidence(
     dtype: torch.dtype | None = None,
     progress: Progress | None = None,
 ) -> Evidence:
-    """Evidence E_js = sum of A_ij over the pixels i of region s, for all views.
+    """Compute the evidence E_js = sum of A_ij over the pixels i of region s, for all views.
 
-    The weights A_ij are those of the rasterizer that trained the scene, its cut-offs and its order of drawing included.
+    The weights A_ij are those of the rasterizer that trained the scene, including its cut-offs and its drawing order.
 
-    Views stream: cameras, labels and num_regions may be generators, and nothing of a view is kept but its entries.
+    Views are streamed: cameras, labels and num_regions may be generators, and only the entries of a view are kept.
 
     Args:
         scene: N Gaussians. Those with parameters that are not finite or out of range (`GaussianScene.drawable`) are
             not drawn; they are counted in the result, with a warning.
-        cameras: one per view.
-        labels: per view an integer tensor [height, width] of view-local region ids 0, 1, …; -1 = unlabelled;
-            -2 = masked: the pixel is no observation at all, whatever `lift` does with unlabelled ones.
-        num_regions: regions (columns, feature rows) per view; by default the largest id + 1. Needed where a table has
-            rows that no pixel shows.
-        backend: "torch" (the reference, any device and precision), "numba" (compiled, CPU), "triton" (fast, GPU,
-            float32), "gsplat" (stock gsplat, GPU, float32, weight_power 1, by the rules of the installed version or
-            older ones), "auto" (the fastest for the scene's device and the precision).
-        rasterize_mode: as the scene was trained, splatfacto's `rasterize_mode`.
-        weight_power: sums A_ij ** power. 1: the paper. 2: as SFS's code. 0: counts the pixels that a Gaussian
+        cameras: One camera per view.
+        labels: One integer tensor [height, width] per view, with region ids 0, 1, … of this view. -1 means unlabeled.
+            -2 means masked: the pixel is not an observation, whatever `lift` does with unlabeled pixels.
+        num_regions: Number of regions (columns, feature rows) per view (default: largest id + 1). Needed if a feature
+            table has rows without pixels.
+        backend: "torch" (reference; any device and precision), "numba" (compiled; CPU), "triton" (fast; GPU, float32),
+            "gsplat" (stock gsplat; GPU, float32, weight_power 1, rules of the installed version or older) or "auto"
+            (the fastest for the device of the scene and the precision).
+        rasterize_mode: `rasterize_mode` of splatfacto in the training of the scene.
+        weight_power: Exponent of the summed A_ij. 1: the paper. 2: the code of SFS. 0: number of pixels that a Gaussian
             contributes to.
-        settings: constants of the rasterizer; those of gsplat 1.4.0 by default. See `RasterSettings.of_gsplat`.
-        dtype: precision of the computation and of the weights; by default the scene's. Sums are always taken in
+        settings: Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`.
+        dtype: Precision of the computation and of the weights (default: that of the scene). Sums are always taken in
             float64.
-        progress: called after every view with (views done, number of views or None).
+        progress: Function called after every view with (views done, number of views or None).
+
     Raises:
-        ValueError: an unknown option, labels of another size or type than their camera, an id below -2 or not below
-            its `num_regions`, or iterables of different lengths; the message names the view.
+        ValueError: If an option is unknown, labels are not integers or differ from their camera in size, or an id is
+            below -2 or not below its `num_regions`. Also if the iterables have different lengths. The message names
+            the view.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
@@ -72,7 +74,7 @@ def rasterize_evidence(
     >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
     >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
     >>> evidence = rasterize_evidence(scene, [camera, camera], [torch.tensor([[0]]), torch.tensor([[-1]])])
-    >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25: seen through the first
+    >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25: behind the first one
     ([0.5, 0.25], [0.5, 0.25])
     """
     if weight_power not in (0, 1, 2):
@@ -90,23 +92,24 @@ def rasterize_evidence(
     parts: list[Entries] = []
     done = 0
     with torch.no_grad():
-        for flight in _flights(_zip_views(cameras, labels, num_regions), lambda camera: chosen.in_flight(job, camera)):
-            for i, (camera, there, _) in enumerate(flight):
-                _check_map(done + i, camera, there)
+        views = _zip_views(cameras, labels, num_regions)
+        for batch in _batches(views, lambda camera: chosen.in_flight(job, camera)):
+            for i, (camera, label_map, _) in enumerate(batch):
+                _check_map(done + i, camera, label_map)
             device = scene.means.device
-            ends = torch.stack([torch.stack(x.aminmax()).to(device, torch.int64) for _, x, _ in flight]).tolist()
+            ranges = torch.stack([torch.stack(x.aminmax()).to(device, torch.int64) for _, x, _ in batch]).tolist()
             checked = [
-                (camera, there, _check_range(done + i, ends[i][0], ends[i][1], count))
-                for i, (camera, there, count) in enumerate(flight)
+                (camera, label_map, _check_range(done + i, ranges[i][0], ranges[i][1], count))
+                for i, (camera, label_map, count) in enumerate(batch)
             ]
 
             def sums(views: Sequence[tuple[Camera, Tensor, int]]) -> Entries:
-                seen, maps, counts = zip(*views)
-                there = [labels.to(scene.means.device, torch.int32) for labels in maps]
-                return chosen.views_evidence(job, Batch(seen, there, counts))
+                view_cameras, label_maps, counts = zip(*views)
+                on_device = [labels.to(scene.means.device, torch.int32) for labels in label_maps]
+                return chosen.views_evidence(job, Batch(view_cameras, on_device, counts))
 
             parts += in_parts(sums, checked, _ADVICE)
-            for _ in flight:
+            for _ in batch:
                 done += 1
                 if progress is not None:
                     progress(done, total)
@@ -116,10 +119,10 @@ def rasterize_evidence(
 def backend_of(
     scene: GaussianScene, backend: BackendName, *, settings: RasterSettings, dtype: torch.dtype, weight_power: int
 ) -> BackendName:
-    """The name of the backend that `rasterize_evidence` would use.
+    """Return the name of the backend that `rasterize_evidence` would use.
 
     Raises:
-        ValueError: none of that name, or it cannot do the job; says what to use instead.
+        ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
     """
     job = _job(scene, "classic", settings, dtype, weight_power)
     return cast(BackendName, choose_backend(backend, job, pictures=False)[0])
@@ -135,15 +138,22 @@ def render(
     settings: RasterSettings | None = None,
     dtype: torch.dtype | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Composites any per-Gaussian values: sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
+    """Composite values of Gaussians: sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
 
     Args:
-        values: colours, relevancies, reliability, …; not premultiplied.
-        backend: as in `rasterize_evidence`.
+        scene: N Gaussians.
+        camera: Camera of the image.
+        values: Colors, relevancies, reliability, …; not premultiplied.
+        backend: As in `rasterize_evidence`.
+        rasterize_mode: As in `rasterize_evidence`.
+        settings: As in `rasterize_evidence`.
+        dtype: As in `rasterize_evidence`.
+
     Returns:
         The image without background (add background * (1 - alpha)), and alpha in 0..1.
+
     Raises:
-        ValueError: values of another length, an unknown option.
+        ValueError: If the values do not have one row per Gaussian, or an option is unknown.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, render
@@ -170,17 +180,23 @@ def render_picture(
     mode: RasterizeMode | None = None,
     gaussians: GaussianScene | None = None,
 ) -> UInt8[Tensor, "h w 3"]:
-    """The trained scene as a camera sees it, sRGB on its background: by the scene's own renderer if it has one.
+    """Render the trained scene in sRGB on its background, with the scene's own renderer if it has one.
 
     Args:
-        settings, mode: other constants and another mode than those of the training, for pictures of another size.
-        gaussians: those of the scene on the device that renders; the picture is on the CPU.
+        scene: Scene to render.
+        camera: Camera of the image.
+        settings: Constants of the rasterizer, if they differ from the training, for images of another size.
+        mode: rasterize_mode, if it differs from the training.
+        gaussians: Gaussians of the scene on the rendering device (default: on the device of the scene).
+
+    Returns:
+        The image on the CPU.
     """
     if scene.renderer is not None:
         return scene.renderer(camera)
-    how = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
-    there = gaussians or scene.gaussians
-    color, alpha = render(there, camera, scene.colors(camera).to(there.means.device), **how)
+    options = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
+    gaussians = gaussians or scene.gaussians
+    color, alpha = render(gaussians, camera, scene.colors(camera).to(gaussians.means.device), **options)
     color = color + (1 - alpha)[:, :, None] * scene.background.to(color)
     return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
@@ -198,14 +214,14 @@ def _job(
     return Job(scene, antialiased, settings or RasterSettings(), dtype or scene.means.dtype, weight_power)
 
 
-def _flights(
-    views: Iterator[tuple[Camera, Tensor, int | None]], most: Callable[[Camera], int]
+def _batches(
+    views: Iterator[tuple[Camera, Tensor, int | None]], batch_size: Callable[[Camera], int]
 ) -> Iterator[list[tuple[Camera, Tensor, int | None]]]:
-    """Consecutive views of one size, at most so many at once."""
+    """Yield batches of consecutive views of one size."""
     for _, group in groupby(views, key=lambda view: (view[0].width, view[0].height)):
         same_size = iter(group)
         for first in same_size:
-            yield [first, *islice(same_size, most(first[0]) - 1)]
+            yield [first, *islice(same_size, batch_size(first[0]) - 1)]
 
 
 def _zip_views(
@@ -239,9 +255,9 @@ def _check_map(index: int, camera: Camera, labels: Tensor) -> None:
 
 
 def _check_range(index: int, low: int, high: int, count: int | None) -> int:
-    """The number of regions of a view."""
+    """Check the range of the labels of a view, and return its number of regions."""
     if low < MASKED:
-        raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabelled, -2 masked")
+        raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabeled, -2 masked")
     if count is not None and high >= count:
-        raise InputError(f"labels of view {index} contain region {high}, but num_regions says {count}")
+        raise InputError(f"labels of view {index} contain region {high}, but num_regions is {count}")
     return max(high, UNLABELED) + 1 if count is None else count

@@ -1,5 +1,6 @@
-"""The reference rasterizer: plain torch, tile by tile, any device and precision. Slow, and the measure of every other
-backend.
+"""Reference rasterizer in plain torch: tile by tile, on any device and in any precision.
+
+It is slow, and all other backends are tested against it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from normlift_ns.raster.settings import RasterSettings
 
 
 def compositing_weights(alpha: Float[Tensor, "p k"], min_transmittance: float) -> Float[Tensor, "p k"]:
-    """A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) of K Gaussians, nearest first, in P pixels.
+    """Return A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) of K Gaussians, nearest first, in P pixels.
 
     A pixel stops before the first Gaussian that would leave `min_transmittance` or less.
 
@@ -40,16 +41,16 @@ def view_evidence(
     weight_power: int,
     settings: RasterSettings,
 ) -> Entries:
-    """Sums of A_ij ** weight_power by (Gaussian, region) of one view; region -1 collects the unlabelled pixels."""
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    """Return the sums of A_ij ** weight_power by (Gaussian, region) of one view; region -1 is the unlabeled pixels."""
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for member, (rows, columns), a in _tiles(projected, tiles, labels.shape[1], labels.shape[0], settings):
         weight = torch.where(a > 0, a.double() ** weight_power, 0.0)
         region, local = labels[rows, columns].flatten().unique(return_inverse=True)
         sums = weight.new_zeros(region.numel(), member.numel()).index_add_(0, local, weight)
         r, k = (sums * (region >= UNLABELED)[:, None]).nonzero(as_tuple=True)
-        found.append((projected.gaussian[member[k]], region[r], sums[r, k]))
-    none = torch.zeros(0, dtype=torch.int64, device=labels.device)
-    gaussian, region, weight = (torch.cat(parts) for parts in zip((none, none, none.double()), *found))
+        parts.append((projected.gaussian[member[k]], region[r], sums[r, k]))
+    empty = torch.zeros(0, dtype=torch.int64, device=labels.device)
+    gaussian, region, weight = (torch.cat(part) for part in zip((empty, empty, empty.double()), *parts))
     gaussian, column, weight = sum_duplicates(gaussian, region + 1, weight)
     return Entries(gaussian, column, weight.to(projected.opacities.dtype), (num_regions,))
 
@@ -57,7 +58,7 @@ def view_evidence(
 def composite(
     projected: Projected, tiles: Tiles, values: Float[Tensor, "m c"], width: int, height: int, settings: RasterSettings
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """sum_j A_ij values_j and sum_j A_ij of every pixel i (eq. 2 of the paper without its background)."""
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel i (eq. 2 of the paper without its background)."""
     image, alpha = values.new_zeros(height, width, values.shape[1]), values.new_zeros(height, width)
     for member, (rows, columns), weight in _tiles(projected, tiles, width, height, settings):
         area = image[rows, columns]
@@ -69,7 +70,7 @@ def composite(
 def _tiles(
     projected: Projected, tiles: Tiles, width: int, height: int, settings: RasterSettings
 ) -> Iterator[tuple[Tensor, tuple[slice, slice], Tensor]]:
-    """For every tile that shows anything: its K Gaussians, its pixels as slices of the image, and A_ij [pixels, K]."""
+    """Yield the K Gaussians, the pixels as slices of the image, and A_ij [pixels, K] of every tile with Gaussians."""
     size, device, dtype = settings.tile_size, projected.means2d.device, projected.means2d.dtype
     across = -(-width // size)
     bounds = tiles.offsets.tolist()

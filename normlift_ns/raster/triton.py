@@ -1,4 +1,4 @@
-"""The fast GPU path, all of it our own kernels: projection, exact lists of cells, sums and pictures."""
+"""Fast GPU backend with Triton kernels for projection, exact lists of cells, sums and compositing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_equal_keys
 from normlift_ns.errors import InputError
-from normlift_ns.kernels import composite as pictures
+from normlift_ns.kernels import composite as kernel
 from normlift_ns.kernels.lists import Grid, Lists, list_cells
 from normlift_ns.kernels.projection import Rules, Splats, project
 from normlift_ns.kernels.regions import Limits, places, region_sums
@@ -20,17 +20,23 @@ from normlift_ns.raster.backend import Batch, Job, check_gpu
 from normlift_ns.raster.settings import RasterSettings
 
 CELL, SMALL_CELL = (16, 16), (16, 8)
-"""Largest width and height in pixels of the cells that have lists of their own. Where there are many Gaussians, few
-pixels of a cell feel the same ones, and smaller cells pay."""
+"""Largest width and height in pixels of the cells that have their own lists.
+
+With many Gaussians, few pixels of a cell share the same ones, and smaller cells are faster.
+"""
 _MANY = 4_000_000
-_ELEMENTS, _MOST_VIEWS = 2**26, 16
-"""Most views in flight times Gaussians, and most views: each takes a byte per Gaussian, and 120 of those it sees."""
+"""Number of Gaussians from which on small cells are used."""
+_ELEMENTS, _MAX_VIEWS = 2**26, 16
+"""Largest number of views in a batch times Gaussians, and of views in a batch.
+
+A view takes a byte per Gaussian, and 120 bytes per visible Gaussian.
+"""
 _SHORT = 2**15
-"""Cells of all views in flight that an int16 numbers, which takes half the time of an int32 to sort."""
+"""Largest number of cells in a batch that int16 can index, which takes half the time of int32 to sort."""
 
 
 def check(job: Job, *, pictures: bool = False) -> None:
-    """Raises ValueError for a scene that is not float32 on a GPU, and for tiles that cannot be halved into cells."""
+    """Raise ValueError if a scene is not float32 on a GPU, or tiles cannot be divided into cells."""
     size = job.settings.tile_size
     check_gpu("triton", job)
     if size < 1 or size & (size - 1) != 0:
@@ -38,10 +44,12 @@ def check(job: Job, *, pictures: bool = False) -> None:
 
 
 def see(job: Job, cameras: Sequence[Camera], *, cull: bool = True) -> tuple[Grid, Splats, Lists]:
-    """What cameras of one size see of a scene, and in which cells of their images.
+    """Project the Gaussians into cameras of one size, and list them by cell.
 
     Args:
-        cull: see `list_cells`.
+        job: Inputs of the call.
+        cameras: Cameras of one size.
+        cull: See `list_cells`.
     """
     scene, settings = job.scene, job.settings
     rows = [
@@ -51,18 +59,18 @@ def see(job: Job, cameras: Sequence[Camera], *, cull: bool = True) -> tuple[Grid
     views = torch.stack(rows).to(scene.means.device)
     width, height = cameras[0].width, cameras[0].height
     grid = _grid(job, cameras[0])
-    seen = project(
+    projected = project(
         scene.means, scene.quats, scene.scales, scene.opacities, scene.drawable, views, width, height,
         Rules(*(getattr(settings, name) for name in Rules._fields)),
         antialiased=job.antialiased, per_axis=settings.per_axis,
     )  # fmt: skip
-    return grid, seen, list_cells(seen, len(cameras), grid, settings.min_alpha, cull=cull)
+    return grid, projected, list_cells(projected, len(cameras), grid, settings.min_alpha, cull=cull)
 
 
 def in_flight(job: Job, camera: Camera) -> int:
-    """How many views of one size are best taken at once."""
-    most = min(_ELEMENTS // max(1, len(job.scene)), (_SHORT - 1) // max(1, _grid(job, camera).cells), _MOST_VIEWS)
-    return max(1, most)
+    """Return the best number of views of one size in a batch."""
+    cells = _grid(job, camera).cells
+    return max(1, min(_ELEMENTS // max(1, len(job.scene)), (_SHORT - 1) // max(1, cells), _MAX_VIEWS))
 
 
 def _grid(job: Job, camera: Camera) -> Grid:
@@ -72,31 +80,34 @@ def _grid(job: Job, camera: Camera) -> Grid:
 
 
 def views_evidence(job: Job, batch: Batch, *, cull: bool = True) -> Entries:
-    """Entries of some views of one size, all in flight at once; bitwise the same on every run.
+    """Return the entries of views of one size, rasterized together; bitwise the same on every run.
 
     Args:
-        cull: see `list_cells`; the entries do not depend on it.
+        job: Inputs of the call.
+        batch: Views.
+        cull: See `list_cells`; the entries do not depend on it.
     """
-    grid, seen, lists = see(job, batch.cameras, cull=cull)
+    grid, projected, lists = see(job, batch.cameras, cull=cull)
     columns = max(batch.num_regions) + 1
     labels = torch.stack(list(batch.labels))
-    found = region_sums(
-        seen.splats, lists, labels, grid, columns=columns, limits=_limits(job.settings), weight_power=job.weight_power
-    )
-    key, weight = sum_equal_keys(*found)
-    # Splats are numbered by Gaussian and then by view: keys in ascending order are entries in theirs.
+    sums = region_sums(
+        projected.splats, lists, labels, grid, columns=columns, limits=_limits(job.settings),
+        weight_power=job.weight_power,
+    )  # fmt: skip
+    key, weight = sum_equal_keys(*sums)
+    # Splats are sorted by Gaussian and then by view, so ascending keys have the order of entries.
     first = torch.tensor([0, *(count + 1 for count in batch.num_regions)]).cumsum(0).int().to(key.device)
-    return Entries(*places(key, seen.seen, first, columns), weight, tuple(batch.num_regions))
+    return Entries(*places(key, projected.seen, first, columns), weight, tuple(batch.num_regions))
 
 
 def composite(
     job: Job, camera: Camera, values: Float32[Tensor, "n c"]
 ) -> tuple[Float32[Tensor, "h w c"], Float32[Tensor, "h w"]]:
-    """sum_j A_ij values_j and sum_j A_ij of every pixel."""
-    grid, seen, lists = see(job, [camera])
-    return pictures.composite(
-        seen.splats, lists, seen.seen, values.to(job.scene.means), grid, _limits(job.settings)
-    )  # fmt: skip
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
+    grid, projected, lists = see(job, [camera])
+    return kernel.composite(
+        projected.splats, lists, projected.seen, values.to(job.scene.means), grid, _limits(job.settings)
+    )
 
 
 def _limits(settings: RasterSettings) -> Limits:

@@ -89,7 +89,7 @@ def test_chunks_and_a_gpus_components_change_nothing(monkeypatch):
     monkeypatch.undo()
     turned = clean_masks(masks.permute(0, 2, 1), 40)  # another order in memory
     assert torch.equal(turned[0], expected[0].permute(0, 2, 1)) and torch.equal(turned[1], expected[1])
-    monkeypatch.setattr(small_regions, "_joined_by_scipy", small_regions._joined_by_torch)
+    monkeypatch.setattr(small_regions, "_components_by_scipy", small_regions._components_by_torch)
     assert all(map(torch.equal, clean_masks(masks, 40), expected))
     order = torch.from_numpy(np.random.default_rng(0).permutation(3000))  # a long chain is one component
-    assert bool((small_regions._joined_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())
+    assert bool((small_regions._components_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())

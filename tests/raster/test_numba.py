@@ -17,7 +17,7 @@ from normlift_ns import Camera, GaussianScene, RasterSettings, rasterize_evidenc
 from normlift_ns.raster import numba as backend
 from normlift_ns.raster import numba_kernels as kernels
 from normlift_ns.raster.backend import Batch, Job
-from normlift_ns.raster.numba_compiling import compiled
+from normlift_ns.raster.numba_compiling import cached_njit
 from normlift_ns.raster.projection import assign_tiles, project
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
 
@@ -162,6 +162,6 @@ def test_without_a_place_for_a_cache_kernels_are_compiled_anew(monkeypatch: pyte
 
     with monkeypatch.context() as patch:
         patch.setattr(numba, "njit", nowhere)
-        twice = compiled()(lambda x: 2 * x)
+        twice = cached_njit()(lambda x: 2 * x)
     assert twice(21) == 42
     assert asked == [True, False]

@@ -1,1 +1,1 @@
-"""SAM's automatic masks, and the rules that make label maps of them."""
+"""Networks of the SAM family, their automatic masks, and label maps."""

@@ -1,4 +1,4 @@
-"""SAM's network: images become embeddings, points on them masks at the resolution of the network."""
+"""Networks of the SAM family: images to embeddings, and points to masks at the resolution of the network."""
 
 from __future__ import annotations
 
@@ -23,22 +23,25 @@ from normlift_ns.options import SamPrecision
 _MEAN = torch.tensor([123.675, 116.28, 103.53])[:, None, None]
 _STD = torch.tensor([58.395, 57.12, 57.375])[:, None, None]
 _BATCHES = {"cuda": (5, 256, 64), "cpu": (1, 16, 16)}
-"""Images, prompts and masks at a time."""
-_DEFAULT: dict[str, SamPrecision] = {"cuda": "float16", "cpu": "float32"}
+"""Images, prompts and masks per batch."""
+_DEFAULT_PRECISION: dict[str, SamPrecision] = {"cuda": "float16", "cpu": "float32"}
 
 
 def resolve_precision(precision: SamPrecision, device: str) -> SamPrecision:
-    """The precision of a network on a device, "auto" decided."""
-    return _DEFAULT[torch.device(device).type] if precision == "auto" else precision
+    """Return the precision of a network on a device; "auto" becomes the default of the device."""
+    return _DEFAULT_PRECISION[torch.device(device).type] if precision == "auto" else precision
 
 
 class PromptedNetwork(ABC):
-    """A network that answers points on an image with three masks each, on a device and in one precision."""
+    """Network that turns each point on an image into three masks, on one device and in one precision."""
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
-        """
+        """Move a model to a device.
+
         Args:
-            model: of transformers, in float32.
+            model: Model of transformers, in float32.
+            device: Device of the network.
+            precision: Precision of the network.
         """
         self._model = model.to(device)
         self._device = torch.device(device)
@@ -47,67 +50,78 @@ class PromptedNetwork(ABC):
         images, prompts, masks = _BATCHES["cuda" if self._device.type == "cuda" else "cpu"]
         self._images, self._prompts = Batches(images), Batches(prompts)
         self.masks = Batches(masks)
-        """For what is done with masks at the size of the image."""
+        """Batches for operations on masks at the size of the image."""
 
     @abstractmethod
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
-        """Images as the network takes them."""
+        """Return images as network inputs."""
 
     def embed(self, pixels: Float[Tensor, "n 3 side side"]) -> list[Any]:
-        """What `prompt` needs to know of each image."""
-        return [one for batch in self._images(lambda part: self._embed(part.to(self._device)), pixels) for one in batch]
+        """Return the embedding of each image, the input of `prompt`."""
+        batches = self._images(lambda batch: self._embed(batch.to(self._device)), pixels)
+        return [embedding for batch in batches for embedding in batch]
 
     @abstractmethod
     def _embed(self, pixels: Tensor) -> list[Any]:
-        """The same of images that fit into memory."""
+        """Return the embeddings of images that fit into memory together."""
 
     @abstractmethod
     def decode(self, embedding: Any, points: Float[Tensor, "b 2"]) -> Answers:
-        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input."""
+        """Return logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input."""
 
     def prompt(self, embedding: Any, points: Float[Tensor, "p 2"], size: tuple[int, int]) -> Iterator[Answers]:
-        """Logits and predicted IoU of the three masks of each point, in batches of points.
+        """Yield logits and predicted IoU of the three masks of each point, in batches of points.
 
         Args:
+            embedding: One of the results of `embed`.
             points: (x, y) in pixels of the image.
-            size: height and width of the image.
+            size: Height and width of the image.
         """
-        height, width = self._scaled(size)
+        height, width = self._input_size(size)
         scaled = (points * torch.tensor([width / size[1], height / size[0]])).float().to(self._device)
         return self._prompts(lambda batch: self.decode(embedding, batch), scaled)
 
     def enlarge(self, logits: Float[Tensor, "n y x"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
-        """Logits at the size of the image, in float32, bilinear: first to the size of the input, then, without its
-        empty rest, to that of the image."""
-        height, width = self._scaled(size)
-        whole = interpolate(logits[:, None].float(), (self._side, self._side), mode="bilinear", align_corners=False)
-        return interpolate(whole[:, :, :height, :width], size, mode="bilinear", align_corners=False)[:, 0]
+        """Return logits at the size of the image, in float32.
+
+        They are resized bilinearly twice: to the input, then, without its padding, to the image.
+        """
+        height, width = self._input_size(size)
+        padded = interpolate(logits[:, None].float(), (self._side, self._side), mode="bilinear", align_corners=False)
+        return interpolate(padded[:, :, :height, :width], size, mode="bilinear", align_corners=False)[:, 0]
 
     def measure(self, logits: Float[Tensor, "n y x"], size: tuple[int, int], offset: float) -> Measured:
-        """What `measured` says of enlarged logits. Where Triton is, they are not made; then pixels whose logits are
-        within rounding of a threshold may count otherwise."""
-        if len(logits) > 0 and kernels_apply(logits):
-            from normlift_ns.kernels.masks import measure_masks  # noqa: PLC0415 (only where Triton is)
+        """Return the measurements of `measured` for enlarged logits.
 
-            rows, columns = self._taps(logits.shape[1], size, 0), self._taps(logits.shape[2], size, 1)
+        With Triton, the logits are not enlarged in memory. Pixels whose logits are within rounding of a threshold may
+        then be counted differently.
+        """
+        if len(logits) > 0 and kernels_apply(logits):
+            from normlift_ns.kernels.masks import measure_masks  # noqa: PLC0415 (needs Triton)
+
+            rows = self._bilinear_weights(logits.shape[1], size, 0)
+            columns = self._bilinear_weights(logits.shape[2], size, 1)
             return Measured(*measure_masks(logits, *rows, *columns, offset))
         parts = [measured(logits.new_zeros(0, 1, 1), offset)]
         parts.extend(self.masks(lambda batch: measured(self.enlarge(batch, size), offset), logits))
         return Measured(*map(torch.cat, zip(*parts)))
 
-    def _taps(self, count: int, size: tuple[int, int], axis: int) -> tuple[Tensor, Tensor]:
-        first, weights = taps(count, self._side, self._scaled(size)[axis], size[axis])
+    def _bilinear_weights(self, count: int, size: tuple[int, int], axis: int) -> tuple[Tensor, Tensor]:
+        first, weights = taps(count, self._side, self._input_size(size)[axis], size[axis])
         return first.to(self._device), weights.to(self._device)
 
-    def _scaled(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width that an image has in the input."""
+    def _input_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return the height and width of an image in the input, without padding."""
         scale = self._side / max(size)
         return int(size[0] * scale + 0.5), int(size[1] * scale + 0.5)
 
 
 class SamNetwork(PromptedNetwork):
-    """The first SAM: products of matrices in the precision of the network, sums and normalisations in float32. In the
-    mask decoder what belongs to prompts, not to positions of the image, is float32 in any case."""
+    """The first SAM.
+
+    Matrix products are in the precision of the network, sums and normalizations in float32. The prompt tokens of the
+    mask decoder are always in float32.
+    """
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:
         super().__init__(model, device, precision)
@@ -115,27 +129,29 @@ class SamNetwork(PromptedNetwork):
 
     @classmethod
     def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> SamNetwork:
-        """The network of a checkpoint; raises as `load_sam`."""
+        """Load the network of a checkpoint; raises like `load_sam`."""
         return cls(load_sam(checkpoint), device, precision)
 
     def pixels(self, images: Sequence[UInt8[Tensor, "h w 3"]]) -> Float[Tensor, "n 3 side side"]:
-        """Images as the network takes them: scaled so that the longer side fills the input, the rest of which is 0."""
+        """Return network inputs: each image is scaled until its longer side fills the input, and padded with 0."""
         return torch.stack([self._pixels(image.to(self._device)) for image in images])
 
     def decode(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]) -> Answers:
-        """Logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input. What is too large
-        for float16 is answered in float32."""
+        """Return logits and predicted IoU of the three masks of each point, (x, y) in pixels of the input.
+
+        Values too large for float16 are recomputed in float32.
+        """
         masks, ious = self._decoder(embedding, points.to(self._device))
         if self._dtype == torch.float16 and not bool(ious.isfinite().all()):
-            return self._exact(embedding, points.to(self._device))
+            return self._float32_decoder(embedding, points.to(self._device))
         return masks, ious
 
     @cached_property
-    def _exact(self) -> MaskDecoder:
+    def _float32_decoder(self) -> MaskDecoder:
         return MaskDecoder(self._model, torch.float32)
 
     def _pixels(self, image: Tensor) -> Tensor:
-        height, width = self._scaled((image.shape[0], image.shape[1]))
+        height, width = self._input_size((image.shape[0], image.shape[1]))
         scaled = resize_bilinear(image, height, width).permute(2, 0, 1)
         pixels = (scaled - _MEAN.to(self._device)) / _STD.to(self._device)
         return pad(pixels, (0, self._side - width, 0, self._side - height))
@@ -148,15 +164,18 @@ class SamNetwork(PromptedNetwork):
 
 @lru_cache(maxsize=64)
 def taps(count: int, side: int, scaled: int, size: int) -> tuple[Int32[Tensor, " n"], Float32[Tensor, "n 3"]]:
-    """How `enlarge` makes the pixels along one axis of the image: of the logit first[i] and the two after it, with
-    weights[i].
+    """Return (first, weights) of the interpolation in `enlarge` along one axis of the image.
+
+    Pixel i is the sum of the logits first[i] to first[i] + 2, weighted by weights[i].
 
     Args:
-        count: logits along the axis, at least 3.
-        side: what they are enlarged to first, `scaled` of which are enlarged to `size`.
+        count: Logits along the axis, at least 3.
+        side: Size after the first interpolation.
+        scaled: Samples without padding after the first interpolation.
+        size: Pixels of the image along the axis.
     """
-    lines = torch.eye(count, dtype=torch.float64)[:, None]
-    whole = interpolate(lines, side, mode="linear", align_corners=False)
-    shares = interpolate(whole[:, :, :scaled], size, mode="linear", align_corners=False)[:, 0].T
-    first = (shares != 0).int().argmax(dim=1).clamp(max=count - 3)
-    return first.int(), shares.gather(1, first[:, None] + torch.arange(3)).float()
+    identity = torch.eye(count, dtype=torch.float64)[:, None]
+    padded = interpolate(identity, side, mode="linear", align_corners=False)
+    weights = interpolate(padded[:, :, :scaled], size, mode="linear", align_corners=False)[:, 0].T
+    first = (weights != 0).int().argmax(dim=1).clamp(max=count - 3)
+    return first.int(), weights.gather(1, first[:, None] + torch.arange(3)).float()

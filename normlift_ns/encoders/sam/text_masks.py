@@ -1,4 +1,4 @@
-"""SAM 3: texts become masks. transformers' model, processor and post-processing as they are."""
+"""SAM 3: text prompts to masks, with the unchanged model, processor and post-processing of transformers."""
 
 from __future__ import annotations
 
@@ -24,146 +24,149 @@ from normlift_ns.options import DEFAULT_SAM3, SamPrecision
 from normlift_ns.ranges import check_texts, shown
 
 SCORE = 0.5
-"""A mask counts if its score, of the instance times that of the text being there at all, is above this: the threshold
-of the model card."""
-_INSIDE = 0.5
+"""Keep masks with a score above this, the threshold of the model card.
+
+The score is that of the instance times the presence score of the prompt.
+"""
+_MASK_THRESHOLD = 0.5
 """Probability above which a pixel is in a mask."""
-_WORDS = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
-_MOST_TOKENS = 32
+_TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
+_MAX_TOKENS = 32
 _TOGETHER = 16
-"""Masks at the size of the image at a time."""
+"""Masks per batch at the size of the image."""
 
 
 class TextMasks(NamedTuple):
-    """The instances of one text in one image."""
+    """Instances of one text prompt in one image."""
 
     masks: Bool[Tensor, "m h w"]
     scores: Float[Tensor, " m"]
-    """In 0..1."""
+    """Scores in 0..1."""
 
     @property
     def union(self) -> Bool[Tensor, "h w"]:
-        """What is in any of them."""
+        """Union of all masks."""
         return self.masks.any(dim=0)
 
 
 class Sam3Network:
-    """SAM 3 on a device, in one precision: under autocast where that is half."""
+    """SAM 3 on one device and in one precision; half precision uses autocast."""
 
     def __init__(self, model: Any, tokenizer: Any, device: str, precision: SamPrecision = "auto") -> None:
         self._model, self._device = model.to(device), torch.device(device)
         self._dtype: torch.dtype = getattr(torch, resolve_precision(precision, device))
         side = model.config.vision_config.image_size
-        inside = import_transformers().Sam3ImageProcessor(size={"height": side, "width": side})
-        self._processor = import_transformers().Sam3Processor(inside, tokenizer)
-        self._together = Batches(_TOGETHER)
-        self._read: dict[str, tuple[Any, Tensor]] = {}
+        image_processor = import_transformers().Sam3ImageProcessor(size={"height": side, "width": side})
+        self._processor = import_transformers().Sam3Processor(image_processor, tokenizer)
+        self._batches = Batches(_TOGETHER)
+        self._text_features: dict[str, tuple[Any, Tensor]] = {}
 
     @classmethod
     def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> Sam3Network:
-        """The network of a checkpoint, a folder or a name on the hub.
+        """Load the network of a checkpoint, which is a folder or a name on the Hugging Face hub.
 
         Raises:
-            FileNotFoundError: it is not on this machine and cannot be downloaded.
-            ValueError: it is damaged, of another network, or the installed torch or transformers cannot run it.
+            FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
+            ValueError: If the checkpoint is damaged or of another network, or if the installed torch or transformers
+                cannot run it.
         """
-        path = local_sam(checkpoint) or download(checkpoint, TEXT_KINDS, _WORDS)
+        path = local_sam(checkpoint) or download(checkpoint, TEXT_KINDS, _TOKENIZER_FILES)
         with told_of(path, "SAM 3"):
             folder = folder_of(path)
             if folder is None:
-                raise InputError("it is a file; expected a folder with config.json, model.safetensors and a tokenizer")
+                raise InputError("found a file, expected a folder with config.json, model.safetensors and a tokenizer")
             model = load_folder(folder, kind_of(folder, TEXT_KINDS))
             if not any((folder / name).is_file() for name in ("tokenizer.json", "vocab.json")):
-                raise InputError("the folder has no tokenizer.json, nor vocab.json and merges.txt")
+                raise InputError("the folder has no tokenizer.json and no vocab.json with merges.txt")
             tokenizer = import_transformers().CLIPTokenizer.from_pretrained(folder, local_files_only=True)
         return cls(model, tokenizer, device, precision)
 
     @torch.no_grad()
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> list[TextMasks]:
-        """The instances of every text, on the device.
+        """Return the instances of every text prompt, on the device.
 
         Raises:
-            ValueError: a text of more than 32 tokens.
+            ValueError: If a prompt has more than 32 tokens.
         """
         channels_first = image.to(self._device).permute(2, 0, 1)
         pixels = self._processor(images=channels_first, return_tensors="pt")["pixel_values"]
-        with self._half():
-            seen = self._model.get_vision_features(pixels.to(self._device))
-        return [self._found(seen, text, (image.shape[0], image.shape[1])) for text in texts]
+        with self._autocast():
+            vision = self._model.get_vision_features(pixels.to(self._device))
+        return [self._instances(vision, text, (image.shape[0], image.shape[1])) for text in texts]
 
-    def _found(self, seen: Any, text: str, size: tuple[int, int]) -> TextMasks:
-        with self._half():
-            words, mask = self._words(text)
-            out = self._model(vision_embeds=seen, text_embeds=words, attention_mask=mask)
-        logits, presence = out.pred_logits[0].float(), out.presence_logits[0].float()
-        some = (logits.sigmoid() * presence.sigmoid() > SCORE).nonzero()[:, 0]
+    def _instances(self, vision: Any, text: str, size: tuple[int, int]) -> TextMasks:
+        with self._autocast():
+            features, mask = self._encode_text(text)
+            output = self._model(vision_embeds=vision, text_embeds=features, attention_mask=mask)
+        logits, presence = output.pred_logits[0].float(), output.presence_logits[0].float()
+        rows = (logits.sigmoid() * presence.sigmoid() > SCORE).nonzero()[:, 0]
 
-        def instances(index: Tensor) -> tuple[Tensor, Tensor]:
+        def post_process(index: Tensor) -> tuple[Tensor, Tensor]:
             part = SimpleNamespace(
                 pred_logits=logits[None, index],
                 presence_logits=presence[None],
-                pred_boxes=out.pred_boxes[:, index].float(),
-                pred_masks=out.pred_masks[:, index].float(),
+                pred_boxes=output.pred_boxes[:, index].float(),
+                pred_masks=output.pred_masks[:, index].float(),
             )
-            (one,) = self._processor.image_processor.post_process_instance_segmentation(
-                part, threshold=SCORE, mask_threshold=_INSIDE, target_sizes=[size]
+            (result,) = self._processor.image_processor.post_process_instance_segmentation(
+                part, threshold=SCORE, mask_threshold=_MASK_THRESHOLD, target_sizes=[size]
             )
-            return one["masks"].bool(), one["scores"]
+            return result["masks"].bool(), result["scores"]
 
-        parts = [(logits.new_zeros(0, *size).bool(), logits.new_zeros(0)), *self._together(instances, some)]
+        parts = [(logits.new_zeros(0, *size).bool(), logits.new_zeros(0)), *self._batches(post_process, rows)]
         return TextMasks(*map(torch.cat, zip(*parts)))
 
-    def _words(self, text: str) -> tuple[Any, Tensor]:
-        if text not in self._read:
-            read = self._processor(text=text, return_tensors="pt").to(self._device)
-            count = read["input_ids"].shape[1]
-            if count > _MOST_TOKENS:
-                raise InputError(f"SAM 3 reads {_MOST_TOKENS} tokens of a text at most, {shown(text)} has {count}")
-            self._read[text] = self._model.get_text_features(**read), read["attention_mask"]
-        return self._read[text]
+    def _encode_text(self, text: str) -> tuple[Any, Tensor]:
+        if text not in self._text_features:
+            tokens = self._processor(text=text, return_tensors="pt").to(self._device)
+            count = tokens["input_ids"].shape[1]
+            if count > _MAX_TOKENS:
+                raise InputError(f"SAM 3 reads at most {_MAX_TOKENS} tokens of a prompt, but {shown(text)} has {count}")
+            self._text_features[text] = self._model.get_text_features(**tokens), tokens["attention_mask"]
+        return self._text_features[text]
 
-    def _half(self) -> Any:
+    def _autocast(self) -> Any:
         return torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32)
 
 
 def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto") -> dict[str, Any]:
-    """All that changes what SAM 3 finds, but the text; files count by their content, wherever they lie."""
+    """Return everything except the prompt that changes the masks of SAM 3; files are identified by their content."""
     path = Path(checkpoint)
-    files = (path / name for name in ("config.json", WEIGHTS, *_WORDS))
+    files = (path / name for name in ("config.json", WEIGHTS, *_TOKENIZER_FILES))
     content = file_digest(*(file for file in files if file.is_file())) if path.is_dir() else checkpoint
-    used = resolve_precision(precision, device)
-    return {"kind": "sam3", "checkpoint": content, "precision": used, "score": SCORE}
+    resolved = resolve_precision(precision, device)
+    return {"kind": "sam3", "checkpoint": content, "precision": resolved, "score": SCORE}
 
 
 @dataclass(frozen=True)
 class Sam3Masks:
-    """Regions that SAM 3 finds for some texts: every instance is one. Where they overlap that of the higher score
-    counts; pixels without one are unlabelled. The weights are loaded at the first use.
+    """Regions that SAM 3 finds for text prompts; every instance is a region. The weights are loaded at the first use.
+
+    If instances overlap, the one with the higher score counts. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: no text, or one that is empty or given twice; transformers is not installed; another network.
-        FileNotFoundError: a checkpoint that does not exist.
+        ValueError: If no prompt is given, a prompt is empty or given twice, transformers is not installed, or the
+            checkpoint is of another network.
+        FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
     texts: tuple[str, ...]
     checkpoint: str = DEFAULT_SAM3
-    """A folder, or a name on the hub."""
+    """Folder with weights, or a name on the Hugging Face hub."""
     device: str = "cpu"
     precision: SamPrecision = "auto"
-    """Of the network. auto: float16 on a GPU, float32 elsewhere."""
+    """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
 
     def __post_init__(self) -> None:
         if len(self.texts) == 0:
-            raise InputError(
-                'regions "sam3" are what texts find: name them with --queries, such as --queries mug plate'
-            )
+            raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
         check_texts("queries", self.texts)
         check_sam(self.checkpoint, TEXT_KINDS)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """As `sam3_identity`, and the texts."""
-        return {**self._kind, "texts": list(self.texts)}
+        """Result of `sam3_identity` plus the prompts."""
+        return {**self._network_identity, "texts": list(self.texts)}
 
     @property
     def at_once(self) -> int:
@@ -177,18 +180,17 @@ class Sam3Masks:
         return ()
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
-        """As in `Regions`; raises as `Sam3Network.load` and `Sam3Network.find`."""
-        found = self.network.find(image, self.texts)
-        masks, scores = (torch.cat(parts) for parts in zip(*found))
-        there = masks.flatten(1).any(dim=1).nonzero()[:, 0]
-        upwards = there[torch.sort(scores[there], stable=True).indices]
-        return stack_masks(masks[upwards])[None]
+        """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.find`."""
+        masks, scores = (torch.cat(parts) for parts in zip(*self.network.find(image, self.texts)))
+        rows = masks.flatten(1).any(dim=1).nonzero()[:, 0]
+        ascending = rows[torch.sort(scores[rows], stable=True).indices]
+        return stack_masks(masks[ascending])[None]
 
     @cached_property
-    def _kind(self) -> dict[str, Any]:
+    def _network_identity(self) -> dict[str, Any]:
         return sam3_identity(self.checkpoint, self.device, self.precision)
 
     @cached_property
     def network(self) -> Sam3Network:
-        """The network with its weights, loaded at the first use."""
+        """Network with its weights, loaded at the first use."""
         return Sam3Network.load(self.checkpoint, self.device, self.precision)

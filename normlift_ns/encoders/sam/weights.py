@@ -1,4 +1,4 @@
-"""Weights of SAM: a folder as transformers writes it, a file as Meta publishes it, or a name on the hub."""
+"""SAM checkpoints: a folder in the format of transformers, a file published by Meta, or a name on the hub."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
 
 REMEDY = (
     f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
-    "as sam_vit_h_4b8939.pth; or cut the images without SAM: --regions patches or --regions superpixel"
+    "as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel"
 )
 REMEDY_SAM3 = (
-    f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, with "
-    "--sam-model in a lift, with --segment-model in a query; or do without it: another --regions, no --segment"
+    f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
+    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment"
 )
 _REMEDIES = {"SAM": REMEDY, "SAM 3": REMEDY_SAM3}
 _FILES = (WEIGHTS, "pytorch_model.bin")
 _FIRST = "the first SAM, ViT-B, -L or -H"
-_AS_FOLDER = ", or for SAM 2 and HQ-SAM a folder as transformers writes it"
+_AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
 _OTHERS = {
     "image_encoder.trunk.": "SAM 2",
     "image_encoder.layers.": "MobileSAM",
     "mask_decoder.hf_token": "HQ-SAM",
     "mask_decoder.compress_vit_feat": "HQ-SAM",
 }
-"""What the parameters of other networks begin with."""
+"""Prefixes of parameter names in other networks."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {
@@ -73,46 +73,46 @@ _NAMES = {
     r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
     r"\.output_upscaling\.3\.": ".upscale_conv2.",
 }
-"""Names of Meta's parameters, as patterns, and what transformers calls them."""
+"""Patterns of Meta's parameter names, with the names in transformers."""
 
 
 def check_sam(checkpoint: str, kinds: Mapping[str, Kind] = MASK_KINDS) -> None:
-    """Checks a checkpoint by name, without loading or downloading anything.
+    """Check a checkpoint by name, without loading or downloading anything.
 
     Raises:
-        ValueError: transformers is not installed; what is neither a path nor a name of the form OWNER/NAME; a folder of
-            another network, or of one that the installed torch cannot run.
-        FileNotFoundError: what looks like a path does not exist.
+        ValueError: If transformers is not installed, or the checkpoint is neither a path nor a name of the form
+            OWNER/NAME. Also if its folder is of another network, or the installed torch cannot run it.
+        FileNotFoundError: If the checkpoint looks like a path but does not exist.
     """
     import_transformers()
-    what, known = _name_of(kinds), DEFAULT_SAM if kinds is MASK_KINDS else DEFAULT_SAM3
-    remedy = _REMEDIES[what]
+    title, example = _title(kinds), DEFAULT_SAM if kinds is MASK_KINDS else DEFAULT_SAM3
+    remedy = _REMEDIES[title]
     path = Path(checkpoint)
     if os.path.isfile(path) or os.path.isdir(path):
         folder = folder_of(path)
         if folder is not None and not (folder / "config.json").is_file():
-            raise InputError(f"{what} checkpoint {path} is a folder without config.json; {remedy}")
+            raise InputError(f"{title} checkpoint {path} is a folder without config.json; {remedy}")
         if folder is not None:
-            with told_of(path, what):
+            with told_of(path, title):
                 kind_of(folder, kinds)
         return
     if os.path.lexists(path):
-        raise InputError(f"{what} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
+        raise InputError(f"{title} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
     if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
-        raise FileNotFoundError(f"{what} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
+        raise FileNotFoundError(f"{title} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
     if len(path.parts) != 2:
         raise InputError(
-            f"{what} checkpoint {checkpoint!r} is neither a path nor a name of the hub such as {known}; {remedy}"
+            f"{title} checkpoint {checkpoint!r} is neither a path nor a name on the hub such as {example}; {remedy}"
         )
 
 
-def _name_of(kinds: Mapping[str, Kind]) -> str:
-    """What messages call the networks."""
+def _title(kinds: Mapping[str, Kind]) -> str:
+    """Return the name of the networks in messages."""
     return "SAM" if kinds is MASK_KINDS else "SAM 3"
 
 
 def local_sam(checkpoint: str) -> Path | None:
-    """Where a checkpoint lies on this machine, the cache of the hub included; None: nowhere."""
+    """Return the path of a checkpoint on this machine, including the cache of the hub; None if there is none."""
     if os.path.exists(checkpoint):
         return Path(checkpoint).resolve()
     hub = importlib.import_module("huggingface_hub")
@@ -124,19 +124,20 @@ def local_sam(checkpoint: str) -> Path | None:
 
 
 def sam_identity(checkpoint: str) -> str:
-    """Local files count by their content, a name of the hub as it is."""
+    """Return the digest of local files, or the name of a checkpoint on the hub."""
     path = Path(checkpoint)
     if not os.path.exists(path):
         return checkpoint
-    return file_digest(*(file for file in (path, path / "config.json", *_weights(path)) if file.is_file()))
+    return file_digest(*(file for file in (path, path / "config.json", *_weight_files(path)) if file.is_file()))
 
 
 def load_model(checkpoint: str) -> tuple[Kind, Any]:
-    """transformers' model with the weights of a checkpoint, in float32 on the CPU, and what it is.
+    """Return the network of a checkpoint, and its transformers model with weights, in float32 on the CPU.
 
     Raises:
-        FileNotFoundError: it is not on this machine and cannot be downloaded.
-        ValueError: it is damaged, of no network that answers points, or of one that the installed torch cannot run.
+        FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
+        ValueError: If the checkpoint is damaged, its network does not take points, or the installed torch cannot run
+            it.
     """
     path = local_sam(checkpoint) or download(checkpoint, MASK_KINDS)
     folder = folder_of(path)
@@ -150,37 +151,37 @@ def load_model(checkpoint: str) -> tuple[Kind, Any]:
 
 
 def folder_of(path: Path) -> Path | None:
-    """The folder, as transformers writes it, that a checkpoint is or lies in; None: it is a file of Meta's."""
+    """Return the folder of a checkpoint in the format of transformers; None for a file published by Meta."""
     if path.is_dir():
         return path
     return path.parent if path.suffix == ".safetensors" and (path.parent / "config.json").is_file() else None
 
 
 @contextmanager
-def told_of(path: Path, what: str = "SAM") -> Iterator[None]:
-    """Errors of foreign libraries within become one of ours that names the checkpoint."""
+def told_of(path: Path, title: str = "SAM") -> Iterator[None]:
+    """Turn errors of other libraries into an InputError that names the checkpoint."""
     try:
         yield
     except MemoryError:
         raise
-    except Exception as error:  # the configs of transformers raise types of their own for a wrong value
+    except Exception as error:  # the configs of transformers raise their own exception types for invalid values
         reason = str(error) if isinstance(error, InputError) else first_line(error)
         raise InputError(
-            f"{what} checkpoint {path} is damaged or not of {what} ({reason}); {_REMEDIES[what]}"
+            f"{title} checkpoint {path} is damaged or not a checkpoint of {title} ({reason}); {_REMEDIES[title]}"
         ) from None
 
 
 def load_sam(checkpoint: str) -> Any:
-    """transformers' SamModel with the weights of a checkpoint of the first SAM, in float32 on the CPU.
+    """Return the SamModel of transformers with the weights of a checkpoint of the first SAM, in float32 on the CPU.
 
     Raises:
-        FileNotFoundError: it is not on this machine and cannot be downloaded.
-        ValueError: it is damaged, or not of the first SAM.
+        FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
+        ValueError: If the checkpoint is damaged or not of the first SAM.
     """
     path = local_sam(checkpoint) or download(checkpoint, MASK_KINDS)
     with told_of(path):
         config, state = _read_folder(path) if path.is_dir() else _read_file(path)
-        for name, other in (_SHARED, _SHARED[::-1]):  # one tensor, of which a file may hold one copy
+        for name, other in (_SHARED, _SHARED[::-1]):  # the same tensor; a file may hold only one copy
             if other in state:
                 state.setdefault(name, state[other])
         with torch.device("meta"):
@@ -190,40 +191,47 @@ def load_sam(checkpoint: str) -> Any:
 
 
 def download(checkpoint: str, kinds: Mapping[str, Kind], more: Sequence[str] = ()) -> Path:
-    """The folder of a name on the hub: config.json first, and weights only if they are of one of some networks.
+    """Download a checkpoint from the hub: config.json first, the weights only if it names one of `kinds`.
 
     Args:
-        more: patterns of further files.
+        checkpoint: Name on the hub.
+        kinds: Networks by the model type of config.json.
+        more: Patterns of further files.
+
+    Returns:
+        The folder of the checkpoint.
+
     Raises:
-        FileNotFoundError: it cannot be downloaded.
+        FileNotFoundError: If the checkpoint cannot be downloaded.
     """
     hub = importlib.import_module("huggingface_hub")
     try:
         probe(hub.constants.ENDPOINT)
         folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
         known = json.loads((folder / "config.json").read_text("utf8")).get("model_type") in kinds
-        wanted = ["config.json", WEIGHTS, *more] if known else ["config.json"]
-        return Path(hub.snapshot_download(checkpoint, allow_patterns=wanted))
-    except Exception as error:  # a download's client raises types of its own, which have nothing in common
-        what = _name_of(kinds)
+        patterns = ["config.json", WEIGHTS, *more] if known else ["config.json"]
+        return Path(hub.snapshot_download(checkpoint, allow_patterns=patterns))
+    except Exception as error:  # the download client raises unrelated exception types
+        title = _title(kinds)
         raise FileNotFoundError(
-            f"{what} checkpoint {checkpoint} is neither in the local cache nor can it be downloaded "
-            f"({first_line(error)}); go online once, or {_REMEDIES[what]}"
+            f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded "
+            f"({first_line(error)}); go online once, or {_REMEDIES[title]}"
         ) from None
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     if kind_of(folder, MASK_KINDS) is not SAM:
-        raise InputError(f"the folder is not of {_FIRST}")
-    found = _weights(folder)
-    if len(found) == 0:
+        raise InputError(f"the folder does not hold {_FIRST}")
+    files = _weight_files(folder)
+    if len(files) == 0:
         raise InputError(f"the folder has no {_FILES[0]}")
     config = json.loads((folder / "config.json").read_text())
     check_sizes(config)
-    return import_transformers().SamConfig.from_dict(config), _read_tensors(found[0])
+    return import_transformers().SamConfig.from_dict(config), _read_tensors(files[0])
 
 
-def _weights(folder: Path) -> list[Path]:
+def _weight_files(folder: Path) -> list[Path]:
+    """Return the weight file of a folder, or an empty list."""
     return [folder / name for name in _FILES if (folder / name).is_file()][:1]
 
 
@@ -232,11 +240,11 @@ def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
     for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
         for part, kind in _OTHERS.items():
             if str(name).startswith(part):
-                raise InputError(f"it is of {kind}, as its parameter {name} says; expected {_FIRST}{_AS_FOLDER}")
+                raise InputError(f"its parameter {name} is of {kind}, expected {_FIRST}{_AS_FOLDER}")
     if "image_encoder.pos_embed" not in state:
         if (path.parent / "config.json").is_file():
             return _read_folder(path.parent)
-        raise InputError(f"it has no image_encoder.pos_embed, which Meta's files of {_FIRST} have")
+        raise InputError(f"it has no image_encoder.pos_embed, expected a file published by Meta for {_FIRST}")
     return published_config(state), {published_name(name): value for name, value in state.items()}
 
 
@@ -247,7 +255,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def published_name(name: str) -> str:
-    """What transformers calls a parameter of Meta's files.
+    """Return the name in transformers of a parameter in Meta's files.
 
     >>> published_name("mask_decoder.iou_prediction_head.layers.2.weight")
     'mask_decoder.iou_prediction_head.proj_out.weight'
@@ -259,16 +267,17 @@ def published_name(name: str) -> str:
 
 
 def published_config(state: Mapping[str, Tensor]) -> Any:
-    """transformers' SamConfig of a file of Meta's, from the shapes of its parameters.
+    """Return the SamConfig of transformers for a file published by Meta, from the shapes of its parameters.
 
-    What shapes do not tell is the same in all of Meta's: eight heads in the mask decoder, and its epsilon.
+    Values that shapes do not determine are the same in all of Meta's files: eight heads in the mask decoder, and its
+    epsilon.
     """
     shape = {name: tuple(value.shape) for name, value in state.items()}
     _, grid, _, width = shape["image_encoder.pos_embed"]
     patch = shape["image_encoder.patch_embed.proj.weight"][-1]
     blocks = sum(name.endswith(".attn.rel_pos_h") for name in shape)
-    reach, head = zip(*(shape[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(blocks)))
-    everywhere = [i for i in range(blocks) if reach[i] == 2 * grid - 1]
+    extent, head = zip(*(shape[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(blocks)))
+    global_blocks = [i for i in range(blocks) if extent[i] == 2 * grid - 1]
     channels = shape["image_encoder.neck.0.weight"][0]
     layer = "mask_decoder.transformer.layers.0"
     transformers = import_transformers()
@@ -279,8 +288,8 @@ def published_config(state: Mapping[str, Tensor]) -> Any:
         num_attention_heads=width // head[0],
         image_size=grid * patch,
         patch_size=patch,
-        window_size=(min(reach) + 1) // 2,
-        global_attn_indexes=everywhere,
+        window_size=(min(extent) + 1) // 2,
+        global_attn_indexes=global_blocks,
         num_pos_feats=channels // 2,
         mlp_dim=shape["image_encoder.blocks.0.mlp.lin1.weight"][0],
     )
