@@ -60,7 +60,9 @@ def _transforms(options: SplatOptions, advice: str) -> Cameras:
     path = path / "transforms.json" if path.is_dir() else path
     contents = read_transforms(path, options.images, options.masks, advice=advice)
     world = options.world_transform
-    to_splat = None if world is None else read_world_transform(world, contents.applied, contents.applied_scale)
+    to_splat = (
+        None if world is None else read_world_transform(world, contents.applied_transform, contents.applied_scale)
+    )
     base = path.parent if options.images is None else options.images.absolute().parent
     return Cameras(contents.frames, contents.held_out, path, path.parent, base, to_splat)
 
@@ -70,7 +72,7 @@ def _colmap(options: SplatOptions, folder: Path, advice: str) -> Cameras:
     model = model_folder(folder)
     cameras, images = read_model(model)
     registered = sorted(images, key=lambda image: image.name)  # as training tools sort them
-    intrinsics = {number: intrinsics_of(camera, model) for number, camera in cameras.items()}
+    intrinsics = {camera_id: intrinsics_of(camera, model) for camera_id, camera in cameras.items()}
     images_dir = (options.images or folder / "images").absolute()
     if not images_dir.is_dir():
         raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")

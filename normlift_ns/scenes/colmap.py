@@ -55,7 +55,7 @@ def model_folder(folder: Path) -> Path:
 class Camera(NamedTuple):
     """A camera as stored in the file."""
 
-    number: int
+    camera_id: int
     model: str
     width: int
     height: int
@@ -65,7 +65,7 @@ class Camera(NamedTuple):
 class Registered(NamedTuple):
     """A registered image as stored in the file, with a world-to-camera pose in OpenCV convention."""
 
-    number: int
+    image_id: int
     name: str
     rotation: list[float]
     """Quaternion w, x, y, z."""
@@ -88,17 +88,17 @@ def read_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, Came
     as_text = text_first and (model / "cameras.txt").exists()
     cameras: dict[int, Camera] = {}
     for camera in _read(model, "cameras", _cameras_text, _cameras_binary, as_text):
-        if camera.number in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
+        if camera.camera_id in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
             raise InputError(
-                f"{model}: camera {camera.number} of {camera.width:.6g} x {camera.height:.6g} pixels is listed twice, "
-                f"or its sides are not 1 to {_MAX_SIDE:,} pixels. {_ADVICE}"
+                f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels is listed "
+                f"twice, or its sides are not 1 to {_MAX_SIDE:,} pixels. {_ADVICE}"
             )
         if not (np.abs(camera.parameters) < _MAX_VALUE).all():
             raise InputError(
-                f"{model}: camera {camera.number} has the parameters {camera.parameters}. Expected finite numbers "
+                f"{model}: camera {camera.camera_id} has the parameters {camera.parameters}. Expected finite numbers "
                 f"below {_MAX_VALUE:g}. {_ADVICE}"
             )
-        cameras[camera.number] = camera
+        cameras[camera.camera_id] = camera
     images = _read(model, "images", _images_text, _images_binary, as_text)
     for image in images:
         pose = np.array([*image.rotation, *image.translation])
@@ -114,7 +114,7 @@ def read_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, Came
             f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected a camera "
             "for every image; copy the whole reconstruction again."
         )
-    if len({image.number for image in images}) < len(images):
+    if len({image.image_id for image in images}) < len(images):
         raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
     return cameras, images
 
@@ -127,7 +127,7 @@ def intrinsics_of(camera: Camera, model: Path) -> Intrinsics:
     """
     if camera.model not in _INTRINSICS:
         raise InputError(
-            f"{model}: camera {camera.number} has the model {camera.model}; supported models are "
+            f"{model}: camera {camera.camera_id} has the model {camera.model}; supported models are "
             f"{', '.join(_INTRINSICS)}. Undistort the images with: colmap image_undistorter, train the scene on those, "
             "and give that folder."
         )
@@ -151,7 +151,7 @@ def read_points(model: Path) -> Float[np.ndarray, "n 3"]:
         ValueError: if the file is damaged or holds points that are not finite.
     """
     positions = dict(_read(model, "points3D", _points_text, _points_binary))
-    points = np.array([positions[number] for number in sorted(positions)], dtype=np.float64).reshape(-1, 3)
+    points = np.array([positions[point_id] for point_id in sorted(positions)], dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise InputError(f"{model}: points3D has coordinates that are NaN or infinite. {_ADVICE}")
     return points
@@ -220,28 +220,28 @@ class _ByteReader:
 
 def _cameras_binary(data: _ByteReader) -> Iterator[Camera]:
     for _ in range(data.count()):
-        number, model_id, width, height = data.unpack("iiQQ")
+        camera_id, model_id, width, height = data.unpack("iiQQ")
         if not 0 <= model_id < len(_MODEL_SIZES):
-            raise InputError(f"camera {number} has the unknown model ID {model_id}")
+            raise InputError(f"camera {camera_id} has the unknown model ID {model_id}")
         name, count = _MODEL_SIZES[model_id]
-        yield Camera(number, name, width, height, data.unpack(f"{count}d"))
+        yield Camera(camera_id, name, width, height, data.unpack(f"{count}d"))
 
 
 def _cameras_text(lines: list[str]) -> Iterator[Camera]:
     counts = dict(_MODEL_SIZES)
     for line in filter(None, lines):
-        number, name, width, height, *parameters = line.split()
+        camera_id, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
-            raise InputError(f"camera {number} has {len(parameters)} parameters, {name} needs {counts[name]}")
-        yield Camera(int(number), name, int(width), int(height), tuple(map(float, parameters)))
+            raise InputError(f"camera {camera_id} has {len(parameters)} parameters, {name} needs {counts[name]}")
+        yield Camera(int(camera_id), name, int(width), int(height), tuple(map(float, parameters)))
 
 
 def _images_binary(data: _ByteReader) -> Iterator[Registered]:
     for _ in range(data.count()):
-        number, *pose, camera = data.unpack("I7dI")
+        image_id, *pose, camera_id = data.unpack("I7dI")
         name = data.string()
         data.skip(24 * data.unpack("Q")[0])
-        yield Registered(number, name, pose[:4], pose[4:], camera)
+        yield Registered(image_id, name, pose[:4], pose[4:], camera_id)
 
 
 def _images_text(lines: list[str]) -> Iterator[Registered]:
@@ -252,9 +252,9 @@ def _images_text(lines: list[str]) -> Iterator[Registered]:
         points = next(iterator, "").split()  # the next line lists the image's points and may be empty
         if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
             raise InputError(f"the line after that of {line.split()[-1]} does not list points as x, y and point ID")
-        number, *values, camera, name = line.split(maxsplit=9)
+        image_id, *values, camera_id, name = line.split(maxsplit=9)
         pose = list(map(float, values))
-        yield Registered(int(number), name, pose[:4], pose[4:], int(camera))
+        yield Registered(int(image_id), name, pose[:4], pose[4:], int(camera_id))
 
 
 def _is_number(text: str) -> bool:
@@ -267,13 +267,13 @@ def _is_number(text: str) -> bool:
 
 def _points_binary(data: _ByteReader) -> Iterator[tuple[int, tuple[float, ...]]]:
     for _ in range(data.count()):
-        number, *position = data.unpack("Q3d")
+        point_id, *position = data.unpack("Q3d")
         data.skip(3 + 8)
         data.skip(8 * data.unpack("Q")[0])
-        yield number, tuple(position)
+        yield point_id, tuple(position)
 
 
 def _points_text(lines: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
     for line in filter(None, lines):
-        number, x, y, z, *_ = line.split(maxsplit=4)
-        yield int(number), (float(x), float(y), float(z))
+        point_id, x, y, z, *_ = line.split(maxsplit=4)
+        yield int(point_id), (float(x), float(y), float(z))

@@ -52,7 +52,7 @@ class Match(NamedTuple):
     """Largest fraction of the Gaussians that lies in one view, in 0..1."""
     grey_psnr: float
     """PSNR in dB of a constant image in the mean color of each image."""
-    focal: float
+    focal_factor: float
     """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; otherwise 1."""
 
 
@@ -120,11 +120,11 @@ def judge(match: Match, *, own_cameras: bool) -> str | None:
             f"images ({match.psnr:.1f} dB) than their mean color is ({match.grey_psnr:.1f} dB). {causes}. --check "
             "False lifts anyway."
         )
-    if match.focal != 1.0:
+    if match.focal_factor != 1.0:
         return (
-            f"Focal lengths that are {abs(match.focal - 1):.0%} {'longer' if match.focal > 1 else 'shorter'} fit the "
-            f"images better by more than 1 dB. The cameras may not be those of the training: has their file changed "
-            "since, or were the images resized?"
+            f"Focal lengths that are {abs(match.focal_factor - 1):.0%} "
+            f"{'longer' if match.focal_factor > 1 else 'shorter'} fit the images better by more than 1 dB. The cameras "
+            "may not be those of the training: has their file changed since, or were the images resized?"
         )
     name, lowest = match.worst
     if match.psnr >= LEAST_PSNR > lowest:

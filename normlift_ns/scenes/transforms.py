@@ -31,7 +31,7 @@ class TransformsFile:
     """Frames sorted by file, as in nerfstudio."""
     held_out: frozenset[str]
     """Names of the frames that the file excludes from the training; most files exclude none."""
-    applied: Float[np.ndarray, "4 4"]
+    applied_transform: Float[np.ndarray, "4 4"]
     """Transform from the world of the capture to that of the file, as ns-process-data applied it."""
     applied_scale: float
     """Scale of that transform."""

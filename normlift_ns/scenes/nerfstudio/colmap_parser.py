@@ -38,8 +38,8 @@ def parse_reconstruction(parser: ColmapDataParserConfig) -> Dataset:
         FileNotFoundError, ValueError: if a file is missing, or nerfstudio could not read it.
     """
     cameras, images = read_model(parser.data / parser.colmap_path, text_first=True)
-    images = sorted(images, key=lambda image: image.number)
-    intrinsics = {number: _colmap_camera(camera) for number, camera in cameras.items()}
+    images = sorted(images, key=lambda image: image.image_id)
+    intrinsics = {camera_id: _colmap_camera(camera) for camera_id, camera in cameras.items()}
     kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera].model else "PERSPECTIVE" for image in images}
     if len(kinds) > 1:
         raise InputError("multiple camera models are not supported")
@@ -72,7 +72,7 @@ def parse_reconstruction(parser: ColmapDataParserConfig) -> Dataset:
         torch.tensor([row[4:] for row in used], dtype=torch.float32),
     )
     train, held_out = (
-        split.only(indices).resized(1.0 / factor, parser.downscale_rounding_mode) for indices in split_indices
+        split.select(indices).resized(1.0 / factor, parser.downscale_rounding_mode) for indices in split_indices
     )
     return Dataset(train, held_out, with_applied(transform, _FLIP if flip else None), scale)
 

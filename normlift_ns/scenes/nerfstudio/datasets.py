@@ -102,7 +102,7 @@ def _check_colmap(parser: ColmapDataParserConfig) -> None:
             f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}. {_ADVICE}"
         )
     _, registered = read_model(model, text_first=True)
-    registered.sort(key=lambda image: image.number)
+    registered.sort(key=lambda image: image.image_id)
     files = [images / image.name for image in registered]
     _check_files(files, model)
     factor = parser.downscale_factor

@@ -123,7 +123,7 @@ def _transforms(parser: NerfstudioDataParserConfig) -> Dataset:
     applied = meta.applied_transform
     if applied is None and (parser.data / "colmap/sparse/0").exists():
         applied = _LEGACY_FLIP
-    train, held_out = (split.only(indices).resized(1.0 / factor) for indices in split_indices)
+    train, held_out = (split.select(indices).resized(1.0 / factor) for indices in split_indices)
     return Dataset(train, held_out, with_applied(transform, applied), scale * float(meta.applied_scale))
 
 

@@ -179,10 +179,10 @@ def _exp_se3(move: Float[Tensor, "1 6"]) -> Float[Tensor, "1 3 4"]:
     transform[:, :3, :3] = cos_ratio * axis_angle @ axis_angle.transpose(1, 2)
     for i in range(3):
         transform[:, i, i] += cosine.view(-1)
-    cross = sin_ratio.view(-1, 1) * axis_angle.view(-1, 3)
+    scaled_axis = sin_ratio.view(-1, 1) * axis_angle.view(-1, 3)
     for i, j, k in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
-        transform[:, i, j] -= cross[:, k]
-        transform[:, j, i] += cross[:, k]
+        transform[:, i, j] -= scaled_axis[:, k]
+        transform[:, j, i] += scaled_axis[:, k]
     sin_ratio = torch.where(small, 1 - square / 6, sin_ratio)
     cos_ratio = torch.where(small, 0.5 - square / 24, cos_ratio)
     cubic_ratio = torch.where(small, 1.0 / 6 - square / 120, (angle - sine) / cube_1)

@@ -26,7 +26,7 @@ class Photographs:
     kind: str
     """PERSPECTIVE, FISHEYE or another of nerfstudio's camera types."""
     poses: Float[Tensor, "v 3 4"]
-    projections: Float[Tensor, "v 4"]
+    intrinsics: Float[Tensor, "v 4"]
     """fx, fy, cx, cy."""
     sizes: Int64[Tensor, "v 2"]
     """Width, height."""
@@ -35,7 +35,7 @@ class Photographs:
     def __len__(self) -> int:
         return len(self.files)
 
-    def only(self, indices: Int[np.ndarray, " m"]) -> Photographs:
+    def select(self, indices: Int[np.ndarray, " m"]) -> Photographs:
         """Return the images and cameras at these indices."""
         rows = torch.tensor(indices, dtype=torch.long)
         return Photographs(
@@ -43,7 +43,7 @@ class Photographs:
             None if self.masks is None else [self.masks[i] for i in indices],
             self.kind,
             self.poses[rows],
-            self.projections[rows],
+            self.intrinsics[rows],
             self.sizes[rows],
             None if self.distortion is None else self.distortion[rows],
         )
@@ -57,7 +57,7 @@ class Photographs:
         elif rounding == "ceil":
             sides = torch.ceil(sides)
         return Photographs(
-            self.files, self.masks, self.kind, self.poses, self.projections * scale, sides.to(torch.int64),
+            self.files, self.masks, self.kind, self.poses, self.intrinsics * scale, sides.to(torch.int64),
             self.distortion,
         )  # fmt: skip
 

@@ -34,10 +34,10 @@ class Reading(NamedTuple):
 
     scale: float = 1.0
     """camera_res_scale_factor."""
-    behind: tuple[float, float, float] | None = None
+    alpha_color: tuple[float, float, float] | None = None
     """RGB in 0..1 that nerfstudio blends behind images with an alpha channel when it reads them; None: it blends the
     background later."""
-    instead: tuple[float, float, float] | None = None
+    mask_color: tuple[float, float, float] | None = None
     """Color that nerfstudio writes into pixels whose mask is zero."""
 
 
@@ -128,7 +128,7 @@ class TrainedViews:
     def _lens(self, index: int) -> _Lens:
         width, height = self._split.sizes[index].tolist()
         distortion = () if self._split.distortion is None else tuple(self._split.distortion[index].tolist())
-        fx, fy, cx, cy = self._split.projections[index].tolist()
+        fx, fy, cx, cy = self._split.intrinsics[index].tolist()
         return _Lens(self._split.kind, Intrinsics(fx, fy, cx, cy, width, height), distortion)
 
     def check_files(self) -> tuple[str, ...]:
@@ -176,8 +176,8 @@ class TrainedViews:
                 f"{file}{'' if masks is None else ' or its mask'} cannot be read ({error}). Expected an 8-bit image; "
                 "copy it again from the capture."
             ) from error
-        if self._reading.instead is not None and any(self._reading.instead) and mask is not None:
-            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._reading.instead)
+        if self._reading.mask_color is not None and any(self._reading.mask_color) and mask is not None:
+            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._reading.mask_color)
             image = torch.where(torch.from_numpy(mask)[:, :, None], torch.from_numpy(image), filled).numpy()
         self._check_size(index, image.shape[1::-1])
         return image, mask
@@ -191,9 +191,9 @@ class TrainedViews:
             image = image[:, :, None].repeat(3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
             raise InputError(f"its shape is {image.shape}")
-        if self._reading.behind is None or image.shape[2] == 3:
+        if self._reading.alpha_color is None or image.shape[2] == 3:
             return image
-        blended, color = torch.from_numpy(image), torch.tensor(self._reading.behind)
+        blended, color = torch.from_numpy(image), torch.tensor(self._reading.alpha_color)
         blended = blended[:, :, :3] * (blended[:, :, -1:] / 255.0) + 255.0 * color * (1.0 - blended[:, :, -1:] / 255.0)
         return torch.clamp(blended, min=0, max=255).to(torch.uint8).numpy()
 
