@@ -157,11 +157,10 @@ def _align(extended: Cameras, known: dict[str, Camera]) -> World:
     worst = int(np.argmax(np.maximum(shifts / _MAX_SHIFT, angles / _MAX_ROTATION)))
     if not (shifts[worst] <= _MAX_SHIFT and angles[worst] <= _MAX_ROTATION and 0 < scale < math.inf):
         raise InputError(
-            f"The worlds differ: in {extended.source}, the camera of {old[worst].name} is not where it was in the "
-            f"training (off by {shifts[worst]:.2%} of the extent of the cameras and {angles[worst]:.2g} degrees; "
-            f"{len(old)} old images were compared). Register new images without moving old ones (COLMAP: "
-            "image_registrator on the old model, no bundle adjustment). Cameras that the training itself optimized "
-            "have moved too."
+            f"The worlds differ: in {extended.source}, the camera of {old[worst].name} has moved since the training, "
+            f"by {shifts[worst]:.2%} of the extent of the cameras and {angles[worst]:.2g} degrees ({len(old)} old "
+            "images were compared). Register new images without moving old ones (COLMAP: image_registrator on the old "
+            "model, no bundle adjustment). Cameras that the training itself optimized have moved too."
         )
     return World(np.concatenate([rotation, translation[:, None] / scale], axis=1), scale)
 

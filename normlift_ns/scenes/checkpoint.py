@@ -67,8 +67,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is truncated, damaged or not a splatfacto checkpoint, if its step is invalid or differs
-            from the file name, or if it holds no Gaussians.
+        ValueError: if the file is truncated, damaged, not a splatfacto checkpoint or without Gaussians, or its step is
+            invalid or differs from its name.
     """
     advice = "give another checkpoint with --load-step"
     loaded = read_tensors(path, "as ns-train splatfacto writes them", advice)
@@ -193,8 +193,8 @@ def check_plain(value: Tensor, name: str, path: Path) -> None:
     """Raise if a tensor would take more memory than it has storage, or is not a plain array of real numbers.
 
     Raises:
-        ValueError: if the tensor is sparse, quantized, complex, nested or not on the CPU, or if it is larger than its
-            storage, for example because it repeats its content.
+        ValueError: if the tensor is sparse, quantized, complex, nested, not on the CPU or larger than its storage, for
+            example because it repeats its content.
     """
     if (
         value.layout != torch.strided

@@ -77,8 +77,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise if a camera is invalid.
 
     Raises:
-        ValueError: if there are no cameras, numbers are not finite, a focal length or size is not positive, a pose is
-            not rigid, or a name occurs twice.
+        ValueError: if there are no cameras, names repeat, poses are not rigid, numbers are not finite, or focal lengths
+            or sizes are not positive.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected one for every training image.")

@@ -183,7 +183,7 @@ def _first_aligned(
 
 
 _TURNED = "The axes of gsplat's normalization point the other way; rotated by half a turn, the splat fits its images."
-_NORMALIZED = "The splat does not fit its images in the world of its cameras, but does in gsplat's normalized world."
+_NORMALIZED = "The splat does not fit its images in the world of its cameras, but it does in gsplat's normalized world."
 
 
 def _candidate_worlds(

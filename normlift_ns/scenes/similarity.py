@@ -136,9 +136,9 @@ def similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World:
 def gsplat_normalization(frames: list[Frame], points: Float[np.ndarray, "n 3"]) -> list[World]:
     """Recompute the normalization of a COLMAP project by gsplat's simple_trainer, which does not save it.
 
-    The steps are those of its datasets/normalize.py and datasets/colmap.py (1.5): put the cameras upright around the
-    origin at a median distance of 1, turn the points' principal axes to x, y and z, and flip the half with more points
-    to the bottom.
+    The steps are those of its datasets/normalize.py and datasets/colmap.py (1.5). First, put the cameras upright around
+    the origin at a median distance of 1. Then turn the points' principal axes to x, y and z, and flip the half with
+    more points to the bottom.
 
     Args:
         frames: all registered images, sorted by name.

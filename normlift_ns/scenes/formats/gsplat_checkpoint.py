@@ -38,8 +38,8 @@ def read_gsplat(path: Path) -> GsplatCheckpoint:
 
     Raises:
         FileNotFoundError: if there is no such file, or a rank is missing.
-        ValueError: if the file is damaged, comes from another trainer or needs an appearance network, if ranks come
-            from different training runs, or if the Gaussians cannot be drawn.
+        ValueError: if a file is damaged, comes from another trainer or training run, or needs an appearance network, or
+            if the Gaussians cannot be drawn.
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]

@@ -44,8 +44,8 @@ def read_ply(path: Path) -> PlySplat:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is not a PLY file, is truncated or does not hold a splat, if the number of spherical
-            harmonics matches no degree, or if the Gaussians cannot be drawn.
+        ValueError: if the file is not a PLY file, is truncated, does not hold a splat or has Gaussians that cannot be
+            drawn. The number of spherical harmonics must match a degree.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")

@@ -32,8 +32,8 @@ def check_config(config: Any, path: Path) -> None:
     """Raise if a config holds values with which stock splatfacto cannot have been trained.
 
     Raises:
-        ValueError: if a value does not have its field's type, a number is out of range, a name is not a valid folder
-            name, or a component is not splatfacto's.
+        ValueError: if a value does not match its type, a number is out of range, a folder name is invalid, or a
+            component is not splatfacto's.
     """
     if type(config) is not TrainerConfig:
         raise InputError(f"{path} is a {type(config).__name__}, expected a TrainerConfig. {_REMEDY}")

@@ -29,8 +29,8 @@ def read_config(path: Path) -> TrainerConfig:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if nerfstudio did not write the config, its method or data parser is not supported, it names other
-            classes than nerfstudio's own configuration classes, or it holds invalid values.
+        ValueError: if nerfstudio did not write the config, or it has an unsupported method or data parser, classes
+            other than nerfstudio's configuration classes, or invalid values.
     """
     if not path.is_file():
         hint = f"; {path / 'config.yml'} exists, give that" if (path / "config.yml").is_file() else ""

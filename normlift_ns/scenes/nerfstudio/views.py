@@ -135,8 +135,8 @@ class TrainedViews:
         """Check the headers of all images and masks, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: if an image or mask is missing, is not an image, is misread by nerfstudio, or
-                does not have the size of its camera or image; the message names it.
+            FileNotFoundError, ValueError: if an image or mask is missing, not an image, misread by nerfstudio, or not
+                of the size of its camera or image; the message names it.
         """
         headers, scale = [read_head(file) for file in self.files], self._reading.scale
         for index, (file, header) in enumerate(zip(self.files, headers)):
