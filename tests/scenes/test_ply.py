@@ -31,7 +31,7 @@ def test_every_kind_of_splat_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
         }
         for kind, how in kinds.items():
             if kind == "several blocks":
-                monkeypatch.setattr("normlift_ns.scenes.formats.ply._ROWS", 7)
+                monkeypatch.setattr("normlift_ns.scenes.formats.ply._PLY_BLOCK_ROWS", 7)
             found = read_ply(write_ply(tmp_path / "a.ply", **{"columns": columns, **how}))
             assert (found.rasterize_mode, found.splat.degree) == (None, degree)
             for name, value in splat.parameters.items():
