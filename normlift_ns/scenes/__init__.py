@@ -1,1 +1,1 @@
-"""Trained splats from anywhere, and the photographs that they were trained with, as a `Scene` of the core."""
+"""Readers that turn trained splats and their training images into a `Scene` of the core."""

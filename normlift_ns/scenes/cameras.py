@@ -1,4 +1,4 @@
-"""Files of cameras, whatever wrote them: COLMAP projects and transforms.json."""
+"""Camera files: COLMAP projects and transforms.json."""
 
 from __future__ import annotations
 
@@ -15,39 +15,41 @@ from normlift_ns.scenes.transforms import read_transforms, relative_name
 
 
 class Cameras(NamedTuple):
-    """What a file of cameras says."""
+    """Contents of a camera file."""
 
     frames: list[Frame]
-    """All photographs in the order of their files, in the file's world."""
+    """All images, sorted by file, with cameras in the file's world."""
     held_out: frozenset[str]
+    """Names of the images that the file excludes from the training."""
     source: Path
+    """The file, or the folder of the COLMAP reconstruction."""
     folder: Path
-    """Of the dataset."""
+    """Folder of the dataset."""
     base: Path
-    """What the names of the photographs are relative to."""
+    """Folder that image names are relative to."""
     to_splat: World | None
-    """By --world-transform."""
+    """Transform to the splat's world, from --world-transform."""
 
 
-def read_camera_file(options: SplatOptions, advice: str = "say where the photographs are with --images") -> Cameras:
-    """The cameras that the options name, with photographs that exist.
+def read_camera_file(options: SplatOptions, advice: str = "give the folder of the images with --images") -> Cameras:
+    """Read the camera file that the options name, and check that its images exist.
 
     Args:
-        advice: what to do about missing photographs.
+        options: locations of cameras, images and masks.
+        advice: what to do about missing images, for error messages.
     Raises:
-        FileNotFoundError: a file, folder, photograph or mask is missing.
-        ValueError: none or two files of cameras, or one that cannot be read.
+        FileNotFoundError: if a file, folder, image or mask is missing.
+        ValueError: if the options name no camera file or two, or the file cannot be read.
     """
-    given = {"--colmap": options.colmap, "--transforms": options.transforms}
-    count = sum(value is not None for value in given.values())
+    count = (options.colmap is not None) + (options.transforms is not None)
     if count != 1:
         raise InputError(
-            f"A splat needs one file of cameras, got {'two' if count else 'none'}: give the folder of a COLMAP project "
+            f"A splat needs one camera file, got {'two' if count else 'none'}: give the folder of a COLMAP project "
             "with --colmap, or a transforms.json with --transforms."
         )
     for name, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and not folder.is_dir():
-            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give the folder of the files.")
+            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give an existing folder.")
     cameras = _transforms(options, advice) if options.colmap is None else _colmap(options, options.colmap, advice)
     check_frames(cameras.frames, cameras.source)
     return cameras._replace(frames=[sized(frame, cameras.source) for frame in cameras.frames])
@@ -56,11 +58,13 @@ def read_camera_file(options: SplatOptions, advice: str = "say where the photogr
 def _transforms(options: SplatOptions, advice: str) -> Cameras:
     path = Path(options.transforms or "").absolute()
     path = path / "transforms.json" if path.is_dir() else path
-    found = read_transforms(path, options.images, options.masks, advice=advice)
+    contents = read_transforms(path, options.images, options.masks, advice=advice)
     world = options.world_transform
-    to_splat = None if world is None else read_world_transform(world, found.applied, found.applied_scale)
+    to_splat = (
+        None if world is None else read_world_transform(world, contents.applied_transform, contents.applied_scale)
+    )
     base = path.parent if options.images is None else options.images.absolute().parent
-    return Cameras(found.frames, found.held_out, path, path.parent, base, to_splat)
+    return Cameras(contents.frames, contents.held_out, path, path.parent, base, to_splat)
 
 
 def _colmap(options: SplatOptions, folder: Path, advice: str) -> Cameras:
@@ -68,14 +72,14 @@ def _colmap(options: SplatOptions, folder: Path, advice: str) -> Cameras:
     model = model_folder(folder)
     cameras, images = read_model(model)
     registered = sorted(images, key=lambda image: image.name)  # as training tools sort them
-    intrinsics = {number: intrinsics_of(camera, model) for number, camera in cameras.items()}
-    place = options.images or folder / "images"
-    if not place.is_dir():
-        raise FileNotFoundError(f"There is no folder {place} of photographs. Put it there, or {advice}.")
-    listed = [image.name for image in registered]
-    files = find_photographs(listed, place.absolute(), model, advice, copies=True)
-    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(listed, options.masks)
-    base = folder if place.absolute().is_relative_to(folder) else place.absolute().parent
+    intrinsics = {camera_id: intrinsics_of(camera, model) for camera_id, camera in cameras.items()}
+    images_dir = (options.images or folder / "images").absolute()
+    if not images_dir.is_dir():
+        raise FileNotFoundError(f"There is no image folder {images_dir}. Put it there, or {advice}.")
+    names = [image.name for image in registered]
+    files = find_photographs(names, images_dir, model, advice, copies=True)
+    masks: Sequence[Path | None] = [None] * len(files) if options.masks is None else find_masks(names, options.masks)
+    base = folder if images_dir.is_relative_to(folder) else images_dir.parent
     frames = [
         Frame(file, relative_name(file, base), pose_of(image), intrinsics[image.camera], mask)
         for image, file, mask in zip(registered, files, masks)

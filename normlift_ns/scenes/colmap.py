@@ -1,4 +1,4 @@
-"""Reconstructions of COLMAP, in its text and its binary files."""
+"""COLMAP reconstructions in text and binary format."""
 
 from __future__ import annotations
 
@@ -13,49 +13,49 @@ from jaxtyping import Float
 from normlift_ns.errors import InputError
 from normlift_ns.scenes.frames import Intrinsics
 
-_MODELS = {
+_INTRINSICS = {
     "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy, {}),
     "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy, {}),
     "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, {"k1": k}),
     "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, {"k1": k1, "k2": k2}),
     "OPENCV": lambda fx, fy, cx, cy, k1, k2, p1, p2: (fx, fy, cx, cy, {"k1": k1, "k2": k2, "p1": p1, "p2": p2}),
 }
-"""fx, fy, cx, cy and distortion by the parameters of COLMAP's camera models."""
-_NUMBERED = (
+"""COLMAP's camera models: functions from their parameters to fx, fy, cx, cy and distortion."""
+_MODEL_SIZES = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )  # fmt: skip
-"""Names and numbers of parameters by the numbers in binary files."""
-_LARGEST, _FARTHEST = 2**16, 1e30
-_PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-_ADVICE = "Copy the reconstruction again, or write it anew with: colmap model_converter"
+"""Camera models in the order of their IDs in binary files, each with its number of parameters."""
+_MAX_SIDE, _MAX_VALUE = 2**16, 1e30
+_MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+_ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
 
 
 def model_folder(folder: Path) -> Path:
-    """Where the reconstruction lies: in the folder itself, or in its sparse/0.
+    """Return the folder of the reconstruction: the given folder, its sparse/0 or a similar subfolder.
 
     Raises:
-        FileNotFoundError: nowhere; the message names the places.
+        FileNotFoundError: if none of them holds a reconstruction; the message lists them.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {folder}. Give the folder of the COLMAP project with --colmap, which holds images and "
-            "sparse/0."
+            f"There is no folder {folder}. Give the folder of the COLMAP project, which holds images and sparse/0, "
+            "with --colmap."
         )
-    for place in _PLACES:
-        if any((folder / place / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
-            return folder / place
+    for subfolder in _MODEL_FOLDERS:
+        if any((folder / subfolder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
+            return folder / subfolder
     raise FileNotFoundError(
-        f"{folder} holds no reconstruction of COLMAP: no cameras.bin and no cameras.txt in it, nor in "
-        f"{', '.join(_PLACES[1:])}. Give the folder that holds sparse/0 with --colmap."
+        f"{folder} holds no COLMAP reconstruction: neither it nor its {', '.join(_MODEL_FOLDERS[1:])} contains "
+        "cameras.bin or cameras.txt. Give the folder that holds sparse/0 with --colmap."
     )
 
 
 class Camera(NamedTuple):
-    """One camera as it stands in the file."""
+    """A camera as stored in the file."""
 
-    number: int
+    camera_id: int
     model: str
     width: int
     height: int
@@ -63,87 +63,95 @@ class Camera(NamedTuple):
 
 
 class Registered(NamedTuple):
-    """One registered image as it stands in the file: a world-to-camera pose in OpenCV convention."""
+    """A registered image as stored in the file, with a world-to-camera pose in OpenCV convention."""
 
-    number: int
+    image_id: int
     name: str
     rotation: list[float]
-    """w, x, y, z."""
+    """Quaternion w, x, y, z."""
     translation: list[float]
     camera: int
 
 
 def read_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, Camera], list[Registered]]:
-    """Cameras by their numbers, and registered images in the order of the file.
+    """Read the cameras, by ID, and the registered images, in file order.
 
     Args:
-        text_first: where there are both, take the text files, as nerfstudio does; else the binary ones, as COLMAP does.
+        model: folder of the reconstruction.
+        text_first: if both formats exist, read the text files, as nerfstudio does; otherwise read the binary files, as
+            COLMAP does.
     Raises:
-        FileNotFoundError, ValueError: no file, a damaged one, numbers twice, sizes that no photograph has, poses that
-            are not finite, no image at all, or an image whose camera is missing.
+        FileNotFoundError: if a file is missing.
+        ValueError: if a file is damaged or holds duplicate IDs, impossible image sizes, poses that are not finite, no
+            images, or an image without its camera.
     """
-    text = text_first and (model / "cameras.txt").exists()
+    as_text = text_first and (model / "cameras.txt").exists()
     cameras: dict[int, Camera] = {}
-    for camera in _read(model, "cameras", _cameras_text, _cameras_binary, text):
-        if camera.number in cameras or not (0 < camera.width <= _LARGEST and 0 < camera.height <= _LARGEST):
+    for camera in _read(model, "cameras", _cameras_text, _cameras_binary, as_text):
+        if camera.camera_id in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
             raise InputError(
-                f"{model}: camera {camera.number} of {camera.width:.6g} x {camera.height:.6g} pixels stands there "
-                f"twice, or has sides that are not 1 to {_LARGEST:,} pixels. {_ADVICE}"
+                f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels is listed "
+                f"twice, or its sides are not 1 to {_MAX_SIDE:,} pixels. {_ADVICE}"
             )
-        if not (np.abs(camera.parameters) < _FARTHEST).all():
-            raise InputError(f"{model}: camera {camera.number} has parameters {camera.parameters}. {_ADVICE}")
-        cameras[camera.number] = camera
-    images = _read(model, "images", _images_text, _images_binary, text)
+        if not (np.abs(camera.parameters) < _MAX_VALUE).all():
+            raise InputError(
+                f"{model}: camera {camera.camera_id} has the parameters {camera.parameters}. Expected finite numbers "
+                f"below {_MAX_VALUE:g}. {_ADVICE}"
+            )
+        cameras[camera.camera_id] = camera
+    images = _read(model, "images", _images_text, _images_binary, as_text)
     for image in images:
         pose = np.array([*image.rotation, *image.translation])
-        if not (np.abs(pose) < _FARTHEST).all() or not np.any(pose[:4]):
+        if not (np.abs(pose) < _MAX_VALUE).all() or not np.any(pose[:4]):
             raise InputError(
-                f"{model}: the pose of {image.name} is not finite or has no rotation: {image.rotation} "
+                f"{model}: the pose of {image.name} is not finite, or its quaternion is zero: {image.rotation} "
                 f"{image.translation}. {_ADVICE}"
             )
-    lost = [image for image in images if image.camera not in cameras]
-    if lost or len(images) == 0:
-        what = f"{lost[0].name} was taken with camera {lost[0].camera}, which is missing" if lost else "no image"
+    orphans = [image for image in images if image.camera not in cameras]
+    if orphans or len(images) == 0:
+        problem = f"{orphans[0].name} needs camera {orphans[0].camera}, which is missing" if orphans else "no image"
         raise InputError(
-            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {what}. Expected a camera for "
-            "every image; copy the whole reconstruction again."
+            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected a camera "
+            "for every image; copy the whole reconstruction again."
         )
-    if len({image.number for image in images}) < len(images):
-        raise InputError(f"{model} has two images of the same number. {_ADVICE}")
+    if len({image.image_id for image in images}) < len(images):
+        raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
     return cameras, images
 
 
 def intrinsics_of(camera: Camera, model: Path) -> Intrinsics:
-    """The projection of a camera.
+    """Return the intrinsics of a camera.
 
     Raises:
-        ValueError: a camera model that cannot be undistorted here.
+        ValueError: if `normlift_ns` cannot undistort images of this camera model.
     """
-    if camera.model not in _MODELS:
+    if camera.model not in _INTRINSICS:
         raise InputError(
-            f"{model}: camera {camera.number} has the model {camera.model}; read are {', '.join(_MODELS)}. Undistort "
-            "the images with: colmap image_undistorter, train the scene on those, and give that folder."
+            f"{model}: camera {camera.camera_id} has the model {camera.model}; supported models are "
+            f"{', '.join(_INTRINSICS)}. Undistort the images with: colmap image_undistorter, train the scene on those, "
+            "and give that folder."
         )
-    fx, fy, cx, cy, distortion = _MODELS[camera.model](*camera.parameters)
+    fx, fy, cx, cy, distortion = _INTRINSICS[camera.model](*camera.parameters)
     return Intrinsics(fx, fy, cx, cy, camera.width, camera.height, **distortion)
 
 
 def pose_of(image: Registered) -> Float[np.ndarray, "3 4"]:
-    """Camera to world in OpenGL convention."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (runs of nerfstudio do without)
+    """Return the camera-to-world pose in OpenGL convention."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (nerfstudio runs do not need SciPy)
 
     matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
     return np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(image.translation)[:, None]], axis=1)
 
 
 def read_points(model: Path) -> Float[np.ndarray, "n 3"]:
-    """The points of the reconstruction in the order of their numbers.
+    """Read the points of the reconstruction, sorted by their IDs.
 
     Raises:
-        FileNotFoundError, ValueError: no file, a damaged one, points that are not finite.
+        FileNotFoundError: if there is no points3D file.
+        ValueError: if the file is damaged or holds points that are not finite.
     """
-    found = dict(_read(model, "points3D", _points_text, _points_binary))
-    points = np.array([found[number] for number in sorted(found)], dtype=np.float64).reshape(-1, 3)
+    positions = dict(_read(model, "points3D", _points_text, _points_binary))
+    points = np.array([positions[point_id] for point_id in sorted(positions)], dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise InputError(f"{model}: points3D has coordinates that are NaN or infinite. {_ADVICE}")
     return points
@@ -152,8 +160,8 @@ def read_points(model: Path) -> Float[np.ndarray, "n 3"]:
 def _read(
     model: Path,
     name: str,
-    text: Callable[[list[str]], Iterator[Any]],
-    binary: Callable[[_Bytes], Iterator[Any]],
+    parse_text: Callable[[list[str]], Iterator[Any]],
+    parse_binary: Callable[[_ByteReader], Iterator[Any]],
     as_text: bool = False,
 ) -> list[Any]:
     path = model / f"{name}.bin"
@@ -166,87 +174,87 @@ def _read(
         )
     try:
         if path.suffix == ".bin":
-            data = _Bytes(path.read_bytes())
-            found = list(binary(data))
-            data.end()
-            return found
+            data = _ByteReader(path.read_bytes())
+            entries = list(parse_binary(data))
+            data.check_end()
+            return entries
         lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
-        return list(text([line for line in lines if not line.startswith("#")]))
+        return list(parse_text([line for line in lines if not line.startswith("#")]))
     except (ValueError, IndexError, struct.error, KeyError, OverflowError) as error:
-        raise InputError(f"{path} is damaged or no file of COLMAP ({error}). {_ADVICE}") from error
+        raise InputError(f"{path} is damaged or not a COLMAP file ({error}). {_ADVICE}") from error
 
 
-class _Bytes:
-    """Numbers one after the other."""
+class _ByteReader:
+    """Sequential reader of little-endian binary data."""
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.at = data, 0
+        self.data, self.offset = data, 0
 
-    def take(self, code: str) -> tuple[Any, ...]:
-        values = struct.unpack_from(f"<{code}", self.data, self.at)
-        self.at += struct.calcsize(f"<{code}")
+    def unpack(self, code: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{code}", self.data, self.offset)
+        self.offset += struct.calcsize(f"<{code}")
         return values
 
-    def text(self) -> str:
-        end = self.data.index(b"\0", self.at)
-        value = self.data[self.at : end].decode("utf8")
-        self.at = end + 1
+    def string(self) -> str:
+        end = self.data.index(b"\0", self.offset)
+        value = self.data[self.offset : end].decode("utf8")
+        self.offset = end + 1
         return value
 
     def skip(self, count: int) -> None:
-        if self.at + count > len(self.data):
+        if self.offset + count > len(self.data):
             raise InputError(f"it ends after {len(self.data):,} bytes")
-        self.at += count
+        self.offset += count
 
     def count(self) -> int:
-        """How many entries follow: each takes eight bytes or more, so that a damaged number shows at once."""
-        number = self.take("Q")[0]
+        """Read the number of entries that follow. Each takes at least eight bytes, which exposes a damaged number."""
+        number = self.unpack("Q")[0]
         if number > len(self.data) // 8:
-            raise InputError(f"it says {number:,} entries, but has {len(self.data):,} bytes")
+            raise InputError(f"it declares {number:,} entries, but has {len(self.data):,} bytes")
         return number
 
-    def end(self) -> None:
-        if self.at != len(self.data):
-            raise InputError(f"{len(self.data) - self.at:,} bytes too many")
+    def check_end(self) -> None:
+        if self.offset != len(self.data):
+            raise InputError(f"{len(self.data) - self.offset:,} bytes too many")
 
 
-def _cameras_binary(data: _Bytes) -> Iterator[Camera]:
+def _cameras_binary(data: _ByteReader) -> Iterator[Camera]:
     for _ in range(data.count()):
-        number, model, width, height = data.take("iiQQ")
-        if not 0 <= model < len(_NUMBERED):
-            raise InputError(f"camera {number} has the model number {model}, which is not known")
-        name, count = _NUMBERED[model]
-        yield Camera(number, name, width, height, data.take(f"{count}d"))
+        camera_id, model_id, width, height = data.unpack("iiQQ")
+        if not 0 <= model_id < len(_MODEL_SIZES):
+            raise InputError(f"camera {camera_id} has the unknown model ID {model_id}")
+        name, count = _MODEL_SIZES[model_id]
+        yield Camera(camera_id, name, width, height, data.unpack(f"{count}d"))
 
 
 def _cameras_text(lines: list[str]) -> Iterator[Camera]:
-    counts = dict(_NUMBERED)
+    counts = dict(_MODEL_SIZES)
     for line in filter(None, lines):
-        number, name, width, height, *parameters = line.split()
+        camera_id, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
-            raise InputError(f"camera {number} has {len(parameters)} parameters, {name} needs {counts[name]}")
-        yield Camera(int(number), name, int(width), int(height), tuple(map(float, parameters)))
+            raise InputError(f"camera {camera_id} has {len(parameters)} parameters, {name} needs {counts[name]}")
+        yield Camera(int(camera_id), name, int(width), int(height), tuple(map(float, parameters)))
 
 
-def _images_binary(data: _Bytes) -> Iterator[Registered]:
+def _images_binary(data: _ByteReader) -> Iterator[Registered]:
     for _ in range(data.count()):
-        number, *pose, camera = data.take("I7dI")
-        name = data.text()
-        data.skip(24 * data.take("Q")[0])
-        yield Registered(number, name, pose[:4], pose[4:], camera)
+        image_id, *pose, camera_id = data.unpack("I7dI")
+        name = data.string()
+        data.skip(24 * data.unpack("Q")[0])
+        yield Registered(image_id, name, pose[:4], pose[4:], camera_id)
 
 
 def _images_text(lines: list[str]) -> Iterator[Registered]:
-    rest = iter(lines)
-    for line in rest:
+    iterator = iter(lines)
+    for line in iterator:
         if line == "":
             continue
-        points = next(rest, "").split()  # of the image, in the line after it, which may be empty
+        points = next(iterator, "").split()  # the next line lists the image's points and may be empty
         if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
-            raise InputError(f"the line after that of {line.split()[-1]} holds no points, as x, y and their numbers")
-        number, *pose, camera, name = line.split(maxsplit=9)
-        values = list(map(float, pose))
-        yield Registered(int(number), name, values[:4], values[4:], int(camera))
+            raise InputError(f"the line after that of {line.split()[-1]} does not list points as x, y and point ID")
+        image_id, *values, camera_id, name = line.split(maxsplit=9)
+        pose = list(map(float, values))
+        yield Registered(int(image_id), name, pose[:4], pose[4:], int(camera_id))
 
 
 def _is_number(text: str) -> bool:
@@ -257,15 +265,15 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _points_binary(data: _Bytes) -> Iterator[tuple[int, tuple[float, ...]]]:
+def _points_binary(data: _ByteReader) -> Iterator[tuple[int, tuple[float, ...]]]:
     for _ in range(data.count()):
-        number, *place = data.take("Q3d")
+        point_id, *position = data.unpack("Q3d")
         data.skip(3 + 8)
-        data.skip(8 * data.take("Q")[0])
-        yield number, tuple(place)
+        data.skip(8 * data.unpack("Q")[0])
+        yield point_id, tuple(position)
 
 
 def _points_text(lines: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
     for line in filter(None, lines):
-        number, x, y, z, *_ = line.split(maxsplit=4)
-        yield int(number), (float(x), float(y), float(z))
+        point_id, x, y, z, *_ = line.split(maxsplit=4)
+        yield int(point_id), (float(x), float(y), float(z))

@@ -1,4 +1,4 @@
-"""Photographs and their cameras, as camera files describe them."""
+"""Images and cameras as camera files describe them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from normlift_ns.errors import InputError
 from normlift_ns.scenes.image_files import check_mask, read_head
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
-_RIGID = 1e-3
-"""How far a rotation may be from orthonormal: files round."""
+_ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of a rotation from orthonormal, because files round."""
 
 
 class Intrinsics(NamedTuple):
-    """A camera's projection: a pinhole with OpenCV's distortion k1 k2 p1 p2 k3, in pixels."""
+    """Intrinsics, in pixels, of a pinhole camera with OpenCV's distortion k1 k2 p1 p2 k3."""
 
     fx: float
     fy: float
@@ -40,7 +40,7 @@ class Intrinsics(NamedTuple):
         return self[6:]
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """Those of the same photograph at another size."""
+        """Return the intrinsics of the same image at another size."""
         x, y = width / self.width, height / self.height
         return self._replace(
             fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
@@ -48,43 +48,45 @@ class Intrinsics(NamedTuple):
 
 
 class World(NamedTuple):
-    """A similarity p -> scale * (transform @ p) from the world of the cameras to that of a splat."""
+    """Similarity p -> scale * (transform @ p) from the world of the cameras to that of a splat."""
 
     transform: Float[np.ndarray, "3 4"]
     """Rotation and translation."""
     scale: float
     single: bool = False
-    """Computed in float32, as nerfstudio does: only so are the cameras those of its training, bit by bit."""
+    """Whether to compute in float32, as nerfstudio does. Only then are the cameras bit-identical to those of its
+    training."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph and its camera."""
+    """An image and its camera."""
 
     file: Path
-    """Absolute."""
+    """Absolute path of the image."""
     name: str
     """The file relative to the dataset, with forward slashes."""
     pose: Float[np.ndarray, "3 4"]
-    """Camera to world in OpenGL convention: x right, y up, z backward."""
+    """Camera-to-world pose in OpenGL convention: x right, y up, z backward."""
     intrinsics: Intrinsics
     mask: Path | None = None
-    """Image of the same size, zero where a pixel does not count; absolute."""
+    """Absolute path of the mask, an image of the same size that is zero at pixels to ignore."""
 
 
 def check_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Refuses cameras that no photograph can have.
+    """Raise if a camera is invalid.
 
     Raises:
-        ValueError: no camera, numbers that are not finite, no focal length, a pose that is not rigid, names twice.
+        ValueError: if there are no cameras, names repeat, poses are not rigid, numbers are not finite, or focal lengths
+            or sizes are not positive.
     """
     if len(frames) == 0:
-        raise InputError(f"{source} has no cameras with photographs. Expected one for every image of the training.")
+        raise InputError(f"{source} has no cameras with images. Expected one for every training image.")
     for frame in frames:
         if not np.isfinite([*frame.pose.ravel(), *frame.intrinsics]).all():
             raise InputError(
-                f"{source}: the camera of {frame.name} has numbers that are NaN or infinite. Expected finite ones; "
-                "make the file again, or remove the image from it."
+                f"{source}: the camera of {frame.name} has numbers that are NaN or infinite. Expected finite numbers; "
+                "create the file again, or remove the image from it."
             )
         if min(frame.intrinsics[:2]) <= 0 or min(frame.intrinsics[4:6]) < 1:
             raise InputError(
@@ -93,56 +95,62 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
                 "positive numbers."
             )
         rotation = frame.pose[:, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
             raise InputError(
-                f"{source}: the pose of {frame.name} is no rotation and translation. Expected a rigid camera-to-world "
-                "matrix without scale or mirror."
+                f"{source}: the pose of {frame.name} is not a rotation and translation. Expected a rigid "
+                "camera-to-world matrix without scale or mirroring."
             )
     names = [frame.name for frame in frames]
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
-    if twice:
-        raise InputError(f"{source} names {twice[0]} more than once. Expected every photograph once.")
+    duplicates = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    if duplicates:
+        raise InputError(f"{source} lists {duplicates[0]} more than once. Expected every image once.")
 
 
 def find_photographs(names: Sequence[str], folder: Path, source: Path, advice: str, *, copies: bool) -> list[Path]:
-    """The files of those names in a folder, absolute.
+    """Find images by name in a folder, and return their absolute paths.
 
     Args:
-        copies: whether the folder may hold copies of the photographs, so that names need not begin with their folders.
+        names: image names from the camera file.
+        folder: folder to search.
+        source: the camera file, for error messages.
+        advice: what to do about missing images, for error messages.
+        copies: whether the folder may hold copies of the images, which need not lie in the same subfolders.
     Raises:
-        FileNotFoundError: some are missing; the message counts them and names the first.
-        ValueError: two names stand for one file.
+        FileNotFoundError: if images are missing; the message counts them and names the first.
+        ValueError: if two names lead to one file.
     """
-    found = [find_file(folder, name, copies=copies) for name in names]
+    found = [_find_file(folder, name, copies=copies) for name in names]
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} photographs that {source} names are not in {folder}, the first is "
+            f"{len(missing)} of the {len(names)} images that {source} lists are not in {folder}, the first is "
             f"{missing[0]}. Put them back, or {advice}."
         )
     files = [file.absolute() for file in found if file is not None]
     if len(set(files)) < len(files):
-        first = next(i for i, file in enumerate(files) if file in files[:i])
+        second = next(i for i, file in enumerate(files) if file in files[:i])
         raise InputError(
-            f"{source} names {names[files.index(files[first])]} and {names[first]}, but in {folder} there is only "
-            f"{files[first]} for both. Put the photographs into the folders that it names, or {advice}."
+            f"{source} lists {names[files.index(files[second])]} and {names[second]}, but {folder} has only "
+            f"{files[second]} for both. Put the images into the folders that it lists, or {advice}."
         )
     return files
 
 
-def find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
-    """The file of that name in a folder, or of another suffix, as downscaled copies have.
+def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
+    """Find a file by name in a folder, also with another suffix, as downscaled copies have.
 
     Args:
-        copies: try it without its first folders too, as copies in images_2 lie.
+        folder: folder to search.
+        name: path relative to the folder.
+        copies: also try the name without its leading folders, for copies in folders such as images_2.
     """
     path = Path(name)
     parts = path.parts[1:] if path.is_absolute() else path.parts
-    places = [folder.joinpath(*parts[start:]) for start in range(len(parts))] if copies else [folder / path]
-    for place in places:
+    candidates = [folder.joinpath(*parts[start:]) for start in range(len(parts))] if copies else [folder / path]
+    for candidate in candidates:
         for file in (
-            *(place.with_name(place.name + end) for end in ("", *_SUFFIXES)),
-            *map(place.with_suffix, _SUFFIXES),
+            *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),
+            *map(candidate.with_suffix, _SUFFIXES),
         ):
             if file.is_file():
                 return file
@@ -150,28 +158,32 @@ def find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
 
 
 def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
-    """The masks of photographs: name.jpg.png as COLMAP has it, or any image of the same stem.
+    """Find the masks of images: name.jpg.png, as in COLMAP, or any image with the same stem.
 
     Raises:
-        FileNotFoundError: one is missing.
+        FileNotFoundError: if a mask is missing.
     """
     masks = []
     for name in names:
-        found = find_file(folder, f"{name}.png", copies=True) or find_file(folder, name, copies=True)
-        if found is None:
+        mask = _find_file(folder, f"{name}.png", copies=True) or _find_file(folder, name, copies=True)
+        if mask is None:
             raise FileNotFoundError(
                 f"There is no mask for {name} in {folder}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
-                "every photograph."
+                "every image."
             )
-        masks.append(found.absolute())
+        masks.append(mask.absolute())
     return masks
 
 
 def sized(frame: Frame, source: Path) -> Frame:
-    """The frame with the intrinsics of the photograph as it lies on the disk, which may be a smaller copy.
+    """Return the frame with intrinsics for the size of its file, which may be a smaller copy of the image.
 
+    Args:
+        frame: the frame as the camera file describes it.
+        source: the camera file, for error messages.
     Raises:
-        FileNotFoundError, ValueError: no such file, no image, one of another aspect than its camera.
+        FileNotFoundError: if the file is missing.
+        ValueError: if the file is not an image, its aspect ratio differs from its camera's, or its mask does not fit.
     """
     width, height = read_head(frame.file).size
     camera = frame.intrinsics
@@ -179,9 +191,9 @@ def sized(frame: Frame, source: Path) -> Frame:
         scale = (width / camera.width + height / camera.height) / 2
         if abs(camera.width * scale - width) > 1 or abs(camera.height * scale - height) > 1:
             raise InputError(
-                f"{frame.file} is {width} x {height} pixels, but its camera in {source} {camera.width} x "
-                f"{camera.height}: the aspect differs. Give the images that the cameras were computed from, or copies "
-                "of them at a fraction of the size, with --images."
+                f"{frame.file} is {width} x {height} pixels, but its camera in {source} has {camera.width} x "
+                f"{camera.height}: the aspect ratios differ. Give the images that the cameras were computed from, or "
+                "proportionally smaller copies, with --images."
             )
         camera = camera.resized(width, height)
     if frame.mask is not None:
@@ -190,9 +202,9 @@ def sized(frame: Frame, source: Path) -> Frame:
 
 
 def moved(frames: Sequence[Frame], world: World) -> list[Frame]:
-    """The frames in another world."""
-    kind = torch.float32 if world.single else torch.float64
-    poses = torch.from_numpy(np.array([[*frame.pose, [0, 0, 0, 1]] for frame in frames])).to(kind)
-    there = torch.from_numpy(world.transform).to(kind) @ poses  # all at once, as nerfstudio does: same roundings
-    there[:, :, 3] *= world.scale
-    return [replace(frame, pose=pose.double().numpy()) for frame, pose in zip(frames, there)]
+    """Return the frames with poses in another world."""
+    dtype = torch.float32 if world.single else torch.float64
+    poses = torch.from_numpy(np.array([[*frame.pose, [0, 0, 0, 1]] for frame in frames])).to(dtype)
+    poses = torch.from_numpy(world.transform).to(dtype) @ poses  # one product, as in nerfstudio, for equal rounding
+    poses[:, :, 3] *= world.scale
+    return [replace(frame, pose=pose.double().numpy()) for frame, pose in zip(frames, poses)]

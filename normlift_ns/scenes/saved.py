@@ -1,4 +1,4 @@
-"""A splat and its cameras in the directory of a lifted run: what opens it again without the files it came from."""
+"""Splat and cameras stored in a lifted run, which open it again without the original files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from normlift_ns.scenes.transforms import read_transforms, write_transforms
 from normlift_ns.scenes.transforms_file import read_json
 
 SCENE_FILE, TRANSFORMS_FILE, CHECKPOINT_FOLDER = "splat.json", "transforms.json", "nerfstudio_models"
-_EXPECTED = "the file that ns-normlift wrote beside config.yml; copy the whole run again"
+_EXPECTED = "the file that ns-normlift wrote next to config.yml; copy the whole run again"
 
 
 class _Saved(msgspec.Struct):
@@ -33,7 +33,7 @@ class _Saved(msgspec.Struct):
 
 
 def save_splat(folder: Path, scene: SplatScene) -> None:
-    """Writes splat.json and the cameras, transforms.json, into the folder of a run."""
+    """Write splat.json and the cameras, transforms.json, into the folder of a run."""
     write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
     saved = _Saved(
         scene.name, scene.rasterize_mode, scene.background_name, str(scene.photographs), dict(scene.identity)
@@ -42,9 +42,9 @@ def save_splat(folder: Path, scene: SplatScene) -> None:
 
 
 def checkpoint_of(scene: SplatScene) -> dict[str, Any]:
-    """What splatfacto loads: step and parameters.
+    """Return the checkpoint that splatfacto loads: step and parameters.
 
-    Without spherical harmonics splatfacto takes colours for logits, so the first degree is added, all zeros.
+    Without spherical harmonics, splatfacto would read the colors as logits, so the first degree is added as zeros.
     """
     parameters = scene.parameters
     if scene.splat.degree == 0:
@@ -56,18 +56,19 @@ def checkpoint_of(scene: SplatScene) -> dict[str, Any]:
 
 
 def is_saved_splat(run_dir: Path) -> bool:
-    """Whether the run came from a splat without a nerfstudio run."""
+    """Return whether the run was lifted from a splat without a nerfstudio run."""
     return (run_dir / SCENE_FILE).is_file()
 
 
 def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int | None = None) -> SplatScene:
-    """The splat of a lifted run.
+    """Open the splat of a lifted run.
 
     Args:
-        data: folder where the photographs are now, if they were moved.
+        run_dir: folder of the lifted run.
+        data: current folder of the images, if they were moved.
         load_step: step of the checkpoint; None: the last.
     Raises:
-        FileNotFoundError, ValueError: a file that is missing or damaged; the message names it.
+        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
     """
     path = run_dir / SCENE_FILE
     try:
@@ -75,24 +76,26 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         if any(text.strip() == "" or "\0" in text for text in (saved.name, saved.photographs)):
             raise msgspec.ValidationError("name or photographs is empty")
     except msgspec.ValidationError as error:
-        raise InputError(f"{path} has another form than expected: {error}. Expected {_EXPECTED}.") from error
+        raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_FOLDER, load_step))
     parameters = {name: checkpoint.model[f"gauss_params.{name}"] for name in GAUSSIAN_PARAMETERS}
     if data is not None and not data.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {data}, given with --data. Expected the folder that {saved.photographs} was before."
+            f"There is no folder {data}, given with --data. Expected the new location of {saved.photographs}."
         )
-    found = read_transforms(
+    cameras = read_transforms(
         run_dir / TRANSFORMS_FILE,
         None if data is None else data.absolute(),
         base=Path(saved.photographs),
-        advice="say where their folder is with --data",
+        advice="give their folder with --data",
     )
-    check_frames(found.frames, run_dir / TRANSFORMS_FILE)
+    check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
     background = BACKGROUNDS[saved.background]
     train, held_out = (
-        PhotographViews([frame for frame in found.frames if (frame.name in found.held_out) == out], background)
-        for out in (False, True)
+        PhotographViews(
+            [frame for frame in cameras.frames if (frame.name in cameras.held_out) == is_held_out], background
+        )
+        for is_held_out in (False, True)
     )
     return SplatScene(
         from_parameters(parameters, checkpoint.path),

@@ -1,4 +1,4 @@
-"""The Gaussians of a splat as they were trained, and the checks that every file of them must pass."""
+"""Raw parameters of a trained splat, and the validation of splat files."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.errors import InputError
 
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
-"""Degree of the spherical harmonics by their number beyond the constant one."""
-_WIDE = 0.02
-"""A median Gaussian wider than this share of the scene, in a file without negative logarithms: they are none."""
+"""Degree of the spherical harmonics by the number of coefficients beyond the constant one."""
+_MAX_MEDIAN_WIDTH = 0.02
+"""Largest plausible width of the median Gaussian, as a fraction of the scene. If a file has no negative log scales and
+exceeds it, its scales are linear."""
 
-_PRECISIONS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-_SAMPLE, _BLOCK = 2**20, 2**18
-_MANY = 100
-"""Gaussians from which logits that all lie in 0..1 are no chance."""
+_DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_SAMPLE_SIZE, _BLOCK_ROWS = 2**20, 2**18
+_MIN_LOGITS = 100
+"""Number of Gaussians from which logits that all lie in 0..1 cannot be a coincidence."""
 
 
 @dataclass(frozen=True)
 class Splat:
-    """N Gaussians with raw parameters, as trainers store them."""
+    """Raw parameters of N Gaussians, as trainers store them."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -37,16 +38,16 @@ class Splat:
     opacities: Float[Tensor, "n 1"]
     """Logits."""
     features_dc: Float[Tensor, "n 3"]
-    """The constant spherical harmonic of the colours."""
+    """Constant spherical harmonic of the colors."""
     features_rest: Float[Tensor, "n k 3"]
-    """The others: K = 0, 3, 8, 15 or 24."""
+    """Remaining spherical harmonics: K = 0, 3, 8, 15 or 24."""
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """By the names that splatfacto gives them."""
+        """The tensors by splatfacto's names."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @property
@@ -56,75 +57,78 @@ class Splat:
 
     @cached_property
     def activated(self) -> GaussianScene:
-        """The Gaussians as a rasterizer sees them."""
+        """The Gaussians with activated scales and opacities, as a rasterizer takes them."""
         return GaussianScene(self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
 
 
 def check_splat(splat: Splat, file: Path) -> None:
-    """Refuses Gaussians that nothing could draw.
+    """Raise if the Gaussians cannot be drawn.
 
     Raises:
-        ValueError: none at all, values that are not finite, rotations of length zero, scales that are no logarithms,
-            opacities that are no logits.
+        ValueError: if there are no Gaussians, values are not finite, all rotations are zero, scales are not logarithms,
+            or opacities are not logits.
     """
     if len(splat) == 0:
-        raise InputError(f"{file} holds no Gaussians at all. Export the scene again.")
-    for name, values in _drawn(splat):
-        blocks = values.reshape(len(splat), -1).split(_BLOCK)
-        wrong = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
-        if len(wrong) > 0:
+        raise InputError(f"{file} holds no Gaussians. Export the scene again.")
+    for name, values in _activated_values(splat):
+        blocks = values.reshape(len(splat), -1).split(_BLOCK_ROWS)
+        invalid = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
+        if len(invalid) > 0:
             raise InputError(
-                f"{file} has {len(wrong):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first in "
-                f"row {int(wrong[0])}. Expected finite numbers; remove those Gaussians, for a PLY "
-                f"file for example with: splat-transform {file.name} --filter-nan clean.ply"
+                f"{file} has {len(invalid):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first "
+                f"in row {int(invalid[0])}. Expected finite numbers. Remove those Gaussians; for a PLY file, for "
+                f"example, with: splat-transform {file.name} --filter-nan clean.ply"
             )
     lengths = splat.quats.abs().amax(dim=1)
     if bool((lengths == 0).all()):
-        raise InputError(f"{file} has rotations of zeros only, so nothing of it can be drawn. Export the scene again.")
+        raise InputError(f"{file} has only zero quaternions, so no Gaussian can be drawn. Export the scene again.")
     low, high = float(splat.opacities.min()), float(splat.opacities.max())
-    if len(splat) >= _MANY and low >= 0 and high <= 1:
+    if len(splat) >= _MIN_LOGITS and low >= 0 and high <= 1:
         raise InputError(
-            f"{file} seems to hold opacities, between {low:.3g} and {high:.3g}, in place of their logits. Expected "
+            f"{file} seems to hold opacities, between {low:.3g} and {high:.3g}, instead of their logits. Expected "
             "logits, as all splat trainers write them; store log(opacity / (1 - opacity))."
         )
-    some = splat.means[:: max(1, len(splat) // _SAMPLE)]
-    left, right = some.quantile(0.05, dim=0), some.quantile(0.95, dim=0)
+    sample = splat.means[:: max(1, len(splat) // _SAMPLE_SIZE)]
+    left, right = sample.quantile(0.05, dim=0), sample.quantile(0.95, dim=0)
     extent, width = float((right - left).amax()), float(splat.scales.median().exp())
-    if bool((splat.scales >= 0).all()) and extent > 0 and width > _WIDE * extent:
+    if bool((splat.scales >= 0).all()) and extent > 0 and width > _MAX_MEDIAN_WIDTH * extent:
         raise InputError(
             f"{file} seems to hold linear scales, between {float(splat.scales.min()):.3g} and "
-            f"{float(splat.scales.max()):.3g}: taken for logarithms, the median Gaussian would be {width:.3g} wide in "
+            f"{float(splat.scales.max()):.3g}: read as logarithms, they make the median Gaussian {width:.3g} wide in "
             f"a scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
         )
 
 
-def _drawn(splat: Splat) -> Iterator[tuple[str, Tensor]]:
-    """What must be finite; a logit or logarithm may well be infinite."""
+def _activated_values(splat: Splat) -> Iterator[tuple[str, Tensor]]:
+    """Yield the values that must be finite; logits and logarithms themselves may be infinite."""
     yield "means", splat.means
     yield "rotations", splat.quats
     yield "scales", splat.activated.scales
     yield "opacities", splat.activated.opacities
-    yield "colours", splat.features_dc
-    yield "colours", splat.features_rest
+    yield "colors", splat.features_dc
+    yield "colors", splat.features_rest
 
 
 def from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat:
-    """A splat from a trainer's tensors by splatfacto's names, as float32; checks types and shapes.
+    """Return a float32 splat from a trainer's tensors, after checking their types and shapes.
 
+    Args:
+        parameters: tensors by splatfacto's names.
+        file: their file, for messages.
     Raises:
-        ValueError: no Gaussian, a tensor of another type than half, bfloat16, float32 or float64, or of a shape that
-            does not fit.
+        ValueError: if there are no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
+            float64.
     """
     n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0
     if parameters["means"].ndim == 2 and n == 0:
-        raise InputError(f"{file} holds no Gaussians at all. Give the file of a training that kept some.")
+        raise InputError(f"{file} holds no Gaussians. Give the file of a training run that kept some.")
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (1,), "features_dc": (3,)}
     for name, shape in shapes.items():
         value = parameters[name]
-        if tuple(value.shape) != (n, *shape) or value.dtype not in _PRECISIONS:
+        if tuple(value.shape) != (n, *shape) or value.dtype not in _DTYPES:
             raise InputError(
                 f"{file}: {name} is {value.dtype} {tuple(value.shape)}, expected floating-point numbers of shape "
-                f"{(n, *shape)}, one row per Gaussian. Copy the file again, or give that of another training."
+                f"{(n, *shape)}, one row per Gaussian. Copy the file again, or give that of another training run."
             )
     rest = parameters["features_rest"]
     if (
@@ -132,11 +136,11 @@ def from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat:
         or len(rest) != n
         or rest.shape[2] != 3
         or rest.shape[1] not in DEGREES
-        or rest.dtype not in _PRECISIONS
+        or rest.dtype not in _DTYPES
     ):
         raise InputError(
             f"{file}: its spherical harmonics have shape {tuple(rest.shape)} and type {rest.dtype}, expected "
             f"floating-point numbers of shape ({n}, K, 3) with K = {', '.join(map(str, DEGREES))} for degrees "
-            f"{', '.join(map(str, DEGREES.values()))}. Copy the file again, or give that of another training."
+            f"{', '.join(map(str, DEGREES.values()))}. Copy the file again, or give that of another training run."
         )
     return Splat(**{name: parameters[name].detach().float() for name in (*shapes, "features_rest")})

@@ -1,4 +1,4 @@
-"""Which photographs were held out of the training."""
+"""Selection of the images that were held out of the training."""
 
 from __future__ import annotations
 
@@ -11,77 +11,76 @@ from normlift_ns.errors import InputError
 
 
 def held_out_names(names: Sequence[str], *, test_every: int | None, holdout: Sequence[str]) -> frozenset[str]:
-    """Names of the photographs that the training did not see.
+    """Return the names of the images that the training did not use.
 
     Args:
-        names: of all photographs, sorted.
-        test_every: every n-th is held out, from the first on, as in gsplat's trainer and in Inria's with --eval.
-        holdout: names, with or without folder and suffix; or one text file with a name per line; or one share below
-            1, as ns-train's dataparser holds out the photographs that its evenly spaced training set leaves over.
+        names: sorted names of all images.
+        test_every: hold out every n-th image, starting with the first, as gsplat's trainer does, and Inria's with
+            --eval.
+        holdout: image names, with or without folder and suffix; or a text file with one name per line; or a fraction
+            below 1. As in ns-train's dataparser, the training images are then evenly spaced, and the rest is held out.
     Raises:
-        ValueError: a name that no photograph has, or both ways at once.
+        ValueError: if no image has one of the names, or both options are given.
     """
     if test_every is not None and len(holdout) > 0:
-        raise InputError("--test-every and --holdout both say which photographs are held out; give one of them")
+        raise InputError("--test-every and --holdout both select held-out images; give only one of them")
     if test_every is not None:
         if test_every < 2:
-            raise InputError(
-                f"--test-every must be at least 2, got {test_every}; leave it out where nothing was held out"
-            )
+            raise InputError(f"--test-every must be at least 2, got {test_every}; omit it if nothing was held out")
         return frozenset(names[::test_every])
-    share = _share(holdout)
-    if share is not None:
-        trained = np.linspace(0, len(names) - 1, int(np.ceil(len(names) * (1 - share))), dtype=int)
+    fraction = _fraction(holdout)
+    if fraction is not None:
+        trained = np.linspace(0, len(names) - 1, int(np.ceil(len(names) * (1 - fraction))), dtype=int)
         return frozenset(np.delete(np.array(names, dtype=object), trained).tolist())
-    wanted = list(holdout)
-    if len(wanted) == 1 and wanted[0].endswith(".txt"):
-        wanted = _listed(Path(wanted[0]))
-    return frozenset(name for want in wanted for name in _matching(want, names))
+    requested = list(holdout)
+    if len(requested) == 1 and requested[0].endswith(".txt"):
+        requested = _read_names(Path(requested[0]))
+    return frozenset(name for request in requested for name in _matching(request, names))
 
 
-def _share(holdout: Sequence[str]) -> float | None:
+def _fraction(holdout: Sequence[str]) -> float | None:
     if len(holdout) != 1:
         return None
     try:
-        share = float(holdout[0])
+        fraction = float(holdout[0])
     except ValueError:
         return None
-    if share.is_integer() and not 0 <= share <= 1:
-        return None  # the name of a photograph
-    if not 0 < share < 1:
+    if fraction.is_integer() and not 0 <= fraction <= 1:
+        return None  # an image name
+    if not 0 < fraction < 1:
         raise InputError(
-            f"--holdout {holdout[0]} is no share: expected a number between 0 and 1, such as 0.1, or names"
+            f"--holdout {holdout[0]} is not a fraction: expected a number between 0 and 1, such as 0.1, or image names"
         )
-    return share
+    return fraction
 
 
-def _listed(file: Path) -> list[str]:
-    """Names in a text file, one per line."""
+def _read_names(file: Path) -> list[str]:
+    """Read image names from a text file, one per line."""
     if not file.is_file():
-        raise InputError(
-            f"--holdout names {file}, and there is no such file. Expected one name of a photograph per line."
-        )
+        raise InputError(f"--holdout names the file {file}, which does not exist. Expected one image name per line.")
     try:
         names = [line.strip() for line in file.read_text("utf-8-sig").splitlines()]
     except UnicodeDecodeError as error:
-        raise InputError(f"{file} is no UTF-8 text ({error}). Expected one name of a photograph per line.") from error
+        raise InputError(f"{file} is not UTF-8 text ({error}). Expected one image name per line.") from error
     if not any(names):
-        raise InputError(f"{file} is empty. Expected the names of the photographs that were held out, one per line.")
+        raise InputError(f"{file} is empty. Expected the names of the held-out images, one per line.")
     return [name for name in names if name != ""]
 
 
-def _matching(wanted: str, names: Sequence[str]) -> list[str]:
-    path = Path(wanted)
+def _matching(requested: str, names: Sequence[str]) -> list[str]:
+    path = Path(requested)
     for short in (lambda name: name, lambda name: name.name, lambda name: name.with_suffix(""), lambda name: name.stem):
-        found = [name for name in names if str(short(Path(name))) == str(path)]
-        if len(found) > 1:
-            raise InputError(f"--holdout {wanted} fits {len(found)} photographs: {', '.join(found)}. Give whole names.")
-        if found:
-            return found
-    found = [name for name in names if path.as_posix().endswith(f"/{name}")]
-    if len(found) != 1:
+        matches = [name for name in names if str(short(Path(name))) == str(path)]
+        if len(matches) > 1:
+            raise InputError(
+                f"--holdout {requested} matches {len(matches)} images: {', '.join(matches)}. Give full names."
+            )
+        if matches:
+            return matches
+    matches = [name for name in names if path.as_posix().endswith(f"/{name}")]
+    if len(matches) != 1:
         raise InputError(
-            f"--holdout names {wanted}, but no photograph is called so; there are {len(names)}, "
+            f"--holdout names {requested}, but no image has this name; there are {len(names)}, "
             f"{names[0]} to {names[-1]}"
         )
-    return found
+    return matches

@@ -1,4 +1,4 @@
-"""transforms.json as it stands in its file: schema, and numbers that a camera can have."""
+"""Schema and validation of transforms.json."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 
 from normlift_ns.errors import InputError
 
-_LARGEST, _MOST_PIXELS = 2**16, 2**28
-"""Pixels along one side of a photograph, and in all of it."""
-_FARTHEST = 1e30
-_MOST_BYTES = 2**27
-"""Of a JSON file; ten thousand frames take a tenth of that."""
+_MAX_SIDE, _MAX_PIXELS = 2**16, 2**28
+"""Largest side and largest area of an image, in pixels."""
+_MAX_VALUE = 1e30
+_MAX_JSON_BYTES = 2**27
+"""Largest JSON file that is read; ten thousand frames take a tenth of that."""
 
 
 class CameraEntry(msgspec.Struct):
-    """What may stand in the file for all frames, or in a frame."""
+    """Camera parameters, given for all frames or for a single frame."""
 
     fl_x: float | None = None
     fl_y: float | None = None
@@ -41,7 +41,7 @@ class CameraEntry(msgspec.Struct):
 
 
 class FrameEntry(CameraEntry, kw_only=True):
-    """One photograph as the file has it."""
+    """A frame, as stored in the file."""
 
     file_path: str
     transform_matrix: list[list[float]]
@@ -49,7 +49,7 @@ class FrameEntry(CameraEntry, kw_only=True):
 
 
 class Entries(CameraEntry, kw_only=True):
-    """The file as it stands."""
+    """The contents of a transforms.json."""
 
     frames: list[FrameEntry]
     applied_transform: list[list[float]] | None = None
@@ -61,71 +61,76 @@ class Entries(CameraEntry, kw_only=True):
 
 
 def read_json(path: Path, expected: str) -> Any:
-    """The values of a JSON file.
+    """Read a JSON file.
 
+    Args:
+        path: the file.
+        expected: noun phrase for error messages that describes the expected file.
     Raises:
-        FileNotFoundError, ValueError: no file, no JSON, or values nested too deeply; the message names it.
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is too large, is not valid JSON or is nested too deeply.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}. Expected {expected}.")
-    if path.stat().st_size > _MOST_BYTES:
+    if path.stat().st_size > _MAX_JSON_BYTES:
         raise InputError(
-            f"{path} has {path.stat().st_size:,} bytes, more than the {_MOST_BYTES:,} that are read. Expected "
+            f"{path} has {path.stat().st_size:,} bytes, more than the limit of {_MAX_JSON_BYTES:,}. Expected "
             f"{expected}."
         )
     text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     try:
         return msgspec.json.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        found = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
-        reason = str(error) if found is None else f"it contains {found}"
-        raise InputError(f"{path} is no valid JSON ({reason}). Expected {expected}.") from error
+        invalid = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
+        reason = str(error) if invalid is None else f"it contains {invalid}"
+        raise InputError(f"{path} is not valid JSON ({reason}). Expected {expected}.") from error
 
 
 def read_entries(path: Path) -> Entries:
-    """A transforms.json as it stands, with poses and sizes that a camera can have; no photograph is looked for.
+    """Read and validate a transforms.json, without looking for its images.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, no JSON, another schema, no frames, poses or sizes that are none.
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not valid JSON, does not match the schema, or has no frames, invalid poses or
+            invalid sizes.
     """
-    expected = "a transforms.json as nerfstudio, instant-ngp or Blender's synthetic scenes have it"
+    expected = "a transforms.json of nerfstudio, instant-ngp or Blender's synthetic scenes"
     values = read_json(path, expected)
     try:
-        found = msgspec.convert(values, Entries)
+        entries = msgspec.convert(values, Entries)
     except (msgspec.ValidationError, RecursionError, OverflowError) as error:
-        raise InputError(f"{path} has another form than expected: {error}. Expected {expected}.") from error
-    if len(found.frames) == 0:
-        raise InputError(f"{path} has no frames, so no cameras. Expected one for every image of the training.")
-    for holder in (found, *found.frames):
-        where = f"{path}: {holder.file_path}" if isinstance(holder, FrameEntry) else str(path)
-        _check_numbers(holder, where)
-        if isinstance(holder, FrameEntry):
-            names = (holder.file_path, holder.mask_path or "-")
-            if any(name.strip() == "" or "\0" in name for name in names):
-                raise InputError(f"{path}: the file_path or mask_path {names} is no name of a file. Expected one.")
-            rows = holder.transform_matrix
-            if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not (np.abs(rows) < _FARTHEST).all():
-                raise InputError(
-                    f"{path}: the transform_matrix of {holder.file_path} is not 4 x 4 finite numbers. Expected a "
-                    "camera-to-world matrix."
-                )
-    return found
+        raise InputError(f"{path} does not match the schema: {error}. Expected {expected}.") from error
+    if len(entries.frames) == 0:
+        raise InputError(f"{path} has no frames, so no cameras. Expected a frame for every training image.")
+    _check_numbers(entries, str(path))
+    for frame in entries.frames:
+        _check_numbers(frame, f"{path}: {frame.file_path}")
+        names = (frame.file_path, frame.mask_path or "-")
+        if any(name.strip() == "" or "\0" in name for name in names):
+            raise InputError(f"{path}: the file_path or mask_path {names} is not a valid file name.")
+        rows = frame.transform_matrix
+        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows) or not (np.abs(rows) < _MAX_VALUE).all():
+            raise InputError(
+                f"{path}: the transform_matrix of {frame.file_path} is not 4 x 4 finite numbers. Expected a "
+                "camera-to-world matrix."
+            )
+    return entries
 
 
-def _check_numbers(entry: CameraEntry, where: str) -> None:
-    """Sizes are whole and in bounds, focal lengths positive, all others within float32."""
+def _check_numbers(entry: CameraEntry, source: str) -> None:
+    """Raise if a size is not a whole number in range, a focal length not positive, or a number beyond float32."""
     for name in ("w", "h"):
         side = getattr(entry, name)
-        if side is not None and not (0 < side <= _LARGEST and float(side).is_integer()):
-            raise InputError(f"{where}: {name} is {side:g}, expected whole numbers of pixels, 1 to {_LARGEST:,}.")
-    if (entry.w or 1) * (entry.h or 1) > _MOST_PIXELS:
-        raise InputError(f"{where}: w and h are {entry.w:g} and {entry.h:g}, more than {_MOST_PIXELS:,} pixels in all.")
+        if side is not None and not (0 < side <= _MAX_SIDE and float(side).is_integer()):
+            raise InputError(f"{source}: {name} is {side:g}, expected a whole number of pixels, 1 to {_MAX_SIDE:,}.")
+    if (entry.w or 1) * (entry.h or 1) > _MAX_PIXELS:
+        raise InputError(f"{source}: w and h are {entry.w:g} and {entry.h:g}, more than {_MAX_PIXELS:,} pixels in all.")
     numbers = {name: getattr(entry, name) for name in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")}
     numbers |= {f"distortion_params[{i}]": value for i, value in enumerate(entry.distortion_params or ())}
     for name in ("fl_x", "fl_y"):
         focal = getattr(entry, name)
-        if focal is not None and not 0 < focal < _FARTHEST:
-            raise InputError(f"{where}: {name} is {focal:g}, expected a positive number of pixels.")
+        if focal is not None and not 0 < focal < _MAX_VALUE:
+            raise InputError(f"{source}: {name} is {focal:g}, expected a positive number of pixels.")
     for name, value in numbers.items():
-        if value is not None and not abs(value) < _FARTHEST:
-            raise InputError(f"{where}: {name} is {value:g}, expected a number that float32 can hold.")
+        if value is not None and not abs(value) < _MAX_VALUE:
+            raise InputError(f"{source}: {name} is {value:g}, expected a number that float32 can hold.")

@@ -1,4 +1,4 @@
-"""numpy's numbers in checkpoints: learning rates in the state of nerfstudio's schedulers are such."""
+"""Safe unpickling of NumPy scalars, such as the learning rates in nerfstudio's scheduler states."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in n
 
 @contextmanager
 def numbers_allowed() -> Iterator[None]:
-    """Lets `torch.load(weights_only=True)` read numpy's numbers besides tensors and plain containers.
+    """Allow `torch.load(weights_only=True)` to read NumPy scalars in addition to tensors and plain containers.
 
-    torch before 2.4 cannot build them at all: there each of them is read as None.
+    torch before 2.4 cannot build NumPy scalars, so it reads each of them as None.
     """
     if hasattr(torch.serialization, "safe_globals"):
         with torch.serialization.safe_globals(numpy_numbers()):
             yield
         return
     if hasattr(torch.serialization, "add_safe_globals"):
-        torch.serialization.add_safe_globals(numpy_numbers())  # torch 2.4, which takes nothing away again
+        torch.serialization.add_safe_globals(numpy_numbers())  # torch 2.4 cannot remove them again
         yield
         return
     allowed: dict[str, Any] = torch._weights_only_unpickler._get_allowed_globals()  # pyright: ignore
@@ -40,37 +40,37 @@ def numbers_allowed() -> Iterator[None]:
 
 
 def numpy_numbers() -> list[Any]:
-    """What unpickling numpy's scalars needs, for torch's list of what may be unpickled."""
+    """Return the types and functions that unpickle NumPy scalars, for torch's allow-list."""
     rebuild: Any = np.float64(0).__reduce__()[0]
     dtypes = {type(np.dtype(code)) for code in "?bBhHiIlLqQefd"}
     return [
         np.dtype,
         *dtypes,
-        _named(_latin1, "_codecs", "encode"),
-        *(_named(rebuild, module, "scalar") for module in _MODULES),
+        _renamed(_latin1, "_codecs", "encode"),
+        *(_renamed(rebuild, module, "scalar") for module in _MODULES),
     ]
 
 
 def _latin1(text: str, encoding: str) -> bytes:
-    """How pickle writes bytes; other encodings than this one could make gigabytes of nothing."""
+    """Encode text as pickle encodes bytes. Other encodings could expand a small file to gigabytes."""
     if encoding != "latin1":
         raise pickle.UnpicklingError(f"bytes in the encoding {encoding}")
     return codecs.latin_1_encode(text)[0]
 
 
 def _unread(*_: object) -> None:
-    """In place of a number."""
+    """Stand-in for a NumPy scalar."""
 
 
 def _unread_dtype(*_: object) -> torch.nn.Parameter:
-    """In place of its type: an object of the one kind with a state of its own that old versions of torch build."""
+    """Stand-in for a NumPy dtype: the only kind of object with a custom state that old torch versions build."""
     stand_in: Any = torch.nn.Parameter(torch.empty(0))
     stand_in.__setstate__ = _unread
     return stand_in
 
 
-def _named(function: Callable[..., Any], module: str, name: str) -> Callable[..., Any]:
-    """The function under another name: torch's allow-list goes by names."""
+def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[..., Any]:
+    """Return the function under another name, because torch's allow-list compares names."""
 
     def alias(*args: Any) -> Any:
         return function(*args)

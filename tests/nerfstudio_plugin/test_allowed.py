@@ -202,7 +202,7 @@ def test_odd_yaml_is_refused(tmp_path: Path, texts: tuple[str, str]) -> None:
         ("prompt: null", "prompt: !!python/tuple 3"): "cannot be read",
         ("prompt: null", "prompt: &a [*a]"): "recursive",
         ("method_name: splatfacto", "method_name: ../splatfacto"): "'../splatfacto'",
-        ("- scene", "- 5"): "other things than text",
+        ("- scene", "- 5"): "are not text",
         ("- Train Iter (time)", "- Nothing"): "cannot be read",
     }
     for (old, new), problem in exchanged.items():
@@ -219,7 +219,7 @@ def test_a_bomb_of_references_costs_nothing(tmp_path: Path, texts: tuple[str, st
     target = "!!python/object:nerfstudio.configs.base_config.LocalWriterConfig {_target: *a29, enable: true}"
     for line, problem in (
         ("prompt: *a29", "is a list"),
-        ("prompt: !!python/object/apply:pathlib.PosixPath [*a29]", "other things than text"),
+        ("prompt: !!python/object/apply:pathlib.PosixPath [*a29]", "are not text"),
         (f"z: {target}", "is list, expected"),
     ):
         assert problem in refusal(tmp_path, f"{bare}\n{line}\n"), line

@@ -125,10 +125,10 @@ def test_what_nerfstudio_reads_first_is_checked_first(moved: Path, tmp_path: Pat
     data = bytearray((model / "images.bin").read_bytes())
     data[12:20] = b"\xff" * 8
     (model / "images.bin").write_bytes(data)
-    with pytest.raises(InputError, match=r"is not finite or has no rotation"):
+    with pytest.raises(InputError, match=r"is not finite, or its quaternion is zero"):
         opened(moved)
     shutil.rmtree(model)
-    with pytest.raises(FileNotFoundError, match=r"sparse/0, COLMAP's reconstruction, is missing"):
+    with pytest.raises(FileNotFoundError, match=r"sparse/0, the COLMAP reconstruction, is missing"):
         opened(moved)
 
 
@@ -142,8 +142,8 @@ def test_cameras_that_no_training_had_are_named(copied: Path) -> None:
     frame, keep = whole["frames"][0], whole["frames"][1:]
     turned = [[float("nan"), 0, 0, 0], *frame["transform_matrix"][1:]]
     cases: list[tuple[dict[str, Any] | str, str]] = [
-        ({"frames": [frame]}, "1 cameras .* one place"),
-        ({"frames": [frame, {**frame, "file_path": "images/001.jpg"}]}, "2 cameras .* one place"),
+        ({"frames": [frame]}, "1 cameras .* same position"),
+        ({"frames": [frame, {**frame, "file_path": "images/001.jpg"}]}, "2 cameras .* same position"),
         ({"frames": [{**frame, "transform_matrix": turned}]}, "NaN"),
         ({"w": 10**9}, "w is 1e[+]09"),
         ({"w": 65536, "h": 65536}, "268,435,456 pixels"),
@@ -152,10 +152,10 @@ def test_cameras_that_no_training_had_are_named(copied: Path) -> None:
         ({"fl_x": None}, "fl_x .* images/000.jpg"),
         ({"camera_model": "CUBE"}, "CUBE"),
         ({"orientation_override": "sideways"}, "cannot read the dataset"),
-        ({"frames": [{**frame, "file_path": "images\0"}, *keep]}, "name of a file"),
+        ({"frames": [{**frame, "file_path": "images\0"}, *keep]}, "not a valid file name"),
         ({"frames": [[[[[[[[]]]]]]]]}, "form"),
         ({"frames": []}, "has no frames"),
-        ({"w": 40}, "000.jpg is 48 x 36 pixels, its camera 40 x 36"),
+        ({"w": 40}, "000.jpg is 48 x 36 pixels, but its camera has 40 x 36"),
         ("{}", "`frames`"),
         ("[" * 20_000, "JSON"),
     ]
@@ -221,8 +221,8 @@ def test_pixels_that_nerfstudio_reads_wrong_are_refused(copied: Path) -> None:
         (lambda file: file.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 36\n"), "cannot be read"),
         (lambda file: file.write_bytes(b""), "cannot be read as an image"),
         (lambda file: Image.new("RGB", (20, 10)).save(file), "is 20 x 10 pixels"),
-        (os.mkfifo, "is no file"),
-        (lambda file: file.mkdir(), "is no file"),
+        (os.mkfifo, "is not a regular file"),
+        (lambda file: file.mkdir(), "is not a regular file"),
     ):
         file.unlink()
         make(file)

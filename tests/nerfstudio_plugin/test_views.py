@@ -127,7 +127,7 @@ def test_masks_are_undistorted_with_their_images_and_named_with_them(tmp_path: P
     file = tmp_path / "masked" / "masks" / "004.png"
     for made, message in (
         (Image.new("RGB", (WIDTH, HEIGHT)), r"masks/004\.png .*images/004\.jpg .* RGB"),
-        (Image.new("L", (WIDTH, 7)), r"masks/004\.png is 48 x 7 .*images/004\.jpg 48 x 36"),
+        (Image.new("L", (WIDTH, 7)), r"masks/004\.png is 48 x 7 .*images/004\.jpg is 48 x 36"),
         (None, r"masks/004\.png cannot be read"),
     ):
         file.write_bytes(b"x") if made is None else made.save(file)
@@ -173,7 +173,7 @@ def test_images_that_are_missing_or_change_later_are_named(copied: Path) -> None
         with pytest.raises(InputError, match=r"images/003\.jpg cannot be read"):
             run.train[3]
     Image.new("RGB", (20, 10)).save(file)
-    with pytest.raises(InputError, match=r"003\.jpg is 20 x 10 pixels, its camera 48 x 36"):
+    with pytest.raises(InputError, match=r"003\.jpg is 20 x 10 pixels, but its camera has 48 x 36"):
         run.train[3]
     file.unlink()
     assert run.train[2].name == "images/002.jpg"

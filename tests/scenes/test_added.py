@@ -87,7 +87,7 @@ def test_worlds_that_differ_are_refused_by_name(scene, larger) -> None:
     moved = scene.train.names[3]
     with pytest.raises(InputError, match=rf"{Path(moved).name} .*14 old"):
         add_photographs(scene, larger(move=moved))
-    with pytest.raises(InputError, match="photograph"):
+    with pytest.raises(InputError, match="already belong to"):
         add_photographs(scene, larger(frames=slice(0, -2)))
     with pytest.raises(InputError, match="has 1 of the"):
         add_photographs(scene, larger(frames=slice(-3, None)))

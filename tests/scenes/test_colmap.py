@@ -119,7 +119,7 @@ def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
             read_model(folder)
     (folder / "cameras.txt").write_text(cameras)
     (folder / "images.txt").write_text(images + "\n".join(images.splitlines()[-2:]))
-    with pytest.raises(InputError, match="same number"):
+    with pytest.raises(InputError, match="same ID"):
         read_model(folder)
     (folder / "images.txt").write_text("# none")
     with pytest.raises(InputError, match="0 registered images"):

@@ -94,7 +94,7 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
         match = match_photographs(Changed(scene, change))
         assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
         warning = judge(match, own_cameras=True)
-        assert warning is not None and f"dB on {name}, one of three photographs" in warning
+        assert warning is not None and f"dB on {name}, one of the three training images" in warning
 
 
 def test_masked_pixels_do_not_count(scene) -> None:
@@ -113,4 +113,4 @@ def test_real_captures() -> None:
     for name, factor in (("fox", 0.98), ("tabletop", 1.02)):
         scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
         assert judge(match_photographs(scene), own_cameras=True) is None
-        assert "fit the photographs better" in warning_of(scene, focal(factor))
+        assert "fit the images better" in warning_of(scene, focal(factor))

@@ -292,9 +292,9 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     path = write_gsplat(tmp_path / "ckpt_1_rank0.pt", rows_of(splat, slice(0, 50)))
     every = {"colmap": "p", "images": str(images)}
     for options, message in (
-        ({}, "cameras, got none"),
-        ({"images": "."}, "cameras, got none"),
-        ({"transforms": "a", "colmap": "b"}, "cameras, got two"),
+        ({}, "camera file, got none"),
+        ({"images": "."}, "camera file, got none"),
+        ({"transforms": "a", "colmap": "b"}, "camera file, got two"),
         ({"transforms": "nowhere.json"}, r"nowhere\.json"),
         ({"colmap": "p", "images": "none"}, "folder none, given with --images"),
         ({"colmap": "p"}, "folder .*p/images"),
@@ -302,7 +302,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
-        ({**every, "test_every": 8, "holdout": ("0001",)}, "give one of them"),
+        ({**every, "test_every": 8, "holdout": ("0001",)}, "give only one of them"),
         ({**every, "holdout": ("1.5",)}, r"1\.5 .* between 0 and 1"),
         ({**every, "holdout": ("list.txt",)}, r"--holdout .*list\.txt"),
         ({**every, "holdout": ("cat",)}, "--holdout .*cat"),

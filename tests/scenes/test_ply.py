@@ -31,7 +31,7 @@ def test_every_kind_of_splat_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
         }
         for kind, how in kinds.items():
             if kind == "several blocks":
-                monkeypatch.setattr("normlift_ns.scenes.formats.ply._ROWS", 7)
+                monkeypatch.setattr("normlift_ns.scenes.formats.ply._PLY_BLOCK_ROWS", 7)
             found = read_ply(write_ply(tmp_path / "a.ply", **{"columns": columns, **how}))
             assert (found.rasterize_mode, found.splat.degree) == (None, degree)
             for name, value in splat.parameters.items():
@@ -70,16 +70,16 @@ def _with(name: str, value: float):
 def test_what_is_not_a_splat_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     for change, message in (
-        (_without("opacity"), "200 vertices have no opacity"),
+        (_without("opacity"), "200 vertices lack opacity"),
         (_without("f_rest_44"), r"44 properties f_rest_\*"),
         (_without("f_rest_3", "f_rest_4", "f_rest_5"), "42 properties f_rest"),
-        (_without("rot_0", "scale_1"), "no scale_1, rot_0"),
+        (_without("rot_0", "scale_1"), "lack scale_1, rot_0"),
         (_with("x", np.nan), "1 of 200 .* means .* row 3"),
-        (_with("f_rest_7", np.inf), "colours are NaN or infinite"),
+        (_with("f_rest_7", np.inf), "colors are NaN or infinite"),
         (_with("scale_2", np.nan), "scales are NaN"),
         (_with("scale_2", 100.0), "scales are NaN or infinite"),
         (_with("opacity", np.nan), "opacities are NaN"),
-        (lambda c: {**c, **{f"rot_{i}": 0 * c["x"] for i in range(4)}}, "zeros only"),
+        (lambda c: {**c, **{f"rot_{i}": 0 * c["x"] for i in range(4)}}, "only zero quaternions"),
         (lambda c: {**c, **{f"scale_{i}": np.exp(c[f"scale_{i}"]) for i in range(3)}}, "linear scales"),
         (lambda c: {**c, "opacity": 1 / (1 + np.exp(-c["opacity"]))}, "opacities, between"),
         (_without("scale_2"), "2D Gaussians"),

@@ -1,1 +1,1 @@
-"""Formats of files that hold a splat."""
+"""File formats of splats."""

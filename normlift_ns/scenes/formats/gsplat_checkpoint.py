@@ -17,29 +17,29 @@ from normlift_ns.scenes.splat import Splat, check_splat, from_parameters
 
 _RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")
 _ADVICE = "give another file with --load-gsplat"
-_REFUSED = {
-    "app_module": "a network of appearances (--app_opt), without which its Gaussians have no colours",
+_UNSUPPORTED = {
+    "app_module": "an appearance network (--app_opt), without which its Gaussians have no colors",
 }
 
 
 class GsplatCheckpoint(NamedTuple):
-    """What the trainer has learned."""
+    """Contents of a gsplat checkpoint."""
 
     files: tuple[Path, ...]
-    """One per GPU of the training."""
+    """One file per GPU of the training."""
     step: int
     splat: Splat
     pose_adjust: Float[Tensor, "v 9"] | None
-    """Translation and rotation in six numbers by which the training moved the camera of every training view."""
+    """Pose adjustment of each training view: a translation, and a rotation in six numbers."""
 
 
 def read_gsplat(path: Path) -> GsplatCheckpoint:
-    """Reads ckpt_<step>_rank<r>.pt; where a training on several GPUs left several files, all of them, in their order.
+    """Read ckpt_<step>_rank<r>.pt; after training on several GPUs, read the files of all ranks, in order.
 
     Raises:
-        FileNotFoundError: no such file, or a rank is missing.
-        ValueError: a damaged file or one of another trainer, one that needs a network of appearances, ranks of
-            different trainings, values that nothing could draw.
+        FileNotFoundError: if there is no such file, or a rank is missing.
+        ValueError: if a file is damaged, comes from another trainer or training run, or needs an appearance network, or
+            if the Gaussians cannot be drawn.
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]
@@ -47,13 +47,13 @@ def read_gsplat(path: Path) -> GsplatCheckpoint:
     if len(steps) > 1:
         raise InputError(
             f"{files[0].parent} has ranks of different steps: {', '.join(map(str, sorted(steps)))}. Expected the files "
-            "of one training; keep those in a folder of their own."
+            "of one training run; put them into a separate folder."
         )
     splats = [from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
     if len({splat.degree for splat in splats}) > 1:
         raise InputError(
-            f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training; keep "
-            "those in a folder of their own."
+            f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training run; "
+            "put them into a separate folder."
         )
     names = splats[0].parameters
     merged = Splat(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
@@ -64,35 +64,35 @@ def read_gsplat(path: Path) -> GsplatCheckpoint:
 def _rank_files(path: Path) -> tuple[Path, ...]:
     if not path.is_file():
         raise FileNotFoundError(
-            f"There is no checkpoint at {path}. Give a file that gsplat's simple_trainer wrote with --load-gsplat, "
+            f"There is no checkpoint at {path}. With --load-gsplat, give a file that gsplat's simple_trainer wrote, "
             "for example results/garden/ckpts/ckpt_29999_rank0.pt."
         )
     match = _RANK.fullmatch(path.name)
     if match is None:
         return (path,)
     ranks = {
-        int(found[2]): file
+        int(other[2]): file
         for file in sorted(path.parent.iterdir())
-        if (found := _RANK.fullmatch(file.name)) is not None and found[1] == match[1] and file.is_file()
+        if (other := _RANK.fullmatch(file.name)) is not None and other[1] == match[1] and file.is_file()
     }
     if max(ranks) >= len(ranks):
         missing = next(rank for rank in range(len(ranks)) if rank not in ranks)
         raise FileNotFoundError(
             f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {missing}. Every "
-            "rank holds a share of the Gaussians; copy all files of the training."
+            "rank holds a part of the Gaussians; copy all files of the training run."
         )
     return tuple(ranks[rank] for rank in sorted(ranks))
 
 
 def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
-    """Step, parameters by splatfacto's names, and how the poses were moved."""
+    """Read the step, the parameters by splatfacto's names, and the pose adjustments."""
     loaded = read_tensors(path, "as gsplat's simple_trainer writes them", _ADVICE)
     splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
     if not isinstance(splats, Mapping):
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
-        hint = "; for a run of nerfstudio give its config.yml with --load-config" if "pipeline" in keys else ""
-        raise InputError(f"{path} is no checkpoint of gsplat: expected `splats` in it, found {keys}{hint}.")
-    for key, meaning in _REFUSED.items():
+        hint = "; for a nerfstudio run, give its config.yml with --load-config" if "pipeline" in keys else ""
+        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats` in it, found {keys}{hint}.")
+    for key, meaning in _UNSUPPORTED.items():
         if key in loaded:
             raise InputError(
                 f"{path} holds `{key}`: {meaning}. Train it again without that option, or export a PLY file with the "
@@ -102,8 +102,8 @@ def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):
         raise InputError(
             f"{path} has no {', '.join(missing) or 'tensors'} in its `splats`, which holds "
-            f"{', '.join(sorted(map(str, splats)))}. Expected those of 3D Gaussians with spherical harmonics, as "
-            "gsplat's simple_trainer writes them."
+            f"{', '.join(sorted(map(str, splats)))}. Expected the parameters of 3D Gaussians with spherical harmonics, "
+            "as gsplat's simple_trainer writes them."
         )
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         check_plain(splats[name], name, path)
@@ -122,12 +122,12 @@ def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] 
     state = loaded.get("pose_adjust")
     if state is None:
         return None
-    moved = state.get("embeds.weight") if isinstance(state, Mapping) else None
-    if isinstance(moved, Tensor):
-        check_plain(moved, "pose_adjust", path)
-    if not isinstance(moved, Tensor) or moved.ndim != 2 or moved.shape[1] != 9 or not bool(moved.isfinite().all()):
+    deltas = state.get("embeds.weight") if isinstance(state, Mapping) else None
+    if isinstance(deltas, Tensor):
+        check_plain(deltas, "pose_adjust", path)
+    if not isinstance(deltas, Tensor) or deltas.ndim != 2 or deltas.shape[1] != 9 or not bool(deltas.isfinite().all()):
         raise InputError(
-            f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected finite numbers "
-            f"embeds.weight (views, 9); {_ADVICE}."
+            f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected embeds.weight with finite "
+            f"numbers of shape (views, 9); {_ADVICE}."
         )
-    return moved.double()
+    return deltas.double()

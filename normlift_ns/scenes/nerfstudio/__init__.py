@@ -1,1 +1,1 @@
-"""Runs of nerfstudio's splatfacto, read and written without importing nerfstudio."""
+"""nerfstudio's splatfacto runs, read and written without importing nerfstudio."""

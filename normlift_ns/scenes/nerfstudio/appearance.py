@@ -1,4 +1,4 @@
-"""What splatfacto draws with: its background, and the degree of its spherical harmonics."""
+"""Background color and spherical harmonics degree of splatfacto renders."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ COLORS = {
     "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0),
     "blue": (0.0, 0.0, 1.0),
 }  # fmt: skip
-"""nerfstudio's, by their names."""
+"""nerfstudio's named colors, RGB in 0..1."""
 LOADED_STEP = 30000
-"""The step that splatfacto takes a loaded checkpoint for, whatever its own."""
+"""Step that splatfacto assumes for a loaded checkpoint, whatever its actual step."""
 _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 def background(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
-    """RGB in 0..1 behind the Gaussians, as splatfacto has it outside training; for "random", that of the viewer."""
+    """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
     name = config.background_color
     return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(COLORS[name])
 
 
 def shading_degree(config: Any, step: int) -> int | None:
-    """Degree of the spherical harmonics in use at a training step; None: colours do not depend on the view.
+    """Return the degree of the spherical harmonics at a training step; None: colors do not depend on the view.
 
     Args:
-        config: of splatfacto, nerfstudio's own or its mirror.
+        config: splatfacto's model config, nerfstudio's own or its mirror.
+        step: training step.
     """
     return min(step // config.sh_degree_interval, config.sh_degree) if config.sh_degree > 0 else None

@@ -1,7 +1,7 @@
-"""nerfstudio's configuration classes as far as splatfacto uses them: fields, types and defaults, without what they do.
+"""Mirrors of the nerfstudio configuration classes that splatfacto uses: fields, types and defaults, without behavior.
 
-A config.yml is a dump of objects of these classes. Importing those of nerfstudio takes 13 s of CPU, because each brings
-along what it configures; here `_target` is only the name of that.
+A config.yml is a dump of instances of these classes. Importing nerfstudio's own takes 13 s of CPU time, because each
+imports the class that it configures; the mirrors keep only the name of that class, as `_target`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _BASE, _DATA, _OURS = "nerfstudio.configs.base_config", "nerfstudio.data", "norm
 
 
 class EventName(Enum):
-    """What nerfstudio prints while it trains."""
+    """Quantities that nerfstudio prints during training."""
 
     ITER_TRAIN_TIME = "Train Iter (time)"
     TOTAL_TRAIN_TIME = "Train Total (time)"
@@ -46,7 +46,7 @@ class EventName(Enum):
 
 @dataclass
 class MachineConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's MachineConfig."""
 
     seed: int = 42
     num_devices: int = 1
@@ -58,7 +58,7 @@ class MachineConfig:
 
 @dataclass
 class LocalWriterConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's LocalWriterConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.utils.writer.LocalWriter"))
     enable: bool = False
@@ -75,7 +75,7 @@ class LocalWriterConfig:
 
 @dataclass
 class LoggingConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's LoggingConfig."""
 
     relative_log_dir: Path = Path()
     steps_per_log: int = 10
@@ -86,7 +86,7 @@ class LoggingConfig:
 
 @dataclass
 class ViewerConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's ViewerConfig."""
 
     relative_log_filename: str = "viewer_log_filename.txt"
     websocket_port: int | None = None
@@ -104,7 +104,7 @@ class ViewerConfig:
 
 @dataclass
 class CameraOptimizerConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's CameraOptimizerConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.cameras.camera_optimizers.CameraOptimizer"))
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
@@ -116,7 +116,7 @@ class CameraOptimizerConfig:
 
 @dataclass
 class SplatfactoModelConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's SplatfactoModelConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.models.splatfacto.SplatfactoModel"))
     enable_collider: bool = True
@@ -165,14 +165,14 @@ class NormLiftModelConfig(SplatfactoModelConfig):
 
     @staticmethod
     def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
-        """The same model with a field: every field of the config is taken over."""
+        """Return a config of the same model with a semantic field; all fields of the config are copied."""
         values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
         return NormLiftModelConfig(**values, semantics=semantics)
 
 
 @dataclass
 class VanillaPipelineConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's VanillaPipelineConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.pipelines.base_pipeline.VanillaPipeline"))
     datamanager: FullImageDatamanagerConfig = field(default_factory=FullImageDatamanagerConfig)
@@ -191,7 +191,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 
 @dataclass
 class TrainerConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's TrainerConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.engine.trainer.Trainer"))
     output_dir: Path = Path("outputs")
@@ -252,10 +252,10 @@ NAMES: dict[type, str] = {
     NormLiftPipelineConfig: f"{_OURS}.pipeline.NormLiftPipelineConfig",
     EventName: "nerfstudio.utils.writer.EventName",
 }
-"""What stands in a config.yml for each class."""
+"""Name of each class in a config.yml."""
 READ: dict[str, type] = {
     **{name: cls for cls, name in NAMES.items() if cls not in (OptimizerConfig, SchedulerConfig, EventName)},
-    "normlift_ns.plugin.model.NormLiftModelConfig": NormLiftModelConfig,  # those of version 0.1
+    "normlift_ns.plugin.model.NormLiftModelConfig": NormLiftModelConfig,  # names of version 0.1
     "normlift_ns.plugin.pipeline.NormLiftPipelineConfig": NormLiftPipelineConfig,
     "normlift_ns.plugin.lifting.LiftOptions": LiftOptions,
     "normlift_ns.core.refine.RefineConfig": RefineConfig,
@@ -264,4 +264,4 @@ READ: dict[str, type] = {
     "normlift_ns.options.SourceOptions": SourceOptions,
     "normlift_ns.options.RefineConfig": RefineConfig,
 }
-"""The classes whose objects a config.yml may hold."""
+"""Classes that a config.yml may contain, by name."""

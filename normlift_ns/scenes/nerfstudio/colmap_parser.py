@@ -1,4 +1,4 @@
-"""Cameras and files of a COLMAP reconstruction as nerfstudio's `ColmapDataParser` makes them, bit by bit."""
+"""Cameras and files of a COLMAP dataset, bit-identical to those of nerfstudio's `ColmapDataParser`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from normlift_ns.scenes.nerfstudio.datasets import automatic_factor
 from normlift_ns.scenes.nerfstudio.poses import placed, with_applied
 from normlift_ns.scenes.nerfstudio.splits import Dataset, Photographs, split_by_lists, split_by_mode
 
-_COLMAP: dict[str, Callable[..., tuple[float, ...]]] = {
+_INTRINSICS_AND_DISTORTION: dict[str, Callable[..., tuple[float, ...]]] = {
     "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy),
     "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy),
     "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, k),
@@ -27,40 +27,40 @@ _COLMAP: dict[str, Callable[..., tuple[float, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": lambda f, cx, cy, k: (f, f, cx, cy, k),
     "RADIAL_FISHEYE": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2),
 }
-"""fx, fy, cx, cy and distortion k1, k2, k3, k4, p1, p2 by the parameters of COLMAP's camera models."""
-_FLIPPED = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
+"""COLMAP's camera models: functions from their parameters to fx, fy, cx, cy and k1, k2, k3, k4, p1, p2."""
+_FLIP = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
 
 
 def parse_reconstruction(parser: ColmapDataParserConfig) -> Dataset:
-    """The data set of a reconstruction.
+    """Read the dataset of a COLMAP reconstruction.
 
     Raises:
-        FileNotFoundError, ValueError: a file that is missing or that nerfstudio could not read.
+        FileNotFoundError, ValueError: if a file is missing, or nerfstudio could not read it.
     """
     cameras, images = read_model(parser.data / parser.colmap_path, text_first=True)
-    images = sorted(images, key=lambda image: image.number)
-    intrinsics = {number: _colmap_camera(camera) for number, camera in cameras.items()}
+    images = sorted(images, key=lambda image: image.image_id)
+    intrinsics = {camera_id: _colmap_camera(camera) for camera_id, camera in cameras.items()}
     kinds = {"FISHEYE" if "FISHEYE" in cameras[image.camera].model else "PERSPECTIVE" for image in images}
     if len(kinds) > 1:
         raise InputError("multiple camera models are not supported")
     used = [intrinsics[image.camera] for image in images]
     if any(row[7] != 0 for row in used):
         raise InputError("the distortion k4 of a camera is not zero")
-    named = parser.data / parser.images_path
-    files = [named / image.name for image in images]
+    images_dir = parser.data / parser.images_path
+    files = [images_dir / image.name for image in images]
     masks = [(parser.data / parser.masks_path / image.name).with_suffix(".png") for image in images] if (
         parser.masks_path is not None
     ) else None  # fmt: skip
     flip = parser.assume_colmap_world_coordinate_convention
     poses, transform, scale = placed([_pose(image, flip) for image in images], parser, parser.orientation_method)
-    chosen = split_by_lists(_lists(parser), files) or split_by_mode(files, parser)
+    split_indices = split_by_lists(_read_lists(parser), files) or split_by_mode(files, parser)
     factor = parser.downscale_factor
     if factor is None:
         factor = automatic_factor(files[0], parser)
     if factor > 1:
-        files = _smaller(files, named, factor)
-        masks = None if masks is None else _smaller(masks, parser.data / (parser.masks_path or ""), factor)
-    photographs = Photographs(
+        files = _downscaled(files, images_dir, factor)
+        masks = None if masks is None else _downscaled(masks, parser.data / (parser.masks_path or ""), factor)
+    split = Photographs(
         files,
         masks,
         kinds.pop(),
@@ -71,20 +71,22 @@ def parse_reconstruction(parser: ColmapDataParserConfig) -> Dataset:
         ),
         torch.tensor([row[4:] for row in used], dtype=torch.float32),
     )
-    train, held_out = (photographs.only(part).resized(1.0 / factor, parser.downscale_rounding_mode) for part in chosen)
-    return Dataset(train, held_out, with_applied(transform, _FLIPPED if flip else None), scale)
+    train, held_out = (
+        split.select(indices).resized(1.0 / factor, parser.downscale_rounding_mode) for indices in split_indices
+    )
+    return Dataset(train, held_out, with_applied(transform, _FLIP if flip else None), scale)
 
 
 def _colmap_camera(camera: Camera) -> list[float]:
-    """fx, fy, cx, cy and k1, k2, k3, k4, p1, p2."""
-    if camera.model not in _COLMAP:
+    """Return fx, fy, cx, cy and k1, k2, k3, k4, p1, p2."""
+    if camera.model not in _INTRINSICS_AND_DISTORTION:
         raise InputError(f"{camera.model} camera model is not supported yet")
-    values = _COLMAP[camera.model](*camera.parameters)
+    values = _INTRINSICS_AND_DISTORTION[camera.model](*camera.parameters)
     return [*values, *[0.0] * (10 - len(values))]
 
 
 def _pose(image: Registered, flip: bool) -> Float[np.ndarray, "4 4"]:
-    """Camera to world in OpenGL convention; flipped: with the first camera's idea of up along z."""
+    """Return the camera-to-world pose in OpenGL convention; with `flip`, the first camera's up direction is along z."""
     w, x, y, z = image.rotation
     rotation = np.array(
         [
@@ -102,7 +104,7 @@ def _pose(image: Registered, flip: bool) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def _lists(parser: ColmapDataParserConfig) -> dict[str, Any]:
+def _read_lists(parser: ColmapDataParserConfig) -> dict[str, Any]:
     lists: dict[str, Any] = {}
     for split in ("train", "test", "validation"):
         path = parser.data / f"{split}_list.txt"
@@ -112,5 +114,5 @@ def _lists(parser: ColmapDataParserConfig) -> dict[str, Any]:
     return lists
 
 
-def _smaller(files: Sequence[Path], folder: Path, factor: int) -> list[Path]:
+def _downscaled(files: Sequence[Path], folder: Path, factor: int) -> list[Path]:
     return [folder.parent / f"{folder.name}_{factor}" / file.relative_to(folder) for file in files]

@@ -1,4 +1,4 @@
-"""config.yml of a nerfstudio run: reading it safely, and finding its files from wherever the program was started."""
+"""Safe reading of a nerfstudio run's config.yml, and location of its files from any working directory."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from normlift_ns.scenes.nerfstudio.checks import check_config
 from normlift_ns.scenes.nerfstudio.classes import TrainerConfig
 
 SUPPORTED_METHODS = (
-    *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # the last one is of nerfstudio's main branch
+    *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # the last one comes from nerfstudio's main branch
     *("normlift", "normlift-lerf-ovs", "normlift-scannet"),
 )
-_LARGEST = 2**18
-"""Bytes of a config.yml; nerfstudio's have 6,000."""
+_MAX_BYTES = 2**18
+"""Largest config.yml that is read; nerfstudio's have 6,000 bytes."""
 _EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
 
 
 def read_config(path: Path) -> TrainerConfig:
-    """Reads config.yml of a splatfacto or normlift run, with the paths as they stand in the file.
+    """Read the config.yml of a splatfacto or normlift run, with its paths unchanged.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a config that nerfstudio wrote, a method or a data parser that is not supported, a config that
-            names anything but nerfstudio's own configuration classes, or values that these cannot have.
+        FileNotFoundError: if there is no such file.
+        ValueError: if nerfstudio did not write the config, or it has an unsupported method or data parser, classes
+            other than nerfstudio's configuration classes, or invalid values.
     """
     if not path.is_file():
         hint = f"; {path / 'config.yml'} exists, give that" if (path / "config.yml").is_file() else ""
@@ -38,9 +38,9 @@ def read_config(path: Path) -> TrainerConfig:
             f"No config at {path}{hint}. Expected the config.yml that ns-train wrote, "
             "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
         )
-    if path.stat().st_size > _LARGEST:
+    if path.stat().st_size > _MAX_BYTES:
         raise InputError(
-            f"{path} is not a nerfstudio config: it has {path.stat().st_size:,} bytes, more than {_LARGEST:,}. "
+            f"{path} is not a nerfstudio config: it has {path.stat().st_size:,} bytes, more than {_MAX_BYTES:,}. "
             f"{_EXPECTED}"
         )
     try:
@@ -48,7 +48,7 @@ def read_config(path: Path) -> TrainerConfig:
         root = loader.get_single_node()
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f"{path} is not a nerfstudio config: it is no valid YAML ({_brief(error)}). {_EXPECTED}"
+            f"{path} is not a nerfstudio config: it is not valid YAML ({_brief(error)}). {_EXPECTED}"
         ) from error
     method = _method_name(root)
     if method is None:
@@ -56,23 +56,23 @@ def read_config(path: Path) -> TrainerConfig:
     if method not in SUPPORTED_METHODS:
         raise InputError(
             f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
-            "Train the capture with: ns-train splatfacto --data ...; or, if its Gaussians are plain ones, write them "
-            "with ns-export gaussian-splat and lift that file with --load-ply"
+            "Train the capture with: ns-train splatfacto --data ...; or, if the run's Gaussians are standard ones, "
+            "export them with ns-export gaussian-splat and lift that file with --load-ply"
         )
     try:
         config = loader.construct_document(root)
-    except Exception as error:  # PyYAML turns values into dates, numbers and sets, and lets all their errors through
+    except Exception as error:  # PyYAML converts values to dates, numbers and sets without catching their errors
         raise InputError(
             f"{path} cannot be read: {_brief(error)}. Only the configuration classes of splatfacto and normlift_ns "
             "are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
-            "blender-data; turn other data sets into one of those with ns-process-data, and train on that."
+            "blender-data. Convert other datasets to one of those formats with ns-process-data, and train on that."
         ) from error
     check_config(config, path)
     return config
 
 
 def _method_name(root: yaml.Node | None) -> str | None:
-    """method_name of a config of any method, read without constructing anything."""
+    """Return the method_name of any config, without constructing objects."""
     if not isinstance(root, yaml.MappingNode) or not root.tag.startswith(f"{OBJECT_TAG}:"):
         return None
     for key, value in root.value:
@@ -82,7 +82,7 @@ def _method_name(root: yaml.Node | None) -> str | None:
 
 
 def _brief(error: Exception) -> str:
-    """One line of a YAML error: what and where."""
+    """Summarize a YAML error in one line: problem and line number."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, yaml.MarkedYAMLError):
@@ -93,79 +93,81 @@ def _brief(error: Exception) -> str:
 
 @dataclass(frozen=True)
 class RunLocation:
-    """Where the files of a run are now; all paths absolute."""
+    """Current absolute paths of a run's files."""
 
     run_dir: Path
-    """The folder of config.yml."""
+    """Folder of config.yml."""
     output_dir: Path
-    """Where runs of this experiment go: the folder above experiment/method/timestamp, outputs/ by default."""
+    """Folder above experiment/method/timestamp, in which runs of this experiment are stored; outputs/ by default."""
     root: Path | None
-    """Working directory of the training, which stock ns-* commands must be run from; None where output_dir is absolute
-    or the run was moved, so that its place does not tell."""
+    """Working directory of the training, from which stock ns-* commands must be run. None if it cannot be inferred,
+    because output_dir is absolute or the run was moved."""
     data: Path
     """The dataset: a folder or a .json file."""
     moved_data: bool
-    """True where `data` is not what the config, read from `root`, says."""
+    """Whether `data` differs from the path in the config, read relative to `root`."""
 
     @property
     def folder(self) -> Path:
-        """The folder of the dataset."""
+        """Folder of the dataset."""
         return self.data.parent if self.data.suffix == ".json" else self.data
 
     def portable(self, path: Path) -> Path:
-        """The path as it should stand in a config: relative to `root` where it lies below it, else absolute."""
+        """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
         return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
 
 
 def locate(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
-    """Finds the files of a run from where its config.yml lies, whatever the current directory.
+    """Locate the files of a run from the path of its config.yml, whatever the current directory.
 
-    nerfstudio writes output_dir, data and others relative to the directory of the training, which config.yml does not
-    name; but it lies in output_dir/experiment/method/timestamp, so the directory can be told.
+    nerfstudio stores output_dir, data and other paths relative to the training's working directory, which config.yml
+    does not contain. But config.yml lies in output_dir/experiment/method/timestamp, from which the directory follows.
 
     Args:
-        data: where the dataset is now; relative to the current directory. None: where the config says.
+        config: contents of config.yml.
+        config_path: path of config.yml.
+        data: current path of the dataset, relative to the current directory; None: the path in the config.
     Raises:
-        FileNotFoundError: no dataset there; the message names every place tried.
+        FileNotFoundError: if there is no dataset; the message names every path tried.
     """
     run_dir = _absolute(config_path).parent
-    above = _without_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
-    output_dir = outputs_of_moved(config.output_dir) if above is None else above
-    root = None if above is None else _without_tail(above, Path(os.path.normpath(config.output_dir)))
+    inferred = _strip_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
+    output_dir = outputs_of_moved(config.output_dir) if inferred is None else inferred
+    root = None if inferred is None else _strip_tail(inferred, Path(os.path.normpath(config.output_dir)))
     if data is not None:
         if not data.exists():
             raise FileNotFoundError(
                 f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
-                "transforms.json that ns-train got."
+                "transforms.json that the run was trained with."
             )
         return RunLocation(run_dir, output_dir, root, _absolute(data), moved_data=True)
     stored = stored_data(config)
     roots = [root] if root is not None else list(output_dir.parents)
     tried = list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
-    for place in tried:
-        if place.exists():
-            moved = root is None or place != _absolute(root / stored)
-            return RunLocation(run_dir, output_dir, root, place, moved_data=moved)
+    for path in tried:
+        if path.exists():
+            moved = root is None or path != _absolute(root / stored)
+            return RunLocation(run_dir, output_dir, root, path, moved_data=moved)
     raise FileNotFoundError(
-        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config says {str(stored)!r}. "
-        "If it was moved, say where it is with --data."
+        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
+        "If it was moved, give its path with --data."
     )
 
 
-def _without_tail(path: Path, tail: Path) -> Path | None:
-    """`path` without the relative path that it ends in; None if it does not."""
+def _strip_tail(path: Path, tail: Path) -> Path | None:
+    """Return `path` without the trailing relative path `tail`; None if it does not end in it."""
     count = len(path.parts) - len(tail.parts)
     return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
 
 
 def stored_data(config: Any) -> Path:
-    """The dataset as the config names it."""
+    """Return the path of the dataset in the config."""
     datamanager = config.pipeline.datamanager
     return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
 
 
 def outputs_of_moved(output_dir: Path) -> Path:
-    """outputs/ of a run that was moved: below the current directory, wherever its config says that it was trained."""
+    """Return the output folder for a moved run: inside the current directory, whatever its config names."""
     return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
 
 
@@ -174,7 +176,7 @@ def _absolute(path: Path) -> Path:
 
 
 def rebased(config: Any, location: RunLocation) -> Any:
-    """A copy of the config with absolute paths, which works from any directory, and without seed points."""
+    """Return a copy of the config with absolute paths, valid in any directory, and without seed points."""
     config = deepcopy(config)
     set_data(config, location.data)
     skip_seed_points(config)
@@ -185,13 +187,13 @@ def rebased(config: Any, location: RunLocation) -> Any:
 
 
 def set_data(config: Any, data: Path) -> None:
-    """Changes the dataset in the three places where nerfstudio keeps it."""
+    """Change the dataset in the three fields in which nerfstudio stores it."""
     datamanager = config.pipeline.datamanager
     config.data = datamanager.data = datamanager.dataparser.data = data
 
 
 def skip_seed_points(config: Any) -> None:
-    """Keeps the dataparser from reading the point cloud that a training starts from; a trained run needs none."""
+    """Stop the dataparser from reading the initial point cloud, which a trained run does not need."""
     dataparser = config.pipeline.datamanager.dataparser
     if hasattr(dataparser, "load_3D_points"):
         dataparser.load_3D_points = False

@@ -1,4 +1,4 @@
-"""nerfstudio's configuration classes of data sets: see `classes`."""
+"""Mirrors of nerfstudio's configuration classes for datasets; see `classes`."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Literal
 
 from normlift_ns.scenes.nerfstudio.targets import Target, target
 
-_DATA = "nerfstudio.data"
+_DATA_MODULE = "nerfstudio.data"
 
 
 @dataclass
 class NerfstudioDataParserConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's NerfstudioDataParserConfig."""
 
-    _target: Target = field(default_factory=target(f"{_DATA}.dataparsers.nerfstudio_dataparser.Nerfstudio"))
+    _target: Target = field(default_factory=target(f"{_DATA_MODULE}.dataparsers.nerfstudio_dataparser.Nerfstudio"))
     data: Path = Path()
     scale_factor: float = 1.0
     downscale_factor: int | None = None
@@ -33,9 +33,9 @@ class NerfstudioDataParserConfig:
 
 @dataclass
 class ColmapDataParserConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's ColmapDataParserConfig."""
 
-    _target: Target = field(default_factory=target(f"{_DATA}.dataparsers.colmap_dataparser.ColmapDataParser"))
+    _target: Target = field(default_factory=target(f"{_DATA_MODULE}.dataparsers.colmap_dataparser.ColmapDataParser"))
     data: Path = Path()
     scale_factor: float = 1.0
     downscale_factor: int | None = None
@@ -59,9 +59,9 @@ class ColmapDataParserConfig:
 
 @dataclass
 class BlenderDataParserConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's BlenderDataParserConfig."""
 
-    _target: Target = field(default_factory=target(f"{_DATA}.dataparsers.blender_dataparser.Blender"))
+    _target: Target = field(default_factory=target(f"{_DATA_MODULE}.dataparsers.blender_dataparser.Blender"))
     data: Path = Path("data/blender/lego")
     scale_factor: float = 1.0
     alpha_color: str | None = "white"
@@ -69,15 +69,15 @@ class BlenderDataParserConfig:
 
 
 DataParser = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
-"""Those whose data sets are read."""
+"""Supported data parsers."""
 
 
 @dataclass
 class FullImageDatamanagerConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's FullImageDatamanagerConfig."""
 
     _target: Target = field(
-        default_factory=target(f"{_DATA}.datamanagers.full_images_datamanager.FullImageDatamanager")
+        default_factory=target(f"{_DATA_MODULE}.datamanagers.full_images_datamanager.FullImageDatamanager")
     )
     data: Path | None = None
     masks_on_gpu: bool = False

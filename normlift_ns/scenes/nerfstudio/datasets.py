@@ -1,7 +1,7 @@
-"""Data sets of trained runs, checked before nerfstudio reads them.
+"""Validation of a trained run's dataset, before nerfstudio reads it.
 
-nerfstudio asks on the terminal where photographs of the right size are missing, and makes them through a shell; it
-trusts whatever numbers stand in the files. What is looked at here is refused instead, with what to do.
+If images of the right size are missing, nerfstudio asks on the terminal and creates them through a shell; it trusts all
+numbers in the files. These checks raise errors with advice instead.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from normlift_ns.scenes.nerfstudio.data_classes import (
 from normlift_ns.scenes.transforms_file import Entries, read_entries
 
 MAX_AUTO_RESOLUTION = 1600
-_ADVICE = "Restore it, or say where the dataset is with --data."
-_NEEDED = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_ADVICE = "Restore it, or give the path of the dataset with --data."
+_REQUIRED = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 def check_dataset(parser: DataParser) -> None:
-    """Refuses what nerfstudio would ask about, could not read, or would read into something else.
+    """Raise if nerfstudio would ask about a dataset, could not read it, or would misread it.
 
     Raises:
-        FileNotFoundError: a file of cameras or a folder of photographs is missing.
-        ValueError: a file of cameras that is damaged or holds numbers that no camera has.
+        FileNotFoundError: if a camera file or an image folder is missing.
+        ValueError: if a camera file is damaged or holds invalid numbers.
     """
     if isinstance(parser, NerfstudioDataParserConfig):
         _check_nerfstudio(parser)
@@ -42,10 +42,11 @@ def check_dataset(parser: DataParser) -> None:
 
 
 def size_of(file: Path, parser: DataParser) -> tuple[int, int]:
-    """Width and height of a photograph.
+    """Return the width and height of an image.
 
     Raises:
-        FileNotFoundError, ValueError: none there, or no image.
+        FileNotFoundError: if the file is missing.
+        ValueError: if the file is not an image.
     """
     if not file.exists():
         raise FileNotFoundError(f"{file} is missing from the dataset {parser.data}. {_ADVICE}")
@@ -53,7 +54,7 @@ def size_of(file: Path, parser: DataParser) -> tuple[int, int]:
 
 
 def automatic_factor(file: Path, parser: ColmapDataParserConfig) -> int:
-    """By which factor nerfstudio takes smaller photographs, where the config does not say it."""
+    """Return the factor by which nerfstudio downscales images if the config does not name one."""
     longest, factor = max(size_of(file, parser)), 1
     while longest / factor > MAX_AUTO_RESOLUTION:
         factor *= 2
@@ -68,39 +69,40 @@ def _entries(path: Path, data: Path) -> Entries:
 
 def _check_nerfstudio(parser: NerfstudioDataParserConfig) -> None:
     path = parser.data if parser.data.suffix == ".json" else parser.data / "transforms.json"
-    found = _entries(path, parser.data)
-    for name in _NEEDED:
-        bare = [frame.file_path for frame in found.frames if getattr(frame, name) is None]
-        if getattr(found, name) is None and bare:
+    entries = _entries(path, parser.data)
+    for name in _REQUIRED:
+        incomplete = [frame.file_path for frame in entries.frames if getattr(frame, name) is None]
+        if getattr(entries, name) is None and incomplete:
             raise InputError(
-                f"{path} has no {name} for {bare[0]}. Expected a focal length, centre and size for every frame."
+                f"{path} has no {name} for {incomplete[0]}. Expected focal lengths, principal point and size for every "
+                "frame."
             )
-    _check_places([frame.transform_matrix for frame in found.frames], parser, path)
-    _check_files([path.parent / frame.file_path for frame in found.frames], path)
+    _check_positions([frame.transform_matrix for frame in entries.frames], parser, path)
+    _check_files([path.parent / frame.file_path for frame in entries.frames], path)
 
 
 def _check_blender(parser: BlenderDataParserConfig) -> None:
     for split in ("train", "test"):
         path = parser.data / f"transforms_{split}.json"
-        found = _entries(path, parser.data)
-        if found.camera_angle_x is None or not 0 < found.camera_angle_x < math.pi:
+        entries = _entries(path, parser.data)
+        if entries.camera_angle_x is None or not 0 < entries.camera_angle_x < math.pi:
             raise InputError(
-                f"{path}: camera_angle_x is {found.camera_angle_x}, expected radians between 0 and pi. {_ADVICE}"
+                f"{path}: camera_angle_x is {entries.camera_angle_x}, expected radians between 0 and pi. {_ADVICE}"
             )
-        files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in found.frames]
+        files = [parser.data / (frame.file_path.replace("./", "") + ".png") for frame in entries.frames]
         _check_files(files, path)
-        size_of(files[0], parser)  # which nerfstudio reads whole
+        size_of(files[0], parser)  # nerfstudio reads all of this image
 
 
 def _check_colmap(parser: ColmapDataParserConfig) -> None:
-    """Also the folder of smaller photographs, for which nerfstudio would ask whether to make it."""
+    """Check the dataset, and the folder of downscaled images, which nerfstudio would offer to create."""
     model, images = parser.data / parser.colmap_path, parser.data / parser.images_path
     if not model.is_dir():
         raise FileNotFoundError(
-            f"{model}, COLMAP's reconstruction, is missing from the dataset {parser.data}. {_ADVICE}"
+            f"{model}, the COLMAP reconstruction, is missing from the dataset {parser.data}. {_ADVICE}"
         )
     _, registered = read_model(model, text_first=True)
-    registered.sort(key=lambda image: image.number)
+    registered.sort(key=lambda image: image.image_id)
     files = [images / image.name for image in registered]
     _check_files(files, model)
     factor = parser.downscale_factor
@@ -114,23 +116,23 @@ def _check_colmap(parser: ColmapDataParserConfig) -> None:
     )
     if missing:
         raise FileNotFoundError(
-            f"There is no folder {missing[0]} of photographs at 1/{factor} of their size, with which the run was "
-            f"trained. Copy it from where it was trained; or make it by resizing the photographs in {images}. "
-            "normlift_ns writes nothing into data sets."
+            f"There is no folder {missing[0]} of images at 1/{factor} of their size, with which the run was trained. "
+            f"Copy it from the machine of the training, or create it by resizing the images in {images}. normlift_ns "
+            "does not write into datasets."
         )
 
 
-def _check_places(poses: Sequence[list[list[float]]], parser: NerfstudioDataParserConfig, path: Path) -> None:
-    places = {tuple(row[3] for row in pose[:3]) for pose in poses}
-    if len(places) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
+def _check_positions(poses: Sequence[list[list[float]]], parser: NerfstudioDataParserConfig, path: Path) -> None:
+    positions = {tuple(row[3] for row in pose[:3]) for pose in poses}
+    if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
         raise InputError(
-            f"{path}: all {len(poses)} cameras stand at one place, so nerfstudio cannot scale them. Expected the "
-            "cameras that the run was trained with; say where the dataset is with --data."
+            f"{path}: all {len(poses)} cameras have the same position, so nerfstudio cannot scale them. Expected the "
+            "cameras that the run was trained with; give the path of the dataset with --data."
         )
 
 
 def _check_files(files: Sequence[Path], path: Path) -> None:
-    """What is there must be files: a pipe would make the program wait for ever."""
-    strange = next((file for file in files if file.exists() and not file.is_file()), None)
-    if strange is not None:
-        raise InputError(f"{path} names {strange}, which is no file. Expected photographs.")
+    """Raise if an existing path is not a regular file; reading a pipe would block forever."""
+    invalid = next((file for file in files if file.exists() and not file.is_file()), None)
+    if invalid is not None:
+        raise InputError(f"{path} lists {invalid}, which is not a regular file. Expected images.")

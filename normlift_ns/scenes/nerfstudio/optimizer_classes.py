@@ -1,4 +1,4 @@
-"""nerfstudio's configuration classes of optimizers and their schedulers: see `classes`."""
+"""Mirrors of nerfstudio's configuration classes for optimizers and schedulers; see `classes`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from normlift_ns.scenes.nerfstudio.targets import Target, target
 
 @dataclass
 class OptimizerConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's OptimizerConfig."""
 
     _target: Target = field(default_factory=target("torch.optim.adam.Adam"))
     lr: float = 0.0005
@@ -20,14 +20,14 @@ class OptimizerConfig:
 
 @dataclass
 class AdamOptimizerConfig(OptimizerConfig):
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's AdamOptimizerConfig."""
 
     weight_decay: float = 0
 
 
 @dataclass
 class RAdamOptimizerConfig(OptimizerConfig):
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's RAdamOptimizerConfig."""
 
     _target: Target = field(default_factory=target("torch.optim.radam.RAdam"))
     weight_decay: float = 0
@@ -35,14 +35,14 @@ class RAdamOptimizerConfig(OptimizerConfig):
 
 @dataclass
 class SchedulerConfig:
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's SchedulerConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.engine.schedulers.Scheduler"))
 
 
 @dataclass
 class MultiStepSchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's MultiStepSchedulerConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.engine.schedulers.MultiStepScheduler"))
     max_steps: int = 1000000
@@ -52,7 +52,7 @@ class MultiStepSchedulerConfig(SchedulerConfig):
 
 @dataclass
 class ExponentialDecaySchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's ExponentialDecaySchedulerConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.engine.schedulers.ExponentialDecayScheduler"))
     lr_pre_warmup: float = 1e-8
@@ -64,7 +64,7 @@ class ExponentialDecaySchedulerConfig(SchedulerConfig):
 
 @dataclass
 class CosineDecaySchedulerConfig(SchedulerConfig):
-    """Mirror of nerfstudio's."""
+    """Mirror of nerfstudio's CosineDecaySchedulerConfig."""
 
     _target: Target = field(default_factory=target("nerfstudio.engine.schedulers.CosineDecayScheduler"))
     warm_up_end: int = 5000

@@ -1,4 +1,4 @@
-"""What a config.yml names and nothing here needs: classes and functions, known by their names alone."""
+"""Placeholders for classes and functions that a config.yml names and this package does not need."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Target:
-    """A class or function that a config names, which is neither imported nor called."""
+    """Name of a class or function in a config, which is neither imported nor called."""
 
     name: str
 
     def __deepcopy__(self, memo: object) -> Target:
-        """Itself, as a class is."""
+        """Return the object itself, as for a class."""
         return self
 
 
-TARGETS: dict[str, Target] = {}
-"""One object per name, so that a dump refers to it as to one class."""
+_TARGETS: dict[str, Target] = {}
+"""One object per name, which a dump references like a single class."""
 
 
 def named(name: str) -> Target:
-    """The target of that name."""
-    return TARGETS.setdefault(name, Target(name))
+    """Return the target of this name, always the same object."""
+    return _TARGETS.setdefault(name, Target(name))
 
 
 def target(name: str) -> Callable[[], Target]:
-    """Makes the default of a field that names it."""
+    """Return a default factory for a field that names a target."""
     return lambda: named(name)

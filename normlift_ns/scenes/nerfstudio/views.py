@@ -1,4 +1,4 @@
-"""The photographs of a run as splatfacto trained on them: undistorted, with the cameras that belong to them."""
+"""Undistorted images and cameras of a run, exactly as splatfacto trained on them."""
 
 from __future__ import annotations
 
@@ -23,25 +23,26 @@ from normlift_ns.scenes.image_files import check_mask, read_head, remarks
 from normlift_ns.scenes.nerfstudio.splits import Photographs
 from normlift_ns.scenes.photographs import to_camera
 
-_READ_WELL = {"RGB", "RGBA", "L", "CMYK"}
-"""Kinds of pixels that nerfstudio can be trained on; CMYK in strange colours."""
-_BROWN = 6
-"""k1, k2, k3, k4, p1, p2."""
+_SUPPORTED_MODES = {"RGB", "RGBA", "L", "CMYK"}
+"""Pillow modes that nerfstudio can train on, CMYK with wrong colors."""
+_DISTORTION_PARAMS = 6
+"""Number of parameters k1, k2, k3, k4, p1, p2."""
 
 
 class Reading(NamedTuple):
-    """How nerfstudio reads the photographs of a run."""
+    """Settings by which nerfstudio reads the images of a run."""
 
     scale: float = 1.0
     """camera_res_scale_factor."""
-    behind: tuple[float, float, float] | None = None
-    """RGB in 0..1 that images with an alpha channel are put on when they are read; None: later, on the background."""
-    instead: tuple[float, float, float] | None = None
-    """What nerfstudio puts where the mask is zero."""
+    alpha_color: tuple[float, float, float] | None = None
+    """RGB in 0..1 that nerfstudio blends behind images with an alpha channel when it reads them; None: it blends the
+    background later."""
+    mask_color: tuple[float, float, float] | None = None
+    """Color that nerfstudio writes into pixels whose mask is zero."""
 
 
 class _Lens(NamedTuple):
-    """What projects one photograph; numbers in the precision in which nerfstudio keeps them."""
+    """Projection of one image, in nerfstudio's precision."""
 
     kind: str
     intrinsics: Intrinsics
@@ -49,17 +50,17 @@ class _Lens(NamedTuple):
 
 
 class TrainedViews:
-    """`Views`: photographs of one split of a dataset, in its order; each is read and undistorted when it is asked for.
+    """Lazy `Views` of one split of a dataset, in its order: indexing reads and undistorts one image.
 
     Images, masks and intrinsics are those of nerfstudio's `FullImageDatamanager.cached_train`, which holds all of them
     in memory (and pins that memory, which needs CUDA).
 
     Args:
-        split: files and cameras, before undistortion.
-        folder: where the dataset lies, for `names`.
-        poses: camera-to-world poses [V, 3, 4] in OpenGL convention; the split's, or as the training optimised them.
-        background: RGB in 0..1 behind images with an alpha channel.
-        reading: what else of the config counts.
+        split: image files and cameras, before undistortion.
+        folder: folder of the dataset, to which `names` are relative.
+        poses: camera-to-world poses [V, 3, 4] in OpenGL convention: the split's, or those optimized by the training.
+        background: RGB in 0..1, blended behind images with an alpha channel.
+        reading: other settings of the config that affect pixels.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class TrainedViews:
     ) -> None:
         self._split, self._poses, self._background, self._reading = split, poses, background, reading
         self.files = list(split.files)
-        """Image files, absolute."""
+        """Absolute paths of the images."""
         self.names = [image_name(file, folder) for file in self.files]
         """Image files relative to the dataset, with forward slashes."""
 
@@ -83,29 +84,29 @@ class TrainedViews:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index: int) -> View:
-        """Reads one photograph.
+        """Read and undistort one image.
 
         Raises:
-            IndexError: no such view.
-            FileNotFoundError, ValueError: a file that is missing, cannot be read or has another size than its camera;
-                the message names it.
+            IndexError: if there is no such view.
+            FileNotFoundError, ValueError: if a file is missing, cannot be read or differs in size from its camera; the
+                message names it.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
         index %= len(self)
         lens = self._lens(index)
-        taken, kept = self._read(index)
-        image = torch.from_numpy(_undistorted(taken, lens)[0])
-        mask = None if kept is None else torch.from_numpy(_undistorted_mask(kept, lens)).bool()
+        pixels, mask_values = self._read(index)
+        image = torch.from_numpy(_undistorted(pixels, lens)[0])
+        mask = None if mask_values is None else torch.from_numpy(_undistorted_mask(mask_values, lens)).bool()
         if image.shape[2] == 4:
             alpha = image[:, :, 3:].float() / 255
             image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
-        original = (taken.shape[1], taken.shape[0]) if any(lens.distortion) else None
-        return View(self.cameras[index], image, mask, self.names[index], original)
+        original_size = (pixels.shape[1], pixels.shape[0]) if any(lens.distortion) else None
+        return View(self.cameras[index], image, mask, self.names[index], original_size)
 
     @property
     def cameras(self) -> list[Camera]:
-        """All cameras, those of the undistorted images; reads no image."""
+        """Cameras of the undistorted images; no image is read."""
         return self._cameras
 
     @cached_property
@@ -117,8 +118,8 @@ class TrainedViews:
         try:
             if lens.kind not in ("PERSPECTIVE", "FISHEYE"):
                 raise InputError(
-                    f"{self.files[index]} was taken with a {lens.kind} camera; splatfacto draws perspective and "
-                    "fisheye cameras only."
+                    f"{self.files[index]} was taken with a {lens.kind} camera; splatfacto supports only perspective "
+                    "and fisheye cameras."
                 )
             return to_camera(self._poses[index], *_pinhole(lens))
         except InputError as error:
@@ -127,38 +128,38 @@ class TrainedViews:
     def _lens(self, index: int) -> _Lens:
         width, height = self._split.sizes[index].tolist()
         distortion = () if self._split.distortion is None else tuple(self._split.distortion[index].tolist())
-        fx, fy, cx, cy = self._split.projections[index].tolist()
+        fx, fy, cx, cy = self._split.intrinsics[index].tolist()
         return _Lens(self._split.kind, Intrinsics(fx, fy, cx, cy, width, height), distortion)
 
     def check_files(self) -> tuple[str, ...]:
-        """Looks at the heads of all photographs and masks; returns what a person should know, in whole sentences.
+        """Check the headers of all images and masks, and return warnings in whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: a photograph or mask that is no image, that nerfstudio reads into something
-                else, or that has another size than its camera or image; the message names it.
+            FileNotFoundError, ValueError: if an image or mask is missing, not an image, misread by nerfstudio, or not
+                of the size of its camera or image; the message names it.
         """
-        heads, scale = [read_head(file) for file in self.files], self._reading.scale
-        for index, (file, head) in enumerate(zip(self.files, heads)):
-            if head.mode not in _READ_WELL:
+        headers, scale = [read_head(file) for file in self.files], self._reading.scale
+        for index, (file, header) in enumerate(zip(self.files, headers)):
+            if header.mode not in _SUPPORTED_MODES:
                 raise InputError(
-                    f"{file} has pixels of kind {head.mode}, which nerfstudio takes for other values than they are. "
-                    "Expected 8-bit RGB, RGBA or grey; convert the photographs, and train again."
+                    f"{file} has the pixel format {header.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
+                    "RGBA or grayscale; convert the images, and train again."
                 )
-            self._check_size(index, head.size if scale == 1 else _scaled(head.size, scale))
+            self._check_size(index, header.size if scale == 1 else _scaled(header.size, scale))
             if self._split.masks is not None:
-                check_mask(self._split.masks[index], file, head.size)
-        return remarks(self.files, heads)
+                check_mask(self._split.masks[index], file, header.size)
+        return remarks(self.files, headers)
 
-    def _check_size(self, index: int, found: tuple[int, int]) -> None:
+    def _check_size(self, index: int, size: tuple[int, int]) -> None:
         expected = self._split.sizes[index].tolist()
-        if list(found) != expected:
+        if list(size) != expected:
             raise InputError(
-                f"{self.files[index]} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} "
-                "(width x height). Use the images that the run was trained with."
+                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{expected[1]} (width x height). Use the images that the run was trained with."
             )
 
     def _read(self, index: int) -> tuple[Any, Bool[np.ndarray, "h w"] | None]:
-        """Pixels and mask as nerfstudio's `InputDataset` reads them."""
+        """Read pixels and mask like nerfstudio's `InputDataset`."""
         file, masks = self.files[index], self._split.masks
         try:
             image = self._pixels(file)
@@ -167,16 +168,16 @@ class TrainedViews:
                 raise InputError(f"the mask has shape {mask.shape}, the image {image.shape[:2]}")
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"{error.filename} is missing, which the dataset names. Put it back, or say where the dataset is "
+                f"{error.filename} is missing, but the dataset lists it. Put it back, or give the path of the dataset "
                 "with --data."
             ) from error
-        except Exception as error:  # Pillow's readers raise whatever a file leads them to
+        except Exception as error:  # Pillow's readers raise any kind of exception on a damaged file
             raise InputError(
                 f"{file}{'' if masks is None else ' or its mask'} cannot be read ({error}). Expected an 8-bit image; "
                 "copy it again from the capture."
             ) from error
-        if self._reading.instead is not None and any(self._reading.instead) and mask is not None:
-            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._reading.instead)
+        if self._reading.mask_color is not None and any(self._reading.mask_color) and mask is not None:
+            filled = torch.ones(image.shape, dtype=torch.uint8) * torch.tensor(self._reading.mask_color)
             image = torch.where(torch.from_numpy(mask)[:, :, None], torch.from_numpy(image), filled).numpy()
         self._check_size(index, image.shape[1::-1])
         return image, mask
@@ -184,17 +185,17 @@ class TrainedViews:
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
         with Image.open(file) as opened:
             scale = self._reading.scale
-            picture = opened if scale == 1 else opened.resize(_scaled(opened.size, scale), Image.Resampling.BILINEAR)
-            image = np.array(picture, dtype=np.uint8)
+            resized = opened if scale == 1 else opened.resize(_scaled(opened.size, scale), Image.Resampling.BILINEAR)
+            image = np.array(resized, dtype=np.uint8)
         if image.ndim == 2:
             image = image[:, :, None].repeat(3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
             raise InputError(f"its shape is {image.shape}")
-        if self._reading.behind is None or image.shape[2] == 3:
+        if self._reading.alpha_color is None or image.shape[2] == 3:
             return image
-        mixed, color = torch.from_numpy(image), torch.tensor(self._reading.behind)
-        mixed = mixed[:, :, :3] * (mixed[:, :, -1:] / 255.0) + 255.0 * color * (1.0 - mixed[:, :, -1:] / 255.0)
-        return torch.clamp(mixed, min=0, max=255).to(torch.uint8).numpy()
+        blended, color = torch.from_numpy(image), torch.tensor(self._reading.alpha_color)
+        blended = blended[:, :, :3] * (blended[:, :, -1:] / 255.0) + 255.0 * color * (1.0 - blended[:, :, -1:] / 255.0)
+        return torch.clamp(blended, min=0, max=255).to(torch.uint8).numpy()
 
 
 def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
@@ -203,32 +204,32 @@ def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
 
 def _mask(file: Path, scale: float) -> Bool[np.ndarray, "h w"]:
     with Image.open(file) as opened:
-        picture = opened if scale == 1 else opened.resize(_scaled(opened.size, scale), Image.Resampling.NEAREST)
-        return np.array(picture).astype(bool)
+        resized = opened if scale == 1 else opened.resize(_scaled(opened.size, scale), Image.Resampling.NEAREST)
+        return np.array(resized).astype(bool)
 
 
-@lru_cache  # photographs of one camera differ in their poses only
+@lru_cache  # images of one camera differ only in their poses
 def _pinhole(lens: _Lens) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Intrinsics, width and height without distortion."""
+    """Return intrinsics, width and height of the undistorted image."""
     blank = np.zeros((lens.intrinsics.height, lens.intrinsics.width, 3), np.uint8)
     image, matrix = _undistorted(blank, lens)
     return torch.from_numpy(matrix).float(), image.shape[1], image.shape[0]
 
 
 def _undistorted(image: Any, lens: _Lens) -> tuple[Any, Float[np.ndarray, "3 3"]]:
-    """The image without distortion, and its camera matrix, as `FullImageDatamanager` has them."""
+    """Undistort an image like `FullImageDatamanager`, and return it with its camera matrix."""
     if not any(lens.distortion):
         return photographs.undistorted(image, lens.intrinsics)
     try:
         if lens.kind == "PERSPECTIVE":
-            return photographs.undistorted(image, _brown(lens))
+            return photographs.undistorted(image, _with_distortion(lens))
         matrix, coefficients, pinhole = _fisheye(lens)
         maps = cv2.fisheye.initUndistortRectifyMap(
             matrix, coefficients, np.eye(3), pinhole, image.shape[1::-1], cv2.CV_32FC1
         )
         pixels = cv2.remap(image, maps[0], maps[1], interpolation=cv2.INTER_LINEAR)
     except (InputError, cv2.error, ValueError) as error:
-        raise InputError(f"its distortion {list(lens.distortion)} cannot be undone ({error})") from error
+        raise InputError(f"its distortion {list(lens.distortion)} cannot be undistorted ({error})") from error
     shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     return pixels, np.asarray(pinhole) * [[1, 0, 1], [0, 1, 1], [0, 0, 1]] + shift
 
@@ -241,20 +242,20 @@ def _undistorted_mask(mask: Bool[np.ndarray, "h w"], lens: _Lens) -> UInt8[np.nd
     return cv2.fisheye.undistortImage(values, matrix, coefficients, None, pinhole)
 
 
-def _brown(lens: _Lens) -> Intrinsics:
-    if len(lens.distortion) < _BROWN or lens.distortion[3] != 0:
-        raise InputError("only k1, k2, k3, p1 and p2 can be undone")
+def _with_distortion(lens: _Lens) -> Intrinsics:
+    if len(lens.distortion) < _DISTORTION_PARAMS or lens.distortion[3] != 0:
+        raise InputError("only k1, k2, k3, p1 and p2 can be undistorted")
     k1, k2, k3, _, p1, p2, *_ = lens.distortion
     return lens.intrinsics._replace(k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
 
 
 def _fisheye(lens: _Lens) -> tuple[Any, Any, Any]:
-    """Camera matrix, coefficients and the matrix of the pinhole camera, with pixel centres at whole numbers."""
+    """Return camera matrix, coefficients and pinhole camera matrix, with pixel centers at integers."""
     fx, fy, cx, cy, width, height = lens.intrinsics[:6]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
     matrix[:2, 2] -= 0.5
     if len(lens.distortion) < 4:
-        raise InputError("a fisheye camera has four coefficients")
+        raise InputError("a fisheye camera needs four distortion coefficients")
     coefficients = np.array(lens.distortion[:4], np.float32)
     pinhole = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
         matrix, coefficients, (width, height), np.eye(3), balance=0
@@ -263,5 +264,5 @@ def _fisheye(lens: _Lens) -> tuple[Any, Any, Any]:
 
 
 def image_name(file: Path, folder: Path) -> str:
-    """The file relative to the folder of its dataset, with forward slashes."""
+    """Return the file relative to its dataset's folder, or unchanged if it lies elsewhere, with forward slashes."""
     return (file.relative_to(folder) if file.is_relative_to(folder) else file).as_posix()
