@@ -107,7 +107,7 @@ def viewer(viewed: tuple[Any, Any]) -> Any:
 @pytest.fixture
 def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The pipeline as loaded; what the panel writes goes to a folder of the test."""
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.insights._CALM", 0.01)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.insights._DELAY", 0.01)
     model, output = viewed[0].model, viewed[1].control_panel._output_render
     field = model.field
     model.config.semantics = tmp_path / "run" / "normlift"
@@ -361,7 +361,7 @@ def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
 
 def listed(panel: Any) -> list[Any]:
     """The buttons of the found objects, once they are listed for what is selected."""
-    until(lambda: panel._rest._turns.busy == "")
+    until(lambda: panel._details._turns.busy == "")
     with panel._lock:  # which is held from then on, until they are shown
         return [group for _, group in panel._widgets.rows._rows if group.visible]
 
@@ -438,7 +438,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     assert all(name in text for name in names)
     assert text.count("data:image/jpeg;base64,") == len(names)
     panel._reasons = reasons
-    panel._follow()
+    panel._update_widgets()
     assert panel._widgets.reasons.content == reasons.content
     ask(panel, "left")  # another selection
     assert panel._widgets.reasons.content == ""
