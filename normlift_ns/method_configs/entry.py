@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 
-def _method(name: str) -> Any:
+def _load_method(name: str) -> Any:
     try:
         return getattr(import_module(f"normlift_ns.method_configs.{name}"), f"{name}_method")
     except Exception as error:  # any missing or broken dependency
@@ -21,6 +21,6 @@ def _method(name: str) -> Any:
         return None
 
 
-normlift_method = _method("normlift")
-lerf_ovs_method = _method("lerf_ovs")
-scannet_method = _method("scannet")
+normlift_method = _load_method("normlift")
+lerf_ovs_method = _load_method("lerf_ovs")
+scannet_method = _load_method("scannet")

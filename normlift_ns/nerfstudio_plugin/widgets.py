@@ -94,12 +94,13 @@ class Widgets:
             with self._gui.add_folder("How it is asked and drawn", expand_by_default=False):
                 self.shown = self._input(
                     "shown",
-                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="The prompt that selects."),
+                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt that selects."),
                 )
                 self.colormap = self._input(
-                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Colormap of relevancy.")
+                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
                 )
-                self.negatives = self._gui.add_text("Negatives", "", hint="Prompts to compare with, separated by commas.")
+                hint = "Prompts to compare with, separated by commas."
+                self.negatives = self._gui.add_text("Negatives", "", hint=hint)
                 rules = ("auto", *RULES)
                 self.rule = self._gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
                 self.refined = self._input(
