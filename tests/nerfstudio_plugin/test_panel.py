@@ -394,7 +394,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert "up: probably not in this scene" in html.unescape(panel._widgets.histograms.content)
     press_row(groups[0], "hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
-    assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._remark.content)
+    assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._summary.content)
     panel.act("Clear")
     listed(panel)
     assert panel._widgets.histograms.content == ""
