@@ -33,9 +33,9 @@ class Asker:
         negatives: str,
         clicks: Mapping[str, Any],
         widgets: Widgets | None,
-        wanted: Callable[[], bool],
+        is_current: Callable[[], bool],
     ) -> tuple[tuple[Prompt, ...], Question] | None:
-        """Encode a line of prompts and build its question.
+        """Encode a line of prompts and build its query.
 
         Args:
             folder: folder of the semantic field; None: no stored prompts and no text embedding cache.
@@ -43,9 +43,9 @@ class Asker:
             negatives: negative prompts as typed.
             clicks: directions of clicked Gaussians, by the names of their prompts.
             widgets: where the rule, the minimum reliability and the choice of features are set; None: defaults.
-            wanted: returns False once the request is stale.
+            is_current: returns False once the request is stale.
         Returns:
-            The prompts and their question; None if the request is stale.
+            The prompts and their query; None if the request is stale.
         Raises:
             ValueError, OSError: as `read_prompts` and `session.prompts.pose`.
         """
@@ -67,12 +67,12 @@ class Asker:
             return self.encoder[0].rows(texts)
 
         with self._lock:  # so that two threads do not both load the encoder
-            if not wanted():
+            if not is_current():
                 return None
             prompts = read_prompts(line, encode, vectors)
             return pose(field, prompts, encode, negatives=split_prompts(negatives), **options)
 
 
 def stored(folder: Path | None) -> Question | None:
-    """Return the question stored in a run, or None if it stores none."""
+    """Return the query stored in a run, or None if it stores none."""
     return None if folder is None else load_question(folder)

@@ -81,7 +81,7 @@ class Face(torch.nn.Module):
 
     @property
     def answer(self) -> Answer | None:
-        """The answer to the question of the state; None without one."""
+        """The answer to the query of the state; None without one."""
         return None if self.state is None else self.state.answer
 
     @property
@@ -185,8 +185,8 @@ class Face(torch.nn.Module):
         widgets.status.content = said(state, self._message, busy, visible)
         widgets.found.content = found_table(state)
 
-    def _show_details(self, wanted: Callable[[], bool], objects: Found, histograms: str) -> None:
+    def _show_details(self, is_current: Callable[[], bool], objects: Found, histograms: str) -> None:
         with self._lock:
-            if self._widgets is not None and wanted():
+            if self._widgets is not None and is_current():
                 self._widgets.rows.show(objects)
                 self._widgets.histograms.content = histograms

@@ -73,30 +73,30 @@ class Rest:
 
     def follow(self, state: State) -> None:
         """Compute the details of the state that is shown now."""
-        turn = self._turns.start("Looking for objects.")
-        Thread(target=self._compute, args=(turn, state), daemon=True).start()
+        token = self._turns.start("Looking for objects.")
+        Thread(target=self._compute, args=(token, state), daemon=True).start()
 
     def cancel(self) -> None:
         """Drop the results of the running computation."""
         self._turns.cancel()
 
-    def _compute(self, turn: Turn, state: State) -> None:
+    def _compute(self, token: Turn, state: State) -> None:
         time.sleep(_DELAY)
-        if not self._turns.wanted(turn):
+        if not self._turns.wanted(token):
             return
         try:
             objects, histograms = found_objects(state, most=MOST_OBJECTS), verdicts_mdx(state)
-            self._show(lambda: self._turns.finish(turn), objects, histograms)
+            self._show(lambda: self._turns.finish(token), objects, histograms)
         except Exception as error:  # no error may stop the viewer
-            if self._turns.finish(turn):
+            if self._turns.finish(token):
                 self._failed(error)
 
 
-def go_to(client: Any, found: FoundObject, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
+def go_to(client: Any, target: FoundObject, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
     """Move the camera of one browser in front of an object, from its current side unless something blocks the view."""
     camera = client.camera
     view = (np.asarray(camera.position) / UNITS, camera.up_direction, float(camera.fov))
-    position = clear_viewpoint(found, scene, drawn, *view)
+    position = clear_viewpoint(target, scene, drawn, *view)
     with client.atomic():
         camera.position = np.array(position) * UNITS
-        camera.look_at = np.array(found.centre) * UNITS
+        camera.look_at = np.array(target.centre) * UNITS

@@ -42,12 +42,12 @@ class Host(Protocol):
         ...
 
 
-def selection_file(host: Host, state: State, mask: Bool[Tensor, " n"], called: str) -> tuple[str, bytes, int]:
+def selection_file(host: Host, state: State, mask: Bool[Tensor, " n"], stem: str) -> tuple[str, bytes, int]:
     """Export Gaussians as a PLY file.
 
     Args:
         mask: the selection, or an object in it.
-        called: name of the file without suffix.
+        stem: name of the file without suffix.
     Returns:
         Name and content of the file, and its number of Gaussians.
     Raises:
@@ -58,7 +58,7 @@ def selection_file(host: Host, state: State, mask: Bool[Tensor, " n"], called: s
     parameters, harmonics, mode = host.splats()
     if not bool((mask & drawable(parameters["opacities"])).any()):
         raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
-    name = f"{file_name(called)}.ply"
+    name = f"{file_name(stem)}.ply"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         rows = write_splats(

@@ -99,7 +99,7 @@ class NormLiftModel(SplatfactoModel):
             compile_renderer()
 
     def attach(self, semantic_field: SemanticField, question: Question | None = None) -> None:
-        """Render a field and the answer to a question from now on, and enable the panel for the field."""
+        """Render a field and the answer to a query from now on, and enable the panel for the field."""
         self._field = semantic_field.to(self.device)
         self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
 

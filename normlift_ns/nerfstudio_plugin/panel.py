@@ -58,7 +58,7 @@ class Panel(Face):
     def open(
         self, field: SemanticField, means: Tensor, folder: Path | None = None, question: Question | None = None
     ) -> None:
-        """Enable the panel for a field, and show the answer to a question.
+        """Enable the panel for a field, and show the answer to a query.
 
         Args:
             folder: folder of the field; None: prompts cannot be saved.
@@ -178,43 +178,43 @@ class Panel(Face):
 
     def _run(self, description: str, task: Callable[[Turn], None]) -> None:
         """Run a slow task without holding a lock; the panel shows its description until it ends."""
-        turn = self._turns.start(description)
+        token = self._turns.start(description)
         self._clicks.disarm()
         self.tell("")
         message = ""
         try:
-            task(turn)
+            task(token)
         except Exception as error:  # the libraries of an encoder may raise anything; no error may stop the viewer
             message = explain(error)[0]
-        if self._turns.finish(turn):
+        if self._turns.finish(token):
             self.tell(message)
 
-    def _answer(self, turn: Turn) -> None:
+    def _answer(self, token: Turn) -> None:
         inputs = (self._folder, self._line, self._negatives, dict(self._clicks.known), self._widgets)
         field = cast(State, self.state).space.field
         result = self._asker.pose(field, *inputs, lambda: self._turns.busy != "")
         with self._lock:
-            if result is not None and self._turns.finish(turn) and self._history is not None:
+            if result is not None and self._turns.finish(token) and self._history is not None:
                 state, (prompts, question) = self._history.now, result
                 self._message = ""
                 self._show(self._history.do(actions.ask(state, prompts, carried(state, question))), answered=True)
 
-    def _select_floaters(self, turn: Turn) -> None:
+    def _select_floaters(self, token: Turn) -> None:
         floaters = find_floaters(self._host[0].scene(), cast(State, self.state).space.field.scalars).mask
         with self._lock:
-            if self._history is not None and self._turns.wanted(turn):
+            if self._history is not None and self._turns.wanted(token):
                 state = actions.select_floaters(self._history.now, floaters)
-                self._turns.finish(turn)
+                self._turns.finish(token)
                 self._message = actions.LOOK_FIRST
                 self._show(self._history.do(state), answered=True)
 
     def _explain(self) -> None:
         """Show the training images behind the selection; the search for them holds no lock."""
         state, reasons = cast(State, self.state), cast(Reasons, self._reasons)
-        turn = reasons.start(state)
+        token = reasons.start(state)
         self.tell("")
         try:
-            reasons.find(turn, state)
+            reasons.find(token, state)
         finally:
             with self._lock:
                 self._update_widgets()

@@ -110,7 +110,7 @@ class DatasetViews:
         if int(camera.camera_type) not in _SUPPORTED_CAMERAS:
             raise InputError(
                 f"{self.files[index]} was taken with a {CameraType(int(camera.camera_type)).name} camera; splatfacto "
-                "renders only perspective and fisheye cameras."
+                "supports only perspective and fisheye cameras."
             )
         blank = torch.zeros(int(camera.height), int(camera.width), 3, dtype=torch.uint8)
         image, intrinsics, _ = _undistort(self._dataset.cameras, index, {"image": blank})
@@ -130,8 +130,8 @@ class DatasetViews:
         for index, (file, head) in enumerate(zip(self.files, heads)):
             if head.mode not in _SUPPORTED_MODES:
                 raise InputError(
-                    f"{file} has pixels of kind {head.mode}, which nerfstudio takes for other values than they are. "
-                    "Expected 8-bit RGB, RGBA or grey; convert the photographs, and train again."
+                    f"{file} has the pixel format {head.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
+                    "RGBA or grayscale; convert the images, and train again."
                 )
             size = head.size if scale == 1 else tuple(int(side * scale) for side in head.size)
             self._check_size(index, size, sizes[index])
@@ -142,8 +142,8 @@ class DatasetViews:
     def _check_size(self, index: int, size: Sequence[int], expected: Sequence[int]) -> None:
         if tuple(size) != tuple(expected):
             raise InputError(
-                f"{self.files[index]} is {size[0]} x {size[1]} pixels, its camera {expected[0]} x {expected[1]} "
-                "(width x height). Use the images that the run was trained with."
+                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{expected[1]} (width x height). Use the images that the run was trained with."
             )
 
     def _read(self, index: int) -> dict[str, Any]:
@@ -152,8 +152,8 @@ class DatasetViews:
             data = self._dataset.get_data(index, image_type="uint8")
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"{error.filename}, which the dataset names, is missing. Put it back, or pass the dataset's path with "
-                "--data."
+                f"{error.filename} is missing, but the dataset lists it. Put it back, or give the path of the dataset "
+                "with --data."
             ) from error
         except Exception as error:  # Pillow's readers and nerfstudio's checks may raise anything
             raise InputError(

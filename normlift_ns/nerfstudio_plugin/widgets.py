@@ -109,7 +109,7 @@ class Widgets:
         self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
 
     def forget(self, negatives: str) -> None:
-        """Reset the settings that apply to the next question.
+        """Reset the settings that apply to the next query.
 
         Args:
             negatives: default negative prompts.

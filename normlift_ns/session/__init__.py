@@ -16,7 +16,7 @@ A viewer keeps one `Space` per run, and one `History` per user::
 
 Slow work runs with a token from `Turns`: the viewer shows that it is busy, and drops stale results.
 
-* `prompts`: prompts and clicks as rows, each with its vector or its error, and the questions made of them.
+* `prompts`: prompts and clicks as rows, each with its vector or its error, and the queries made of them.
 * `space`: the field and the centers of its Gaussians; connected objects, growing and shrinking, boxes.
 * `state`: what is asked, selected and hidden. `actions`: functions from one state to the next.
 * `verdicts`: histograms, suggested thresholds, and prompts that are probably not in the scene.

@@ -31,11 +31,11 @@ LOOK_FIRST = "Likely floaters are selected. Check them, then press Hide. Undo br
 
 
 def ask(state: State, prompts: Sequence[Prompt], question: Question) -> State:
-    """Answer a question. Hidden Gaussians stay hidden; selections by click and cuts are dropped.
+    """Answer a query. Hidden Gaussians stay hidden; selections by click and cuts are dropped.
 
     Args:
         prompts: all rows, from `pose`.
-        question: the question of these rows, from `pose`.
+        question: the query of these rows, from `pose`.
     Raises:
         ValueError: the vectors differ in length from the field's.
     """
@@ -50,14 +50,14 @@ def ask_again(state: State, question: Question | None, did: str) -> State:
 
 
 def _with_suggested_threshold(state: State) -> State:
-    """Apply the suggested threshold if the question asks for it. Invalid questions raise here."""
+    """Apply the suggested threshold if the query asks for it. Invalid queries raise here."""
     if state.answer is None or state.question is None or not state.question.suggest:
         return state
     return replace(state, question=state.answer.question)
 
 
 def clear(state: State) -> State:
-    """Remove the question and the selection. Hidden Gaussians stay hidden."""
+    """Remove the query and the selection. Hidden Gaussians stay hidden."""
     return State(state.space, hidden=state.hidden, look=state.look, did="Clear")
 
 
@@ -74,7 +74,7 @@ def suggest(state: State) -> State:
     """Set the threshold suggested by the relevancies of the prompts that select.
 
     Raises:
-        ValueError: there is no question.
+        ValueError: there is no query.
     """
     value = suggested(state)
     if value is None:
@@ -97,7 +97,7 @@ def leave_out_poor(state: State) -> State:
 
 
 def show(state: State, shown: int | None) -> State:
-    """Let only one prompt of the question select; None: all of them."""
+    """Let only one prompt of the query select; None: all of them."""
     count = 0 if state.question is None else len(state.question.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
         return state
@@ -166,17 +166,17 @@ def take_away(state: State, chosen: Bool[Tensor, " n"], did: str = "Take away") 
     return replace(state, removed=chosen if state.removed is None else state.removed | chosen, did=did)
 
 
-def select_floaters(state: State, found: Bool[Tensor, " n"]) -> State:
+def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
     """Select likely floaters.
 
     Args:
-        found: mask of the floaters, from `insight.floaters.find_floaters`.
+        floaters: mask of the floaters, from `insight.floaters.find_floaters`.
     Raises:
         ValueError: there are none.
     """
-    if not bool(found.any()):
+    if not bool(floaters.any()):
         raise InputError("There are no likely floaters.")
-    return select(state, found, "Select likely floaters")
+    return select(state, floaters, "Select likely floaters")
 
 
 def resize(state: State, steps: int) -> State:

@@ -1,4 +1,4 @@
-"""Prompts as rows: every text or click with its vector or its error, and the questions made of them."""
+"""Prompts as rows: every text or click with its vector or its error, and the queries made of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Read = Callable[[Sequence[str]], Any]
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """One row of a question."""
+    """One row of a query."""
 
     text: str
     vector: Float[np.ndarray, " d"] | None = None
@@ -126,14 +126,14 @@ def pose(
     min_reliability: float = 0.0,
     refined: bool = True,
 ) -> tuple[tuple[Prompt, ...], Question]:
-    """Build the question of all rows that have a vector.
+    """Build the query of all rows that have a vector.
 
     Clicks alone are compared by cosine, above 0.9 by default. Together with texts, clicks need the rule cosine.
 
     Args:
         read: encoder of the negatives. The other arguments are those of `make_question`.
     Returns:
-        The rows, in which clicks that the rule excludes have an error, and their question.
+        The rows, in which clicks that the rule excludes have an error, and their query.
     Raises:
         ValueError: no row has a vector; as `make_question`.
     """
@@ -164,18 +164,18 @@ def _question(field: Field, prompts: Sequence[Prompt], read: Read, **options: An
 
 
 def prompts_of(question: Question | None) -> tuple[Prompt, ...]:
-    """Return the rows of a question, for instance of the one that a run stores. None: no rows."""
+    """Return the rows of a query, for instance of the one that a run stores. None: no rows."""
     if question is None:
         return ()
     return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.vectors))
 
 
 def merged(stored: Question | None, asked: Question) -> Question:
-    """Merge stored and new prompts into one question; a new prompt replaces a stored one with the same text.
+    """Merge stored and new prompts into one query; a new prompt replaces a stored one with the same text.
 
     Args:
-        stored: question of the run; None: the run stores none.
-        asked: question to add.
+        stored: query of the run; None: the run stores none.
+        asked: query to add.
     Raises:
         ValueError: the two differ in rule, negatives or features.
     """

@@ -29,9 +29,9 @@ class State:
     prompts: tuple[Prompt, ...] = ()
     """All rows, including those with errors."""
     question: Question | None = None
-    """Question of the rows without errors, with the threshold and the minimum reliability."""
+    """Query of the rows without errors, with the threshold and the minimum reliability."""
     shown: int | None = None
-    """Index of the only prompt of the question that selects; None: all of them select."""
+    """Index of the only prompt of the query that selects; None: all of them select."""
     from_answer: bool = True
     """Whether the prompts select; False: the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
@@ -48,7 +48,7 @@ class State:
 
     @cached_property
     def answer(self) -> Answer | None:
-        """Answer to the question; None without one."""
+        """Answer to the query; None without one."""
         return None if self.question is None else self.space.answer(self.question)
 
     @cached_property
@@ -86,7 +86,7 @@ class State:
 
     @property
     def refined(self) -> bool:
-        """Whether the question uses refined features."""
+        """Whether the query uses refined features."""
         return True if self.question is None else self.question.refined
 
     @cached_property

@@ -29,21 +29,21 @@ class Turns:
     _last: Turn = Turn(0, "")
     _running: bool = False
 
-    def start(self, what: str) -> Turn:
+    def start(self, description: str) -> Turn:
         """Return a new token; all earlier ones become stale."""
         with self._lock:
-            self._last, self._running = Turn(self._last.number + 1, what), True
+            self._last, self._running = Turn(self._last.number + 1, description), True
             return self._last
 
-    def wanted(self, turn: Turn) -> bool:
+    def wanted(self, token: Turn) -> bool:
         """Return whether the result of a request is still wanted."""
         with self._lock:
-            return self._running and turn.number == self._last.number
+            return self._running and token.number == self._last.number
 
-    def finish(self, turn: Turn) -> bool:
+    def finish(self, token: Turn) -> bool:
         """End a request; return whether its result is still wanted."""
         with self._lock:
-            current = self._running and turn.number == self._last.number
+            current = self._running and token.number == self._last.number
             self._running = self._running and not current
             return current
 

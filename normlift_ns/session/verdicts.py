@@ -75,9 +75,9 @@ def suggested(state: State) -> float | None:
 
 
 def carried(state: State, question: Question) -> Question:
-    """Return a new question with the threshold of the previous one, if both use the same rule.
+    """Return a new query with the threshold of the previous one, if both use the same rule.
 
-    A question that asks for a suggested threshold keeps its own, unless the user has chosen the previous one.
+    A query that asks for a suggested threshold keeps its own, unless the user has chosen the previous one.
     """
     previous = state.question
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):

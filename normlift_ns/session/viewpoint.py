@@ -32,10 +32,10 @@ class Spot:
 
 
 def clear_viewpoint(
-    found: FoundObject | Spot,
+    target: FoundObject | Spot,
     scene: GaussianScene,
     drawn: Bool[Tensor, " n"] | None,
-    from_: Sequence[float] | np.ndarray,
+    camera_position: Sequence[float] | np.ndarray,
     up: Sequence[float] | np.ndarray,
     field_of_view: float = 0.9,
 ) -> Place:
@@ -45,23 +45,23 @@ def clear_viewpoint(
     above.
 
     Args:
-        found: object or point to look at.
+        target: object or point to look at.
         scene: Gaussians that may occlude it.
         drawn: mask of the Gaussians that are drawn; None: all.
-        from_: current position of the camera.
+        camera_position: current position of the camera.
         up: direction of the vertical.
         field_of_view: of the camera, in radians.
     """
-    first = viewpoint(found, from_, field_of_view)
-    center = torch.tensor(found.centre, dtype=torch.float64)
-    distance = float(np.linalg.norm(np.asarray(first) - np.asarray(found.centre)))
+    first = viewpoint(target, camera_position, field_of_view)
+    center = torch.tensor(target.centre, dtype=torch.float64)
+    distance = float(np.linalg.norm(np.asarray(first) - np.asarray(target.centre)))
     means = scene.means.detach().double().cpu()
     near = (means - center).norm(dim=1) - 3 * scene.scales.detach().double().cpu().amax(dim=1) < distance
     near = near if drawn is None else near & drawn.cpu()
     parts = (x.detach().cpu()[near] for x in (scene.means, scene.quats, scene.scales, scene.opacities))
     occluders, best, least = GaussianScene(*parts), first, np.inf
-    for position in _candidates(np.asarray(first), np.asarray(found.centre), np.asarray(up, float)):
-        occlusion = _occlusion(occluders, torch.from_numpy(position), center, found.extent / 2)
+    for position in _candidates(np.asarray(first), np.asarray(target.centre), np.asarray(up, float)):
+        occlusion = _occlusion(occluders, torch.from_numpy(position), center, target.extent / 2)
         if occlusion < least:
             best, least = (float(position[0]), float(position[1]), float(position[2])), occlusion
         if least <= _MAX_OCCLUSION:
@@ -69,19 +69,21 @@ def clear_viewpoint(
     return best
 
 
-def viewpoint(found: FoundObject | Spot, from_: Sequence[float] | np.ndarray, field_of_view: float = 0.9) -> Place:
+def viewpoint(
+    target: FoundObject | Spot, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
+) -> Place:
     """Return the camera position on the current side of an object from which it fills half of the image.
 
     Args:
-        found: object or point to look at.
-        from_: current position of the camera.
+        target: object or point to look at.
+        camera_position: current position of the camera.
         field_of_view: of the camera, in radians.
     """
-    center = np.asarray(found.centre)
-    offset = np.asarray(from_, float) - center
+    center = np.asarray(target.centre)
+    offset = np.asarray(camera_position, float) - center
     length = float(np.linalg.norm(offset))
     offset = offset / length if length > 0 else np.array([0.0, -1.0, 0.0])
-    distance = max(found.extent, 1e-6) / np.tan(field_of_view / 2)
+    distance = max(target.extent, 1e-6) / np.tan(field_of_view / 2)
     position = center + offset * distance
     return float(position[0]), float(position[1]), float(position[2])
 

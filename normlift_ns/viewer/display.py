@@ -21,7 +21,7 @@ _MIN_SPAN = 0.05
 SEGMENTED = 0.8
 """Opacity of the prompt colors over the scene."""
 BY_HAND = prompt_colors([""])[0]
-"""RGB of Gaussians selected by clicks without a question."""
+"""RGB of Gaussians selected by clicks without a query."""
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,13 @@ _MAX_SIDE, _QUALITY = 480, 80
 """Longer side of an image in pixels, and its JPEG quality."""
 
 
-def histogram_svg(histogram: Histogram, colour: Sequence[float]) -> str:
+def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
     """Draw the histogram of one prompt.
 
     The heights of the bars are logarithmic. A solid line marks the threshold, and a dashed line the suggested one.
 
     Args:
-        colour: color of the bars above the threshold, RGB in 0..1.
+        color: color of the bars above the threshold, RGB in 0..1.
 
     >>> values = np.array([0.1] * 60 + [0.9] * 10)
     >>> from normlift_ns.insight.histogram import histogram
@@ -41,7 +41,7 @@ def histogram_svg(histogram: Histogram, colour: Sequence[float]) -> str:
     low, high = float(histogram.edges[0]), float(histogram.edges[-1])
     step, height_of_bars = _WIDTH / len(histogram.counts), _HEIGHT - _TOP - _BOTTOM
     heights = np.log1p(histogram.counts) / np.log1p(max(1, histogram.counts.max())) * height_of_bars
-    selected = "#" + "".join(f"{round(255 * x):02x}" for x in colour)
+    selected = "#" + "".join(f"{round(255 * x):02x}" for x in color)
     parts = [f'<rect width="{_WIDTH}" height="{_HEIGHT}" rx="4" fill="{_BACKGROUND}"/>']
     for i, height in enumerate(heights):
         if height > 0:

@@ -40,28 +40,28 @@ def font(size: int) -> ImageFont.FreeTypeFont:
 
 
 def with_bar(
-    picture: Float[Tensor, "h w 3"], colormap: Colormap, scale: tuple[float, float], title: str
+    image: Float[Tensor, "h w 3"], colormap: Colormap, scale: tuple[float, float], title: str
 ) -> Float[Tensor, "h w 3"]:
     """Return an image with a color bar in its lower right corner if there is room for one.
 
     Args:
-        picture: RGB in 0..1.
+        image: RGB in 0..1.
         scale: values of the first and the last color.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     tile = None if height < LEAST_HEIGHT else _color_bar(colormap, scale, clipped(title, 28), _font_size(height))
-    return picture if tile is None else _paste(picture, tile, width)
+    return image if tile is None else _paste(image, tile, width)
 
 
-def with_prompts(picture: Float[Tensor, "h w 3"], texts: Sequence[str], colors: Float[Tensor, "q 3"]) -> Tensor:
+def with_prompts(image: Float[Tensor, "h w 3"], texts: Sequence[str], colors: Float[Tensor, "q 3"]) -> Tensor:
     """Return an image [H, W, 3] with prompts and their colors in its lower right corner if there is room for them."""
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     if height < LEAST_HEIGHT or len(texts) == 0:
-        return picture
+        return image
     rows = tuple(clipped(text, 28) for text in texts[:_MAX_PROMPTS])
     rows += (f"and {len(texts) - _MAX_PROMPTS} more",) if len(texts) > _MAX_PROMPTS else ()
     rgb = tuple(tuple(row) for row in (colors[:_MAX_PROMPTS].cpu() * 255).round().int().tolist())
-    return _paste(picture, _prompt_list(rows, rgb, _font_size(height)), width)
+    return _paste(image, _prompt_list(rows, rgb, _font_size(height)), width)
 
 
 def _font_size(height: int) -> int:
@@ -69,17 +69,17 @@ def _font_size(height: int) -> int:
     return max(11, height // 42)
 
 
-def _paste(picture: Tensor, tile: UInt8[np.ndarray, "rows columns 3"], width: int) -> Tensor:
+def _paste(image: Tensor, tile: UInt8[np.ndarray, "rows columns 3"], width: int) -> Tensor:
     """Return an image with a tile in its lower right corner if a third of the width stays free."""
     rows, columns = tile.shape[:2]
     margin = max(4, rows // 8)
-    if 3 * columns > 2 * width or columns + 2 * margin > width or rows + 2 * margin > len(picture):
-        return picture
+    if 3 * columns > 2 * width or columns + 2 * margin > width or rows + 2 * margin > len(image):
+        return image
     corner = (slice(-rows - margin, -margin), slice(-columns - margin, -margin))
-    result = picture.clone()
+    result = image.clone()
     opacity = np.where((tile == _BACKDROP).all(axis=2), _BACKDROP_OPACITY, 1.0)  # the backdrop is translucent
-    opacity = torch.from_numpy(opacity[:, :, None]).to(picture)
-    result[corner] = opacity * (torch.from_numpy(tile).to(picture) / 255) + (1 - opacity) * result[corner]
+    opacity = torch.from_numpy(opacity[:, :, None]).to(image)
+    result[corner] = opacity * (torch.from_numpy(tile).to(image) / 255) + (1 - opacity) * result[corner]
     return result
 
 

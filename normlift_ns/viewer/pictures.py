@@ -60,7 +60,7 @@ def save_overlays(
     duplicates = [name for name, count in counts.items() if count > 1]
     if len(duplicates) > 0:
         raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
-    titles = [Found.of(finding) for finding in answer]
+    headers = [Found.of(finding) for finding in answer]
     sheet = Sheet(COLORMAPS[0], make_display(answer.field, answer).whole, answer.question.threshold)
     paths, overlays = [], [[] for _ in answer.texts]
     for view, camera in cameras.items():
@@ -69,11 +69,11 @@ def save_overlays(
             overlays[q].append((view, *overlay))
             paths.append(folder / files[view][q])
             with new_file(paths[-1], overwrite=overwrite) as draft:
-                picture_of(sheet, titles[q], view, image, *overlay).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+                picture_of(sheet, headers[q], view, image, *overlay).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
     for q, name in enumerate(sheets):
         paths.append(folder / name)
         with new_file(paths[-1], overwrite=overwrite) as draft:
-            contact_sheet(sheet, titles[q], overlays[q]).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+            contact_sheet(sheet, headers[q], overlays[q]).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
     return paths
 
 

@@ -85,7 +85,7 @@ class Reasons:
         self._selection, self.content = state.selection, ""
         return self._turns.start(_BUSY)
 
-    def find(self, turn: Turn, state: State) -> None:
+    def find(self, token: Turn, state: State) -> None:
         """Compute the explanation of a selection. This can take seconds: call it without a lock, from any thread.
 
         Raises:
@@ -94,12 +94,12 @@ class Reasons:
         content = ""
         try:
             with _explain_lock:
-                if self._turns.wanted(turn):
+                if self._turns.wanted(token):
                     content = reasons_mdx(self._votes(), state.selection, refined=state.refined)
         except Exception:
-            if self._turns.finish(turn):
+            if self._turns.finish(token):
                 raise
-        if self._turns.finish(turn):
+        if self._turns.finish(token):
             self.content = content
 
     def follow(self, state: State) -> None:

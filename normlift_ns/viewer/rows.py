@@ -29,12 +29,12 @@ class Rows:
             # created once: viser never frees what is added to or removed from a panel that all pages share
             self._rows = [self._row(gui, i, act) for i in range(MOST_OBJECTS)]
 
-    def show(self, found: Found) -> None:
+    def show(self, object_list: Found) -> None:
         """Replace the listed objects; at most `MOST_OBJECTS` are shown."""
-        self._objects = tuple(found.objects)
-        unlisted = [f"{found.left_out:,} smaller objects are not listed"] * (found.left_out > 0)
-        unlisted += [f"Gaussians in smaller components: {found.in_smaller_parts:,}"] * (found.in_smaller_parts > 0)
-        empty = "" if len(found.objects) > 0 else "Nothing that is drawn is selected."
+        self._objects, small = tuple(object_list.objects), object_list.in_smaller_parts
+        unlisted = [f"{object_list.left_out:,} smaller objects are not listed"] * (object_list.left_out > 0)
+        unlisted += [f"Gaussians in smaller components: {small:,}"] * (small > 0)
+        empty = "" if len(self._objects) > 0 else "Nothing that is drawn is selected."
         self._summary.content = as_text("; ".join(unlisted) or empty)
         for i, (text, buttons) in enumerate(self._rows):
             if i < len(self._objects):

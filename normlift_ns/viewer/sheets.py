@@ -39,7 +39,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Found:
-    """Title of a figure."""
+    """Title and summary above a figure."""
 
     text: str
     """The prompt."""
@@ -71,41 +71,41 @@ class Found:
 
 def picture_of(
     sheet: Sheet,
-    found: Found,
+    header: Found,
     view: str,
-    photograph: UInt8[Tensor, "h w 3"] | None,
+    image: UInt8[Tensor, "h w 3"] | None,
     overlay: UInt8[Tensor, "h w 3"],
     selected: Bool[Tensor, "h w"],
 ) -> Image.Image:
     """Draw a figure of one view: the training image next to the overlay.
 
     Args:
-        found: title of the figure.
+        header: title and summary above the figure.
         view: name of the view.
-        photograph: training image; None: it is not available, and the figure shows the overlay alone.
+        image: training image; None: it is not available, and the figure shows the overlay alone.
         overlay: rendered overlay of the same view.
         selected: mask of the selected pixels, which are outlined.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
-    panels = [panel] if photograph is None else [Image.fromarray(photograph.cpu().numpy()).resize(panel.size), panel]
-    captions = ["answer"] if photograph is None else ["training image", "answer"]
-    summary = f"{100 * float(selected.float().mean()):.1f} % of this view, {found.summary}"
+    panels = [panel] if image is None else [Image.fromarray(image.cpu().numpy()).resize(panel.size), panel]
+    captions = ["answer"] if image is None else ["training image", "answer"]
+    summary = f"{100 * float(selected.float().mean()):.1f} % of this view, {header.summary}"
     if not bool(selected.any()):
-        summary = found.summary
-    return _page(sheet, [f"{found.title}   ·   {clipped(view, 40)}", summary], panels, captions, 2)
+        summary = header.summary
+    return _page(sheet, [f"{header.title}   ·   {clipped(view, 40)}", summary], panels, captions, 2)
 
 
-def contact_sheet(sheet: Sheet, found: Found, overlays: Sequence[tuple[str, Tensor, Tensor]]) -> Image.Image:
+def contact_sheet(sheet: Sheet, header: Found, overlays: Sequence[tuple[str, Tensor, Tensor]]) -> Image.Image:
     """Draw a figure of all views for one prompt.
 
     Args:
-        found: title of the figure.
+        header: title and summary above the figure.
         overlays: name, overlay [H, W, 3] and mask of selected pixels [H, W] of each view.
     """
     columns = len(overlays) if len(overlays) <= _MAX_SINGLE_ROW else math.ceil(math.sqrt(len(overlays)))
     width = min(_THUMBNAIL_WIDTH, _MAX_WIDTH // columns)
     panels = [_outlined(overlay, selected, width) for _, overlay, selected in overlays]
-    return _page(sheet, [found.title, found.summary], panels, [view for view, _, _ in overlays], columns)
+    return _page(sheet, [header.title, header.summary], panels, [view for view, _, _ in overlays], columns)
 
 
 def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
@@ -146,13 +146,13 @@ def _page(
     return page
 
 
-def _draw_color_bar(draw: ImageDraw.ImageDraw, page: Image.Image, sheet: Sheet, place: tuple[int, int, int]) -> None:
+def _draw_color_bar(draw: ImageDraw.ImageDraw, page: Image.Image, sheet: Sheet, position: tuple[int, int, int]) -> None:
     """Draw the color bar with the values at its ends and a mark at the threshold.
 
     Args:
-        place: x, y and width in pixels.
+        position: x, y and width in pixels.
     """
-    (x, y, width), typeface = place, font(_FONT_SIZE - 4)
+    (x, y, width), typeface = position, font(_FONT_SIZE - 4)
     (low, high), height = sheet.scale, _FONT_SIZE
     ramp = (colors_of(sheet.colormap).numpy() * 255).round().astype(np.uint8)[None]
     page.paste(Image.fromarray(ramp).resize((width, height)), (x, y))

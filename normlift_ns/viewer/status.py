@@ -18,11 +18,11 @@ def as_text(text: str) -> str:
     return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in visible(text, keep="\n"))
 
 
-def swatch(colour: Sequence[float]) -> str:
+def swatch(color: Sequence[float]) -> str:
     """Return a colored square as MDX.
 
     Args:
-        colour: RGB in 0..1.
+        color: RGB in 0..1.
     """
-    red, green, blue = (round(255 * x) for x in colour)
+    red, green, blue = (round(255 * x) for x in color)
     return f'<span style={{{{color: "rgb({red},{green},{blue})"}}}}>■</span>'
