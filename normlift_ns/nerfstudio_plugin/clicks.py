@@ -1,4 +1,4 @@
-"""Clicks on the scene in nerfstudio's viewer: one browser at a time waits for the next one."""
+"""Clicks on the scene in nerfstudio's viewer. At most one browser at a time waits for a click."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MODES = {"More like this": "like", "Select": "select", "Add": "add", "Drop": "ta
 
 
 class Clicks:
-    """Listener for clicks on the scene. At most one browser of a viewer waits for a click.
+    """Listener for clicks on the scene, in at most one browser of a viewer.
 
     Args:
         hit: called with the mode of the click, and with the origin and direction of its ray in scene units.

@@ -155,7 +155,7 @@ class Face(torch.nn.Module):
             redraw(self._viewer)
 
     def _select_output(self, display: Display, *, answered: bool) -> None:
-        """Switch the output to the overlay if the shown one is about to vanish, or is rgb and there is a new answer."""
+        """Switch to the overlay if the current output no longer exists, or if it is rgb and there is a new answer."""
         output = self._viewer.control_panel._output_render
         outdated = output.value.startswith("relevancy_") and output.value not in output_names(display.texts)
         if "overlay" in output.options and (outdated or (answered and output.value == "rgb")):

@@ -93,7 +93,7 @@ class Rest:
 
 
 def go_to(client: Any, target: FoundObject, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
-    """Move the camera of one browser in front of an object, from its current side unless something blocks the view."""
+    """Move the camera of one browser to face an object, from the current side unless something blocks the view."""
     camera = client.camera
     view = (np.asarray(camera.position) / UNITS, camera.up_direction, float(camera.fov))
     position = clear_viewpoint(target, scene, drawn, *view)

@@ -187,7 +187,7 @@ class Page:
 
     @property
     def behind(self) -> bool:
-        """Whether messages are waiting to be sent."""
+        """Whether messages wait until the page has received earlier ones."""
         return len(self._buffer.message_from_id) > 0
 
     def together(self) -> Any:

@@ -169,7 +169,7 @@ def mask_files(scene: Scene, folder: Path) -> list[Path]:
 def view_mask(
     scene: Scene, camera: Camera, selected: Bool[Tensor, " n"], *, settings: RasterSettings | None = None
 ) -> Bool[Tensor, "h w"]:
-    """Return the mask of pixels of which the selection contributes more than half."""
+    """Return the mask of pixels in which the selection makes up more than half of the opacity."""
     values = selected.to(scene.gaussians.means)[:, None]
     image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
     return pixel_relevancy(image, alpha)[:, :, 0] > 0.5
