@@ -1,1 +1,1 @@
-"""Method specifications of nerfstudio, which find the plugin by the entry points that name them."""
+"""nerfstudio method specifications, discovered through entry points."""

@@ -1,8 +1,8 @@
-"""`ns-train normlift-lerf-ovs`: scenes of the LERF-OVS benchmark, which are COLMAP folders with images/ and sparse/0.
+"""Method of `ns-train normlift-lerf-ovs`, for scenes of LERF-OVS: COLMAP folders with images/ and sparse/0.
 
-Its labelled frames are training views as well, so all images train; they have the size that the labels have. Features
-are those of LangSplat's preprocessing, in language_features/ of the scene; `--pipeline.source.features none` makes them
-from the photographs instead.
+All images are used for training, including the labeled frames, at the size of the labels. Features are read from
+language_features/ of the scene, as written by LangSplat's preprocessing. `--pipeline.source.features none` computes
+them from the images instead.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""`ns-train normlift`, and what makes ns-viewer, ns-render and ns-export accept runs of ns-normlift.
+"""Method of `ns-train normlift`; with it, ns-viewer, ns-render and ns-export also accept runs of ns-normlift.
 
-Every ns-* command imports this module while nerfstudio builds its list of methods, so it must import neither that list
-(nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils) nor anything slow or optional.
+Every ns-* command imports this module while nerfstudio builds its list of methods. It must therefore import neither
+that list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils) nor anything slow or optional.
 """
 
 from typing import Any
@@ -29,12 +29,12 @@ def trainer_config(
     image_scale: float = 1.0,
     **optimizers: Any,
 ) -> TrainerConfig:
-    """splatfacto's training with a lift at its end; the viewer listens on this machine only.
+    """Return splatfacto's trainer config with a lift at the end; the viewer listens on this machine only.
 
     Args:
-        source: what to see in the images; None: as ns-normlift.
-        image_scale: size of the images used, as a share of that on disk.
-        optimizers: in place of splatfacto's, by the name of the parameters.
+        source: options of the 2D features; None: the defaults of ns-normlift.
+        image_scale: size of the training images relative to the files.
+        optimizers: replacements of splatfacto's optimizers, by parameter name.
     """
     return TrainerConfig(
         method_name=method_name,
@@ -85,5 +85,5 @@ def _splatfacto_optimizers() -> dict[str, Any]:
 
 normlift_method = MethodSpecification(
     config=trainer_config("normlift", NerfstudioDataParserConfig(load_3D_points=True), NormLiftModelConfig()),
-    description="splatfacto, lifted at the end of its training: open-vocabulary semantics that can be asked.",
+    description="splatfacto with open-vocabulary semantics, lifted at the end of training.",
 )

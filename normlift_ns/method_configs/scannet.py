@@ -1,7 +1,7 @@
-"""`ns-train normlift-scannet`: one Gaussian per vertex of a ScanNet mesh, in its place and order, throughout.
+"""Method of `ns-train normlift-scannet`: one Gaussian per vertex of a ScanNet mesh, at its position and in its order.
 
-The benchmark compares labels vertex by vertex. So the seed points (`ply_file_path` of transforms.json: the vertices)
-are neither moved nor split nor culled, and the world is that of the data set.
+The benchmark compares labels vertex by vertex. Training therefore does not move, split or cull the seed points
+(`ply_file_path` of transforms.json: the vertices), and keeps the coordinates of the dataset.
 """
 
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig

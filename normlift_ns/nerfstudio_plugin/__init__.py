@@ -1,1 +1,1 @@
-"""All that knows nerfstudio: its runs, its model, its viewer."""
+"""Integration with nerfstudio: configs, model, pipeline and viewer panel."""

@@ -1,4 +1,4 @@
-"""Reads what is typed into the panel, with the encoder of the run."""
+"""Encoding of the prompts typed into the panel, with the text encoder of the run."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from normlift_ns.text_encoders import Texts, encoder_of
 
 
 class Asker:
-    """The encoder is loaded at its first text, and is kept."""
+    """Encoder of the panel's prompts. The text encoder is loaded at the first prompt and then kept."""
 
     def __init__(self) -> None:
         self.encoder: list[Texts] = []
-        """One, once it is loaded."""
+        """The text encoder as the only item once it is loaded; empty before."""
         self._lock = Lock()
 
     def pose(
@@ -33,37 +33,46 @@ class Asker:
         negatives: str,
         clicks: Mapping[str, Any],
         widgets: Widgets | None,
-        wanted: Callable[[], bool],
+        is_current: Callable[[], bool],
     ) -> tuple[tuple[Prompt, ...], Question] | None:
-        """The rows of a line of prompts, and their question; None where nobody waits for it any more.
+        """Encode a line of prompts and build its query.
 
+        Args:
+            folder: folder of the semantic field; None: no stored prompts and no text embedding cache.
+            line: prompts as typed.
+            negatives: negative prompts as typed.
+            clicks: directions of clicked Gaussians, by the names of their prompts.
+            widgets: where the rule, the minimum reliability and the choice of features are set; None: defaults.
+            is_current: returns False once the request is stale.
+        Returns:
+            The prompts and their query; None if the request is stale.
         Raises:
             ValueError, OSError: as `read_prompts` and `session.prompts.pose`.
         """
-        known: dict[str, Any] = dict(clicks)
-        with suppress(ValueError, OSError):  # a damaged file is told where it is read to be shown or replaced
-            known |= {prompt.text: prompt.vector for prompt in prompts_of(stored(folder))}
-        how: dict[str, Any] = {}
+        vectors: dict[str, Any] = dict(clicks)
+        with suppress(ValueError, OSError):  # a damaged file is reported when it is shown or replaced
+            vectors |= {prompt.text: prompt.vector for prompt in prompts_of(stored(folder))}
+        options: dict[str, Any] = {}
         if widgets is not None:
-            how = {
+            options = {
                 "rule": widgets.rule.value,
                 "min_reliability": widgets.reliability.value,
                 "refined": widgets.refined.value,
             }
 
-        def read(texts: Sequence[str]) -> Any:
+        def encode(texts: Sequence[str]) -> Any:
             if len(self.encoder) == 0:
                 cache = None if folder is None else texts_cache(folder.parent)
                 self.encoder.append(encoder_of(field, str(field.source.device), cache))
             return self.encoder[0].rows(texts)
 
-        with self._lock:  # it must not be loaded twice
-            if not wanted():
+        with self._lock:  # so that two threads do not both load the encoder
+            if not is_current():
                 return None
-            prompts = read_prompts(line, read, known)
-            return pose(field, prompts, read, negatives=split_prompts(negatives), **how)
+            prompts = read_prompts(line, encode, vectors)
+            return pose(field, prompts, encode, negatives=split_prompts(negatives), **options)
 
 
 def stored(folder: Path | None) -> Question | None:
-    """The question of a run; None: there is none."""
+    """Return the query stored in a run, or None if it stores none."""
     return None if folder is None else load_question(folder)

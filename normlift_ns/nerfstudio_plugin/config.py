@@ -15,23 +15,25 @@ from normlift_ns.scenes.nerfstudio.allowed import dump_config
 
 
 def read_config(path: Path) -> TrainerConfig:
-    """As `normlift_ns.scenes.nerfstudio.config.read_config`, in nerfstudio's classes.
+    """Read a config.yml into nerfstudio's classes.
 
     Raises:
-        FileNotFoundError, ValueError: as there.
+        FileNotFoundError, ValueError: as `normlift_ns.scenes.nerfstudio.config.read_config`.
     """
     return as_nerfstudios(plain.read_config(path))
 
 
 def as_nerfstudios(config: Any) -> TrainerConfig:
-    """A config that was read and checked here, in nerfstudio's classes."""
-    return yaml.load(dump_config(config), Loader=yaml.Loader)  # of our own text, which names allowed classes only
+    """Convert a config that normlift_ns has read and checked to nerfstudio's classes."""
+    # Loader is safe here: dump_config wrote the text, and it names allowed classes only
+    return yaml.load(dump_config(config), Loader=yaml.Loader)
 
 
 def rerooted(config: TrainerConfig, config_path: Path, data: Path | None = None) -> TrainerConfig:
-    """A copy of the config with absolute paths, which works from any directory, and without seed points.
+    """Return a copy of the config with absolute paths, valid from any directory, and without seed points.
 
-    Serves stock nerfstudio too: `eval_setup(path, update_config_callback=lambda config: rerooted(config, path))`.
+    It also works with stock nerfstudio:
+    `eval_setup(path, update_config_callback=lambda config: rerooted(config, path))`.
 
     Raises:
         FileNotFoundError: as `locate`.

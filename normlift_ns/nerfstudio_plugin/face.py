@@ -1,4 +1,4 @@
-"""The face of the panel: which state it shows, in the widgets and in the picture of nerfstudio's viewer."""
+"""View of the panel: shows a state in the widgets and in the image of nerfstudio's viewer."""
 
 from __future__ import annotations
 
@@ -26,43 +26,43 @@ from normlift_ns.viewer.adapter import pass_over_the_gone
 from normlift_ns.viewer.display import Display, make_display, output_names
 from normlift_ns.viewer.reasons import Reasons
 
-WAITING = "No semantics yet. They are lifted at the end of the training."
+WAITING = "No semantics yet. They are lifted at the end of training."
 
 
 def redraw(viewer: Any) -> None:
-    """Has every browser before nerfstudio's viewer draw its picture again.
+    """Render the image again in every browser that shows nerfstudio's viewer.
 
-    nerfstudio 1.1.5's own `Viewer._trigger_rerender` ends at the first browser that comes or goes at this moment, and
-    leaves the pictures of those after it as they were.
+    nerfstudio 1.1.5's own `Viewer._trigger_rerender` stops at the first browser that connects or disconnects at this
+    moment, and leaves outdated images in the browsers after it.
     """
     if not viewer.ready:
         return
     for number, client in viewer.viser_server.get_clients().items():
-        with suppress(KeyError):  # it is coming, and will draw anyway, or going
+        with suppress(KeyError):  # connecting, and about to render anyway, or disconnecting
             viewer.render_statemachines[number].action(RenderAction("move", viewer.get_camera_state(client)))
 
 
 class _Control(ViewerControl):
-    """By which nerfstudio tells the panel that there is a viewer."""
+    """Element through which nerfstudio passes its viewer to the panel."""
 
-    def __init__(self, face: Face) -> None:
-        self._face = [face]  # in a list: nerfstudio looks for widgets in whatever it can walk to
+    def __init__(self, panel: Face) -> None:
+        self._panel = [panel]  # in a list: nerfstudio searches attributes for widgets
 
     def _setup(self, viewer: Any) -> None:
         super()._setup(viewer)
-        self._face[0].install(viewer)
+        self._panel[0].install(viewer)
 
 
 class Face(torch.nn.Module):
-    """What is shown. A module, because nerfstudio looks for a `ViewerControl` in modules only.
+    """Widgets and display of the panel. A module, because nerfstudio searches only modules for a `ViewerControl`.
 
     Args:
-        armed: whether a browser waits for a click.
+        armed: returns whether a browser waits for a click.
     """
 
     def __init__(self, host: Host, armed: Callable[[], bool]) -> None:
         super().__init__()
-        self._host = [host]  # in a list: a module that holds its parent
+        self._host = [host]  # in a list: the model is the parent of this module
         self._armed = armed
         self._viewer: Any = None
         self._widgets: Widgets | None = None
@@ -71,17 +71,17 @@ class Face(torch.nn.Module):
         self._colormap: Colormap = COLORMAPS[0]
         self._turns, self._lock = Turns(), RLock()
         self._reasons: Reasons | None = None
-        self._rest = Rest(self._list, lambda error: self.tell(explain(error)[0]))
+        self._details = Rest(self._show_details, lambda error: self.tell(explain(error)[0]))
         self.control = _Control(self)
 
     @property
     def state(self) -> State | None:
-        """What is shown now; None: there is no field."""
+        """The state shown now; None without a field."""
         return None if self._history is None else self._history.now
 
     @property
     def answer(self) -> Answer | None:
-        """To the question of the state."""
+        """The answer to the query of the state; None without one."""
         return None if self.state is None else self.state.answer
 
     @property
@@ -90,95 +90,103 @@ class Face(torch.nn.Module):
         return self._widgets is not None
 
     def act(self, name: str, value: Any = None, client: Any = None) -> None:
-        """What a widget does.
+        """Carry out the action of a widget.
 
         Args:
+            name: name of the widget or caption of the button.
             client: the browser in which it was pressed.
         """
         raise NotImplementedError
 
     def forget(self, client: Any) -> None:
-        """A browser is gone."""
+        """Handle a disconnected browser."""
         raise NotImplementedError
 
     def install(self, viewer: Any) -> None:
-        """Makes the tab in a viewer."""
+        """Add the tab to a viewer."""
         self._viewer = viewer
         self._widgets = Widgets(viewer.viser_server, self.act, self._lock)
-        viewer.viser_server.on_client_disconnect(self._gone)
+        viewer.viser_server.on_client_disconnect(self._on_disconnect)
         pass_over_the_gone(viewer.viser_server)
         self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives
         if self.state is not None:
-            self._rest.follow(self.state)
-        self._follow()
+            self._details.follow(self.state)
+        self._update_widgets()
 
-    def _gone(self, client: Any) -> None:
-        """viser tells it under a lock of its own, which a thread that holds ours may wait for."""
+    def _on_disconnect(self, client: Any) -> None:
+        """Handle a disconnect in another thread.
+
+        viser calls this under its own lock, for which a thread that holds the panel's lock may be waiting.
+        """
         Thread(target=self.forget, args=(client,), daemon=True).start()
 
     def tell(self, message: str) -> None:
-        """Shows a message, and below it what is selected."""
+        """Show a message above the size of the selection."""
         with self._lock:
             self._message = message
-            self._follow()
+            self._update_widgets()
 
     def _show(self, history: History[State], *, answered: bool = False) -> None:
-        """Shows a state of a history. The display is complete before the model gets it."""
-        now = history.now
-        drawn = None if now.hidden is None else now.drawn
+        """Show the current state of a history. The display is complete before the model gets it.
+
+        Args:
+            answered: whether the selection is new, so that the overlay replaces an rgb output.
+        """
+        state = history.now
+        drawn = None if state.hidden is None else state.drawn
         display = make_display(
-            now.space.field,
-            now.answer,
-            shown=now.shown,
+            state.space.field,
+            state.answer,
+            shown=state.shown,
             colormap=self._colormap,
-            chosen=now.selection,
+            chosen=state.selection,
             drawn=drawn,
-            by_hand=not now.from_answer,
+            by_hand=not state.from_answer,
         )
         self._history = history
         if self._reasons is not None:
-            self._reasons.follow(now)
+            self._reasons.follow(state)
         if self._viewer is not None:
-            self._keep_output(display, answered=answered)
-            self._rest.follow(now)
+            self._select_output(display, answered=answered)
+            self._details.follow(state)
         self._host[0].show(display)
-        self._follow()
+        self._update_widgets()
         if self._viewer is not None:
             redraw(self._viewer)
 
-    def _keep_output(self, display: Display, *, answered: bool) -> None:
-        """Where rgb, or an output that there will not be any more, is shown, the overlay takes its place."""
+    def _select_output(self, display: Display, *, answered: bool) -> None:
+        """Switch to the overlay if the current output no longer exists, or if it is rgb and there is a new answer."""
         output = self._viewer.control_panel._output_render
-        gone = output.value.startswith("relevancy_") and output.value not in output_names(display.texts)
-        if "overlay" in output.options and (gone or (answered and output.value == "rgb")):
+        outdated = output.value.startswith("relevancy_") and output.value not in output_names(display.texts)
+        if "overlay" in output.options and (outdated or (answered and output.value == "rgb")):
             output.value = "overlay"
 
-    def _write(self, line: str) -> None:
-        """Puts another line into the box of prompts; otherwise it belongs to the person who types."""
+    def _set_prompts(self, line: str) -> None:
+        """Replace the text in the prompt box, which otherwise only the user edits."""
         self._line = line
         if self._widgets is not None:
             self._widgets.prompts.value = line
 
-    def _follow(self) -> None:
-        """Shows the state in the widgets."""
+    def _update_widgets(self) -> None:
+        """Show the state in the widgets."""
         widgets, state = self._widgets, self.state
         if widgets is None:
             return
-        why = "" if self._reasons is None else self._reasons.busy
+        explaining = "" if self._reasons is None else self._reasons.busy
         widgets.ask.disabled = self._turns.busy != "" or state is None
-        busy = self._turns.busy or why
+        busy = self._turns.busy or explaining
         widgets.cancel.visible = busy != "" or self._armed()
-        widgets.explain("" if self._reasons is None else self._reasons.content, busy=why != "")
+        widgets.explain("" if self._reasons is None else self._reasons.content, busy=explaining != "")
         if state is None:
             widgets.status.content, widgets.found.content, widgets.histograms.content = WAITING, "", ""
             return
         widgets.follow(state)
-        faint = drawable(self._host[0].splats()[0]["opacities"])
-        widgets.status.content = said(state, self._message, busy, faint)
+        visible = drawable(self._host[0].splats()[0]["opacities"])
+        widgets.status.content = said(state, self._message, busy, visible)
         widgets.found.content = found_table(state)
 
-    def _list(self, wanted: Callable[[], bool], found: Found, histograms: str) -> None:
+    def _show_details(self, is_current: Callable[[], bool], objects: Found, histograms: str) -> None:
         with self._lock:
-            if self._widgets is not None and wanted():
-                self._widgets.rows.show(found)
+            if self._widgets is not None and is_current():
+                self._widgets.rows.show(objects)
                 self._widgets.histograms.content = histograms

@@ -1,4 +1,4 @@
-"""What an answer rests on, in the panel: found objects, histograms, and the photographs that voted."""
+"""Details of an answer in the panel: objects, histograms, and the training images behind it."""
 
 from __future__ import annotations
 
@@ -29,73 +29,74 @@ from normlift_ns.viewer.drawing import verdicts_mdx
 from normlift_ns.viewer.reasons import Reasons
 from normlift_ns.viewer.rows import MOST_OBJECTS
 
-_CALM = 0.1
-"""Seconds without a change before objects are looked for."""
+_DELAY = 0.1
+"""Seconds without a change before the details are computed."""
 
 
 def reasons_of(folder: Path | None, field: SemanticField) -> Reasons:
-    """Reasons of a lifted run, which is opened a second time when they are first wanted: without nerfstudio, and with
-    its photographs.
+    """Return the explanations of a lifted run.
+
+    The run is opened a second time at the first explanation, without nerfstudio and with its images.
 
     Args:
-        folder: of the field; None: there is none yet.
+        folder: folder of the semantic field; None: the run is not stored yet.
     """
 
     @cache
     def votes() -> Votes:
         if folder is None:
-            raise InputError("The run is not stored yet; nobody knows which photographs voted.")
+            raise InputError("The run is not stored yet, so the images behind the selection are unknown.")
         run = folder.parent
-        scene = open_saved_splat(run) if is_saved_splat(run) else load_scene(run / "config.yml", by_nerfstudio=_refuse)
+        scene = open_saved_splat(run) if is_saved_splat(run) else load_scene(run / "config.yml", by_nerfstudio=_no_aria)
         return Votes(scene, field.to("cpu"), cache_folder(run))
 
     return Reasons(votes)
 
 
-def _refuse(*_: Any) -> Any:
+def _no_aria(*_: Any) -> Any:
     raise InputError(
-        "The photographs of Aria's cameras (FISHEYE624) cannot be shown here; ns-normlift-view and ns-normlift-query "
-        "--why show them."
+        "Images of Aria cameras (FISHEYE624) cannot be shown here. Use ns-normlift-view or ns-normlift-query --why."
     )
 
 
 class Rest:
-    """Looks for what takes longer than a frame, once nothing has changed for a moment; late results are dropped.
+    """Background computation of objects and histograms, after a moment without changes. Stale results are dropped.
 
     Args:
-        show: called with the objects and the histograms of a state, in a thread of its own.
-        failed: called with whatever was raised.
+        show: called in a separate thread with a function that returns False for stale results, the objects and the
+            histograms.
+        failed: called with any exception raised.
     """
 
     def __init__(self, show: Callable[[Callable[[], bool], Found, str], None], failed: Callable[[Exception], None]):
         self._show, self._failed, self._turns = show, failed, Turns()
 
     def follow(self, state: State) -> None:
-        """A state is shown."""
-        turn = self._turns.start("Looking for objects.")
-        Thread(target=self._look, args=(turn, state), daemon=True).start()
+        """Compute the details of the state that is shown now."""
+        token = self._turns.start("Looking for objects.")
+        Thread(target=self._compute, args=(token, state), daemon=True).start()
 
     def cancel(self) -> None:
-        """Nothing is wanted any more."""
+        """Drop the results of the running computation."""
         self._turns.cancel()
 
-    def _look(self, turn: Turn, state: State) -> None:
-        time.sleep(_CALM)
-        if not self._turns.wanted(turn):
+    def _compute(self, token: Turn, state: State) -> None:
+        time.sleep(_DELAY)
+        if not self._turns.wanted(token):
             return
         try:
-            found, histograms = found_objects(state, most=MOST_OBJECTS), verdicts_mdx(state)
-            self._show(lambda: self._turns.finish(turn), found, histograms)
-        except Exception as error:  # whatever it is: nothing may stop the viewer
-            if self._turns.finish(turn):
+            objects, histograms = found_objects(state, most=MOST_OBJECTS), verdicts_mdx(state)
+            self._show(lambda: self._turns.finish(token), objects, histograms)
+        except Exception as error:  # no error may stop the viewer
+            if self._turns.finish(token):
                 self._failed(error)
 
 
-def go_to(client: Any, found: FoundObject, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
-    """Moves the camera of one browser before an object, from the side where it is if nothing stands in the way."""
+def go_to(client: Any, target: FoundObject, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
+    """Move the camera of one browser to face an object, from the current side unless something blocks the view."""
     camera = client.camera
-    eye = (np.asarray(camera.position) / UNITS, camera.up_direction, float(camera.fov))
-    place = clear_viewpoint(found, scene, drawn, *eye)
+    view = (np.asarray(camera.position) / UNITS, camera.up_direction, float(camera.fov))
+    position = clear_viewpoint(target, scene, drawn, *view)
     with client.atomic():
-        camera.position = np.array(place) * UNITS
-        camera.look_at = np.array(found.centre) * UNITS
+        camera.position = np.array(position) * UNITS
+        camera.look_at = np.array(target.centre) * UNITS

@@ -1,4 +1,4 @@
-"""What the panel hands out: the selection as a file, and the prompts of a run."""
+"""Results that the panel exports: the selection as a file, and the prompts stored in a run."""
 
 from __future__ import annotations
 
@@ -23,40 +23,42 @@ from normlift_ns.viewer.display import Display
 
 
 class Host(Protocol):
-    """What the panel needs of the model."""
+    """Interface of the model that the panel uses."""
 
     def show(self, display: Display | None) -> None:
-        """Replaces what is drawn besides the colours."""
+        """Replace what is rendered in addition to the colors."""
         ...
 
     def in_sight(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """Weights of the Gaussians on a ray."""
+        """Return the weights of the Gaussians on a ray."""
         ...
 
     def scene(self) -> GaussianScene:
-        """All Gaussians."""
+        """Return all Gaussians."""
         ...
 
     def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """For `write_splats`: parameters, whether colours are spherical harmonics, and how they were rasterized."""
+        """Return what `write_splats` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
         ...
 
 
-def selection_file(host: Host, state: State, mask: Bool[Tensor, " n"], called: str) -> tuple[str, bytes, int]:
-    """Name and content of a PLY file of some Gaussians, and how many are in it.
+def selection_file(host: Host, state: State, mask: Bool[Tensor, " n"], stem: str) -> tuple[str, bytes, int]:
+    """Export Gaussians as a PLY file.
 
     Args:
         mask: the selection, or an object in it.
-        called: what the file is called, without suffix.
+        stem: name of the file without suffix.
+    Returns:
+        Name and content of the file, and its number of Gaussians.
     Raises:
-        ValueError: nothing is selected, or nothing of it is ever drawn.
+        ValueError: nothing is selected, or no selected Gaussian is ever drawn.
     """
     if not bool(mask.any()):
         raise InputError("Nothing is selected; there is nothing to download.")
     parameters, harmonics, mode = host.splats()
     if not bool((mask & drawable(parameters["opacities"])).any()):
-        raise InputError("Nothing that is selected is ever drawn (opacity below 1/255); there is nothing to download.")
-    name = f"{file_name(called)}.ply"
+        raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
+    name = f"{file_name(stem)}.ply"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         rows = write_splats(
@@ -72,12 +74,15 @@ def selection_file(host: Host, state: State, mask: Bool[Tensor, " n"], called: s
 
 
 def save_prompts(folder: Path | None, state: State, *, replaces: bool) -> int:
-    """Stores the prompts in the folder of the field beside those that it has; returns how many it has now.
+    """Store the prompts of a state in a run, in addition to the prompts stored there.
 
     Args:
-        replaces: instead of those that it has.
+        folder: folder of the semantic field; None: the run is not stored yet.
+        replaces: replace the stored prompts.
+    Returns:
+        Number of prompts that the run stores now.
     Raises:
-        ValueError: there are none; those that it has go by another rule.
+        ValueError: there are no prompts to store, or the stored prompts use another rule.
     """
     if state.question is None or folder is None:
         raise InputError("No query yet; there is nothing to save.")

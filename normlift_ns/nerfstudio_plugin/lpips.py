@@ -1,4 +1,4 @@
-"""LPIPS that is built when it is first asked for."""
+"""LPIPS metric that is built at its first use."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from torch import Tensor
 
 
 class LazyLpips(torch.nn.Module):
-    """Stands in for torchmetrics' LearnedPerceptualImagePatchSimilarity, whose construction downloads weights.
+    """Stand-in for torchmetrics' LearnedPerceptualImagePatchSimilarity, whose constructor downloads weights.
 
     Args:
-        options: those of the metric.
+        options: keyword arguments of the metric.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__()
         self.options = options
         self.available = True
-        """False once its weights could not be had."""
-        self._metric: list[torch.nn.Module] = []  # in a list: the network stays out of checkpoints
+        """False once loading the weights has failed."""
+        self._metric: list[torch.nn.Module] = []  # in a list, which keeps the network out of checkpoints
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """LPIPS of images [B, 3, H, W] in 0..1; NaN, and one warning, where its weights cannot be had."""
+        """Return the LPIPS of images [B, 3, H, W] in 0..1; NaN, with a single warning, if the weights are missing."""
         if self.available and not self._metric:
             self._build()
         if not self.available:
@@ -38,4 +38,4 @@ class LazyLpips(torch.nn.Module):
             self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
         except (ImportError, OSError) as error:
             self.available = False
-            warnings.warn(f"LPIPS is left out: its weights cannot be downloaded ({error})", stacklevel=2)
+            warnings.warn(f"LPIPS is skipped: its weights cannot be downloaded ({error})", stacklevel=2)

@@ -1,4 +1,4 @@
-"""splatfacto's model with a semantic field attached: what ns-viewer, ns-render, ns-eval and ns-export load."""
+"""splatfacto's model with a semantic field, as loaded by ns-viewer, ns-render, ns-eval and ns-export."""
 
 from __future__ import annotations
 
@@ -34,38 +34,40 @@ from normlift_ns.scenes.nerfstudio.appearance import shading_degree
 from normlift_ns.scenes.photographs import to_camera
 from normlift_ns.viewer.display import Display, draw
 
-_WIDEST = 1e-3
-"""Least focal length of a picture that is drawn, and its inverse the greatest, in larger sides of the picture."""
+_MIN_FOCAL = 1e-3
+"""Smallest focal length that is rendered, as a fraction of the image's longer side; its inverse is the largest."""
 
 
 @dataclass
 class NormLiftModelConfig(SplatfactoModelConfig):
-    """splatfacto with the semantics that ns-normlift lifted onto its Gaussians."""
+    """splatfacto with the semantics that ns-normlift has lifted onto its Gaussians."""
 
     _target: type = field(default_factory=lambda: NormLiftModel)
     semantics: Path | None = None
-    """Folder of the semantic field (normlift/ of a lifted run), relative to config.yml; none: plain splatfacto."""
+    """Folder of the semantic field (normlift/ in a lifted run), relative to config.yml. None: plain splatfacto."""
 
     @staticmethod
     def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
-        """The same model with a field: every field of the config is taken over."""
+        """Return the same config with a semantic field; every other value is copied."""
         values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
         return NormLiftModelConfig(**values, semantics=semantics)
 
 
 class NormLiftModel(SplatfactoModel):
-    """splatfacto that loads without LPIPS weights and without CUDA, and renders scalars of its Gaussians.
+    """splatfacto model that loads without LPIPS weights and without CUDA, and renders scalars of its Gaussians.
 
-    On CUDA all but the scalars is stock splatfacto. On the CPU, where splatfacto cannot render, normlift_ns does.
+    On CUDA, everything except the scalars is stock splatfacto. On the CPU, where splatfacto cannot render,
+    normlift_ns renders instead.
     """
 
     config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
 
     def populate_modules(self) -> None:
-        """As splatfacto's, without what it needs CUDA or a download for; with the panel of the viewer."""
-        if not torch.cuda.is_available():  # where splatfacto cannot move the colours of seed points to, nor train
-            few = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)  # without, it finds the neighbours of 50,000
-            self.seed_points = None if self.config.semantics is None else few  # until the checkpoint brings its own
+        """Set up splatfacto's modules without CUDA and without downloads, and add the panel of the viewer."""
+        if not torch.cuda.is_available():  # splatfacto moves the colors of seed points to CUDA, and trains there only
+            # four seed points: with none, splatfacto searches the neighbors of 50,000 random points
+            seeds = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)
+            self.seed_points = None if self.config.semantics is None else seeds  # until the checkpoint is loaded
         with _lazy_lpips():
             super().populate_modules()
         self._field: SemanticField | None = None
@@ -74,19 +76,19 @@ class NormLiftModel(SplatfactoModel):
 
     @property
     def on_cpu(self) -> bool:
-        """True where normlift_ns renders; stock splatfacto needs CUDA."""
+        """Whether normlift_ns renders; stock splatfacto needs CUDA."""
         return self.device.type == "cpu"
 
     @property
     def field(self) -> SemanticField | None:
-        """The attached field, on the model's device."""
+        """The attached semantic field, on the model's device; None if no field is attached."""
         return self._field
 
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
-        """Loads a splatfacto or normlift checkpoint, then the field that the config names.
+        """Load a splatfacto or normlift checkpoint, then the field that the config names.
 
         Raises:
-            FileNotFoundError, ValueError: no field there, a damaged one, or one of other Gaussians.
+            FileNotFoundError, ValueError: the field is missing, damaged, or belongs to other Gaussians.
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
@@ -97,28 +99,28 @@ class NormLiftModel(SplatfactoModel):
             compile_renderer()
 
     def attach(self, semantic_field: SemanticField, question: Question | None = None) -> None:
-        """Renders a field and the answer to a question from now on, and lets the panel ask it."""
+        """Render a field and the answer to a query from now on, and enable the panel for the field."""
         self._field = semantic_field.to(self.device)
         self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
 
     def detach(self) -> None:
-        """Forgets the field, because the Gaussians are about to change."""
+        """Drop the field, because the Gaussians are about to change."""
         self.config.semantics = self._field = self._display = None
         self.normlift.close()
 
     def show(self, display: Display | None) -> None:
-        """Replaces what is drawn besides the colours. Safe to call while another thread renders."""
+        """Replace what is rendered in addition to the colors. Safe to call while another thread renders."""
         self._display = display
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
+        """Return the stock outputs (rgb, depth, accumulation, background), and with a field those of `display.draw`.
 
         Args:
-            camera: one camera. nerfstudio's viewer can ask for impossible ones; a possible one is drawn instead.
-            obb_box: Gaussians outside are not drawn.
+            camera: one camera. For an invalid camera from nerfstudio's viewer, a valid one near it is rendered.
+            obb_box: crop box; Gaussians outside are not drawn.
         """
-        display, (camera, view) = self._display, _drawable(camera.to(self.device))
+        display, (camera, view) = self._display, _valid_camera(camera.to(self.device))
         rows = self.rows_in(obb_box, display)
         values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
         if self.on_cpu:
@@ -126,7 +128,7 @@ class NormLiftModel(SplatfactoModel):
                 outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
             outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
-            # where all is cropped away, splatfacto's outputs are on the CPU and its background is [3]
+            # if nothing is left after cropping, splatfacto's outputs are on the CPU and its background is [3]
             outputs = {name: value.to(self.device) for name, value in outputs.items()}
             outputs["background"] = outputs["background"].expand(view.height, view.width, 3)
             scalars = self._composited(view, values, rows)
@@ -138,7 +140,7 @@ class NormLiftModel(SplatfactoModel):
             return {**outputs, **draw(display, outputs["rgb"], scalars, alpha, by_text=self.normlift.viewed)}
 
     def rows_in(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
-        """The Gaussians that are drawn: inside the box, and not hidden; None: all."""
+        """Return the mask of the Gaussians that are drawn: in the box and not hidden. None: all."""
         drawn = None if display is None else display.drawn
         if obb_box is None:
             return drawn
@@ -146,17 +148,17 @@ class NormLiftModel(SplatfactoModel):
         return inside if drawn is None else inside & drawn
 
     def in_sight(self, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]) -> Float[Tensor, " n"]:
-        """`ray_weights` of the Gaussians that were drawn last."""
+        """Return the `ray_weights` of the Gaussians drawn in the last render, and 0 for all others."""
         rows = self.rows_in(self.crop_box, self._display)
         weights = ray_weights(self._scene(rows), origin, direction)
         return weights if rows is None else weights.new_zeros(self.num_points).masked_scatter(rows, weights)
 
     def scene(self) -> GaussianScene:
-        """All Gaussians."""
+        """Return all Gaussians."""
         return self._scene(None)
 
     def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """For `write_splats`: parameters, whether colours are spherical harmonics, and how they were rasterized."""
+        """Return what `write_splats` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
         return dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:
@@ -164,15 +166,15 @@ class NormLiftModel(SplatfactoModel):
         return GaussianScene(*(part.detach() if rows is None else part.detach()[rows] for part in parts))
 
     def _render_on_cpu(self, view: Camera, values: Tensor, rows: Tensor | None) -> tuple[dict[str, Tensor], Tensor]:
-        """As `SplatfactoModel.get_outputs` outside training, with the values [N, C] in the same pass."""
+        """Render the outputs of `SplatfactoModel.get_outputs` outside training, and the values [N, C], in one pass."""
         scene = self._scene(rows)
         coefficients = torch.cat([self.features_dc[:, None], self.features_rest], dim=1).detach()
         if rows is not None:
             coefficients, values = coefficients[rows], values[rows]
         rgb = view_colors(scene.means, coefficients, view, shading_degree(self.config, self.step))
         depth = scene.means @ view.world_to_camera[2, :3, None] + view.world_to_camera[2, 3]
-        how = {"rasterize_mode": self.config.rasterize_mode, "settings": self._settings}
-        image, alpha = render(scene, view, torch.cat([rgb, depth, values], dim=1), **how)
+        options = {"rasterize_mode": self.config.rasterize_mode, "settings": self._settings}
+        image, alpha = render(scene, view, torch.cat([rgb, depth, values], dim=1), **options)
         alpha = alpha[:, :, None]
         background = self._get_background_color()
         expected_depth = image[:, :, 3:4] / alpha.clamp(min=1e-10)
@@ -185,19 +187,19 @@ class NormLiftModel(SplatfactoModel):
         return outputs, image[:, :, 4:]
 
     def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
-        """sum_j A_ij value_j [H, W, C], by the rules of the lift."""
-        drawn, mode = values if rows is None else values[rows], self.config.rasterize_mode
-        return render(self._scene(rows), view, drawn, rasterize_mode=mode, settings=self._settings)[0]
+        """Composite values: sum_j A_ij value_j [H, W, C], with the rasterizer settings of the lift."""
+        values, mode = values if rows is None else values[rows], self.config.rasterize_mode
+        return render(self._scene(rows), view, values, rasterize_mode=mode, settings=self._settings)[0]
 
     @property
     def _settings(self) -> RasterSettings:
-        """Constants of the rasterizer, those of the lift."""
+        """Rasterizer settings of the lift."""
         return RasterSettings.recorded({} if self._field is None else self._field.manifest)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Stock metrics; without LPIPS where its weights cannot be had."""
+        """Return the stock metrics and images, without LPIPS if its weights are not available."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         if not self.lpips.available:
             metrics = {name: value for name, value in metrics.items() if "lpips" not in name}
@@ -205,21 +207,25 @@ class NormLiftModel(SplatfactoModel):
 
 
 def own_semantics(semantics: Path) -> Path:
-    """The semantic field beside the config.yml that nerfstudio's `eval_setup` reads, or where the config says.
+    """Return the folder of the semantic field next to the config.yml that nerfstudio's `eval_setup` reads.
 
-    A run that was copied says what the original said. nerfstudio does not tell a model where its config is.
+    The config of a copied run still names the folder of the original run, and nerfstudio does not tell a model where
+    its config is. The path of the config is therefore read from the call stack.
+
+    Args:
+        semantics: the folder that the config names; returned if there is no folder next to config.yml.
     """
     frame = inspect.currentframe()
     while frame is not None:
         if frame.f_code.co_name == "eval_setup" and "config_path" in frame.f_locals:
-            beside = Path(frame.f_locals["config_path"]).absolute().parent / FIELD_FOLDER
-            return beside if beside.is_dir() else semantics
+            folder = Path(frame.f_locals["config_path"]).absolute().parent / FIELD_FOLDER
+            return folder if folder.is_dir() else semantics
         frame = frame.f_back
     return semantics
 
 
 class _Rows(NamedTuple):
-    """Some Gaussians, where splatfacto expects a box that tells which points are within."""
+    """Mask of Gaussians with the interface of the crop box that splatfacto expects."""
 
     mask: Bool[Tensor, " n"]
 
@@ -228,7 +234,7 @@ class _Rows(NamedTuple):
 
 
 def compile_renderer() -> None:
-    """Compiles the CPU rasterizer now: the viewer renders under a tracer, which would slow the compiler down."""
+    """Compile the CPU rasterizer now; later, the viewer renders under a tracer that would slow the compiler down."""
     scene = GaussianScene(torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1))
     pose = torch.eye(4)
     pose[2, 3] = 3
@@ -241,9 +247,11 @@ def _opencv(camera: Cameras) -> Camera:
     return to_camera(pose, intrinsics, int(camera.width.item()), int(camera.height.item()))
 
 
-def _drawable(camera: Cameras) -> tuple[Cameras, Camera]:
-    """The camera, or one near it where there is none such: nerfstudio's viewer takes any number for a resolution and a
-    field of view, and what it makes of 0 or of 180 degrees and more would end the thread that draws.
+def _valid_camera(camera: Cameras) -> tuple[Cameras, Camera]:
+    """Return the camera if it is valid, else a valid camera near it.
+
+    nerfstudio's viewer accepts any number as resolution and field of view. The camera that it makes of a resolution
+    of 0, or of 180 degrees and more, would end the thread that renders.
     """
     with suppress(InputError):
         return camera, _opencv(camera)
@@ -253,7 +261,7 @@ def _drawable(camera: Cameras) -> tuple[Cameras, Camera]:
     size, pose = max(width, height), camera.camera_to_worlds.reshape(3, 4)
     if not bool(pose.isfinite().all()):
         pose = torch.eye(4, device=pose.device)[:3]
-    low, high = size * _WIDEST, size / _WIDEST
+    low, high = size * _MIN_FOCAL, size / _MIN_FOCAL
     focal = torch.stack([camera.fx, camera.fy]).nan_to_num(size, posinf=high, neginf=low).clamp(low, high)
     fx, fy = focal.reshape(2, 1, 1)
     near = Cameras(pose[None], fx=fx, fy=fy, cx=width / 2, cy=height / 2, width=width, height=height)
@@ -263,9 +271,9 @@ def _drawable(camera: Cameras) -> tuple[Cameras, Camera]:
 
 @contextmanager
 def untraced() -> Iterator[None]:
-    """Without the tracer by which nerfstudio's viewer interrupts a picture at any line of Python.
+    """Suspend the tracer with which nerfstudio's viewer interrupts a render at any line of Python.
 
-    An exception from it inside Numba's dispatcher, or in the middle of an import, ends the thread that draws.
+    If the tracer raises inside Numba's dispatcher, or in the middle of an import, the thread that renders ends.
     """
     tracer = sys.gettrace()
     sys.settrace(None)
@@ -277,7 +285,7 @@ def untraced() -> Iterator[None]:
 
 @contextmanager
 def _lazy_lpips() -> Iterator[None]:
-    """splatfacto builds LPIPS, which downloads AlexNet, before anything else; here it gets `LazyLpips` in its place."""
+    """Replace LPIPS by `LazyLpips` while splatfacto builds its modules; the stock metric downloads AlexNet."""
     from torchmetrics.image import lpip  # noqa: PLC0415 (import-light: this module is loaded by every ns-* command)
 
     stock = lpip.LearnedPerceptualImagePatchSimilarity

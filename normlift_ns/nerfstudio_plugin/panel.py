@@ -1,7 +1,7 @@
-"""The panel in nerfstudio's viewer: what its widgets do to a history of states.
+"""Controller of the panel in nerfstudio's viewer: applies the actions of the widgets to a history of states.
 
-All browsers share one panel, as they share nerfstudio's. A state is never changed, and neither is the `Display` that
-the model gets of it, so that pictures are rendered in other threads without waiting for this one.
+All browsers share one panel, as they share nerfstudio's own. States are immutable, and so is the `Display` of a state
+that the model gets. Other threads can therefore render images without waiting for this one.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from normlift_ns.text_encoders import default_rule
 from normlift_ns.viewer.reasons import Reasons
 from normlift_ns.viewer.rows import OBJECT_DEEDS
 
-_READING = "Reading the prompts. The first time the text encoder is loaded, which takes a while."
-_DEEDS = {
+_READING = "Reading the prompts. The first query also loads the text encoder, which takes a while."
+_ACTIONS = {
     "Hide": actions.hide,
     "Only": actions.only,
     "All": actions.show_all,
@@ -48,30 +48,30 @@ _SLIDERS = {"Threshold": actions.threshold, "Minimum reliability": actions.min_r
 
 
 class Panel(Face):
-    """What is asked and shown."""
+    """The panel with its queries, clicks and history."""
 
     def __init__(self, host: Host) -> None:
         super().__init__(host, lambda: self._clicks.armed)
-        self._asker, self._clicks = Asker(), Clicks(self._hit)
+        self._asker, self._clicks = Asker(), Clicks(self._on_click)
         self._folder: Path | None = None
 
     def open(
         self, field: SemanticField, means: Tensor, folder: Path | None = None, question: Question | None = None
     ) -> None:
-        """Lets the panel be used, once there is a field, and shows the answer to a question.
+        """Enable the panel for a field, and show the answer to a query.
 
         Args:
-            folder: of the field; None: nothing can be saved.
+            folder: folder of the field; None: prompts cannot be saved.
         """
         with self._lock:
             self._folder, state = folder, State(Space(field, means))
             if question is None:
-                with suppress(ValueError, OSError):  # a file of text vectors that is gone is told when it is needed
+                with suppress(ValueError, OSError):  # a missing file of text embeddings is reported when it is needed
                     self._negatives = join_prompts(default_rule(field).negatives)
             else:
                 state = actions.ask(state, prompts_of(question), question)
                 self._negatives = join_prompts(question.negatives)
-                self._write(join_prompts(question.texts))
+                self._set_prompts(join_prompts(question.texts))
             self._clicks.known, self._message = {}, ""
             self._reasons = reasons_of(folder, field)
             if self._widgets is not None:
@@ -79,17 +79,18 @@ class Panel(Face):
             self._show(History.of(state, lean=State.lean))
 
     def close(self) -> None:
-        """Forgets the field, because the Gaussians are about to change."""
+        """Drop the field, because the Gaussians are about to change."""
         with self._lock:
             self._cancel()
-            self._rest.cancel()
+            self._details.cancel()
             self._history = self._reasons = None
-            self._follow()
+            self._update_widgets()
 
     def act(self, name: str, value: Any = None, client: Any = None) -> None:
-        """What a widget does; whatever goes wrong is told in the panel.
+        """Carry out the action of a widget; the panel shows any error.
 
         Args:
+            name: name of the widget or caption of the button.
             client: the browser in which it was pressed.
         """
         try:
@@ -98,135 +99,136 @@ class Panel(Face):
             if name == "Ask":
                 self._ask()
             elif name == "Select likely floaters":
-                self._work("Looking for floaters.", self._select_floaters)
+                self._run("Looking for floaters.", self._select_floaters)
             elif name == "Why?":
                 self._explain()
             else:
                 with self._lock:
-                    self._do(name, value, client)
-        except Exception as error:  # whatever it is: nothing may stop the viewer
+                    self._act_quickly(name, value, client)
+        except Exception as error:  # no error may stop the viewer
             self.tell(explain(error)[0])
 
-    def _do(self, name: str, value: Any, client: Any) -> None:
-        """All that takes no time."""
+    def _act_quickly(self, name: str, value: Any, client: Any) -> None:
+        """Carry out an action that takes no noticeable time."""
         history = cast("History[State]", self._history)
-        now, self._message = history.now, ""
-        if name in _DEEDS:
-            self._show(history.do(_DEEDS[name](now)))
+        state, self._message = history.now, ""
+        if name in _ACTIONS:
+            self._show(history.do(_ACTIONS[name](state)))
         elif name in _SLIDERS:
-            self._show(history.do(_SLIDERS[name](now, value), key=name))
+            self._show(history.do(_SLIDERS[name](state, value), key=name))
         elif name in ("Undo", "Redo"):
-            moved = history.undo() if name == "Undo" else history.redo()
-            self._write(join_prompts([prompt.text for prompt in moved.now.prompts]))
-            self._show(moved)
+            history = history.undo() if name == "Undo" else history.redo()
+            self._set_prompts(join_prompts([prompt.text for prompt in history.now.prompts]))
+            self._show(history)
         elif name == "Clear":
             self._cancel()
-            self._write("")
+            self._set_prompts("")
             with suppress(ValueError, OSError):  # as in `open`
-                self._negatives = join_prompts(default_rule(now.space.field).negatives)
+                self._negatives = join_prompts(default_rule(state.space.field).negatives)
             if self._widgets is not None:
                 self._widgets.forget(self._negatives)
-            self._show(history.do(replace(actions.show_all(actions.clear(now)), did="Clear")))
+            self._show(history.do(replace(actions.show_all(actions.clear(state)), did="Clear")))
         elif name == "shown" and self._widgets is not None:
-            self._show(history.do(actions.show(now, self._widgets.place(value))))
-        elif name == "refined" and now.question is not None:
-            self._show(history.do(actions.ask_again(now, replace(now.question, refined=value), "Refined features")))
+            self._show(history.do(actions.show(state, self._widgets.place(value))))
+        elif name == "refined" and state.question is not None:
+            question = replace(state.question, refined=value)
+            self._show(history.do(actions.ask_again(state, question, "Refined features")))
         elif name == "colormap":
             self._colormap = value
             self._show(history)
         elif name in MODES:
             self._clicks.arm(name, client)
-            self.tell("Click on something in the scene. Cancel or Escape ends it.")
+            self.tell("Click on the scene, or press Cancel or Escape to stop.")
         elif name == "Cancel":
             self._cancel()
-            self._follow()
+            self._update_widgets()
         elif name in OBJECT_DEEDS:
-            self._with_object(name, value, client)
+            self._act_on_object(name, value, client)
         elif name == "Download selection":
-            self._download(now.selection, now.name, client)
+            self._download(state.selection, state.name, client)
         elif name in ("Save prompts in run", "Replace the saved prompts"):
-            self._save(now, replaces=name.startswith("Replace"))
+            self._save(state, replaces=name.startswith("Replace"))
 
     def _cancel(self) -> None:
-        """Ends what runs, and what waits for a click."""
+        """Discard running work, and stop waiting for a click."""
         self._turns.cancel()
         self._clicks.disarm()
         if self._reasons is not None:
             self._reasons.forget()
 
-    def _with_object(self, deed: str, row: FoundObject, client: Any) -> None:
-        if deed == "go to":
+    def _act_on_object(self, action: str, row: FoundObject, client: Any) -> None:
+        if action == "go to":
             go_to(client, row, self._host[0].scene(), cast(State, self.state).drawn)
-        elif deed == "export":
+        elif action == "export":
             self._download(row.mask, row.name, client)
         else:
             history = cast("History[State]", self._history)
-            self._show(history.do((actions.only if deed == "only" else actions.hide)(history.now, row.mask)))
+            self._show(history.do((actions.only if action == "only" else actions.hide)(history.now, row.mask)))
 
     def _download(self, mask: Tensor, name: str, client: Any) -> None:
         file, content, count = selection_file(self._host[0], cast(State, self.state), mask, name)
         client.send_file_download(file, content)
-        self.tell(f"{file} with {count:,} Gaussians goes to your downloads.")
+        self.tell(f"Sent {file} with {count:,} Gaussians to the browser's downloads.")
 
     def _ask(self) -> None:
-        """Asks what the text boxes say."""
+        """Ask the prompts in the text boxes."""
         if self._widgets is not None:
             self._line, self._negatives = self._widgets.prompts.value, self._widgets.negatives.value
-        self._work(_READING, self._answer)
+        self._run(_READING, self._answer)
 
-    def _work(self, what: str, work: Callable[[Turn], None]) -> None:
-        """Does what takes a while, without any lock; the panel shows what, until it is done."""
-        turn = self._turns.start(what)
+    def _run(self, description: str, task: Callable[[Turn], None]) -> None:
+        """Run a slow task without holding a lock; the panel shows its description until it ends."""
+        token = self._turns.start(description)
         self._clicks.disarm()
         self.tell("")
         message = ""
         try:
-            work(turn)
-        except Exception as error:  # whatever an encoder makes its libraries raise: nothing may stop the viewer
+            task(token)
+        except Exception as error:  # the libraries of an encoder may raise anything; no error may stop the viewer
             message = explain(error)[0]
-        if self._turns.finish(turn):
+        if self._turns.finish(token):
             self.tell(message)
 
-    def _answer(self, turn: Turn) -> None:
-        asked = (self._folder, self._line, self._negatives, dict(self._clicks.known), self._widgets)
+    def _answer(self, token: Turn) -> None:
+        inputs = (self._folder, self._line, self._negatives, dict(self._clicks.known), self._widgets)
         field = cast(State, self.state).space.field
-        posed = self._asker.pose(field, *asked, lambda: self._turns.busy != "")
+        result = self._asker.pose(field, *inputs, lambda: self._turns.busy != "")
         with self._lock:
-            if posed is not None and self._turns.finish(turn) and self._history is not None:
-                now, (prompts, question) = self._history.now, posed
+            if result is not None and self._turns.finish(token) and self._history is not None:
+                state, (prompts, question) = self._history.now, result
                 self._message = ""
-                self._show(self._history.do(actions.ask(now, prompts, carried(now, question))), answered=True)
+                self._show(self._history.do(actions.ask(state, prompts, carried(state, question))), answered=True)
 
-    def _select_floaters(self, turn: Turn) -> None:
-        found = find_floaters(self._host[0].scene(), cast(State, self.state).space.field.scalars).mask
+    def _select_floaters(self, token: Turn) -> None:
+        floaters = find_floaters(self._host[0].scene(), cast(State, self.state).space.field.scalars).mask
         with self._lock:
-            if self._history is not None and self._turns.wanted(turn):
-                after = actions.select_floaters(self._history.now, found)
-                self._turns.finish(turn)
+            if self._history is not None and self._turns.wanted(token):
+                state = actions.select_floaters(self._history.now, floaters)
+                self._turns.finish(token)
                 self._message = actions.LOOK_FIRST
-                self._show(self._history.do(after), answered=True)
+                self._show(self._history.do(state), answered=True)
 
     def _explain(self) -> None:
-        """Shows the photographs that voted for the selection, which are looked for without any lock."""
+        """Show the training images behind the selection; the search for them holds no lock."""
         state, reasons = cast(State, self.state), cast(Reasons, self._reasons)
-        turn = reasons.start(state)
+        token = reasons.start(state)
         self.tell("")
         try:
-            reasons.find(turn, state)
+            reasons.find(token, state)
         finally:
             with self._lock:
-                self._follow()
+                self._update_widgets()
 
     def forget(self, client: Any) -> None:
-        """A browser is gone; its click does not come any more."""
+        """Handle a disconnected browser, and stop waiting for its click."""
         if self._clicks.forget(client):
             self.tell("")
 
-    def _hit(self, mode: str, origin: Tensor, direction: Tensor) -> None:
-        """A browser has clicked: asks for everything like that, or selects, adds or takes away the object."""
+    def _on_click(self, mode: str, origin: Tensor, direction: Tensor) -> None:
+        """Handle a click: ask for everything similar, or select, add or remove the object under it."""
         try:
             device = cast(State, self.state).space.means.device
-            with self._viewer.train_lock:  # what is drawn may be changed by a picture that is being made
+            with self._viewer.train_lock:  # a render in another thread may change which Gaussians are drawn
                 weights = self._host[0].in_sight(origin.to(device), direction.to(device))
             with self._lock:
                 history = cast("History[State]", self._history)
@@ -236,21 +238,21 @@ class Panel(Face):
                     return
                 saved = stored(self._folder)
                 vector = actions.click_vector(history.now, weights)
-                self._write(self._clicks.keep(vector, () if saved is None else saved.texts))
+                self._set_prompts(self._clicks.keep(vector, () if saved is None else saved.texts))
             self._ask()
         except Exception as error:  # as in `act`
             self.tell(explain(error)[0])
 
-    def _save(self, now: State, *, replaces: bool) -> None:
+    def _save(self, state: State, *, replaces: bool) -> None:
         try:
-            count = save_prompts(self._folder, now, replaces=replaces)
+            count = save_prompts(self._folder, state, replaces=replaces)
         except InputError:
-            self._offer_to_replace(now.question is not None)
+            self._offer_to_replace(state.question is not None)
             raise
         self._offer_to_replace(False)
-        stored = "one prompt" if count == 1 else f"{count} prompts"
-        self.tell(f"Saved: the run stores {stored} now, for ns-render to draw.")
+        prompts = "one prompt" if count == 1 else f"{count} prompts"
+        self.tell(f"Saved. The run now stores {prompts} for ns-render to draw.")
 
-    def _offer_to_replace(self, offered: bool) -> None:
+    def _offer_to_replace(self, visible: bool) -> None:
         if self._widgets is not None:
-            self._widgets.replace.visible = offered
+            self._widgets.replace.visible = visible

@@ -1,4 +1,4 @@
-"""`ns-train normlift`: splatfacto's training, and a lift at its end."""
+"""Pipeline of `ns-train normlift`: trains splatfacto, then lifts features onto the trained Gaussians."""
 
 from __future__ import annotations
 
@@ -41,38 +41,38 @@ if TYPE_CHECKING:
 
 @dataclass
 class NormLiftPipelineConfig(VanillaPipelineConfig):
-    """splatfacto's pipeline, and what to lift when the training ends."""
+    """splatfacto's pipeline with a lift at the end of training."""
 
     _target: type = field(default_factory=lambda: NormLiftPipeline)
     source: SourceOptions = field(default_factory=SourceOptions)
-    """What to see in the images."""
+    """Options of the 2D features."""
     lift: LiftOptions = field(default_factory=LiftOptions)
-    """What to lift and how."""
+    """Options of the lift."""
     queries: tuple[str, ...] = ()
-    """Texts to store in the run; ns-render and ns-viewer show their relevancy."""
+    """Prompts to store in the run; ns-render and ns-viewer show their relevancy."""
 
 
 class NormLiftPipeline(VanillaPipeline):
-    """Trains as splatfacto does; after the last checkpoint is saved, lifts that checkpoint in the same run."""
+    """splatfacto's pipeline. After the last checkpoint is saved, it lifts that checkpoint in the same run."""
 
     config: NormLiftPipelineConfig
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if hasattr(torch.serialization, "add_safe_globals"):  # torch 2.4, from which on nerfstudio's own loading fails
+        if hasattr(torch.serialization, "add_safe_globals"):  # nerfstudio cannot load from torch 2.4 on without it
             torch.serialization.add_safe_globals(numpy_numbers())
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Those of splatfacto, and the lift.
+        """Return splatfacto's callbacks and the lift, after checking what the lift needs.
 
         Raises:
-            ValueError, FileNotFoundError: the encoder or a query cannot be used; better known before the training.
+            ValueError, FileNotFoundError: the encoder or a query cannot be used.
         """
         callbacks = super().get_training_callbacks(training_callback_attributes)
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
-        model.detach()  # of a lifted checkpoint that is trained further
+        model.detach()  # the field of a lifted checkpoint whose training is resumed
         if trainer is not None and trainer.local_rank == 0:
             check_before(trainer)
             source = source_of(trainer.config)
@@ -87,12 +87,12 @@ class NormLiftPipeline(VanillaPipeline):
 
 
 def check_before(trainer: Trainer) -> None:
-    """Refuses, before hours of training, what the lift at its end would refuse.
+    """Raise before training if the lift at its end would fail, and print warnings about the images.
 
     Raises:
-        ValueError, FileNotFoundError: a data parser or model that cannot be lifted, options out of range, photographs
-            that training reads into something else.
-        PermissionError: the folder of the lift's caches cannot be written.
+        ValueError, FileNotFoundError: the data parser or model cannot be lifted, an option is out of range, or
+            nerfstudio misreads the pixel values of an image.
+        PermissionError: the folder of the run or of the lift's caches is not writable.
     """
     config: Any = trainer.config
     path = trainer.base_dir / "config.yml"
@@ -101,28 +101,28 @@ def check_before(trainer: Trainer) -> None:
     datamanager: Any = trainer.pipeline.datamanager
     dataset = datamanager.train_dataset
     poses = dataset.cameras.camera_to_worlds
-    for remark in DatasetViews(dataset, dataset_folder(config), poses, torch.zeros(3)).check_files():
-        CONSOLE.print(f"Warning: {remark}", markup=False, soft_wrap=True)
+    for warning in DatasetViews(dataset, dataset_folder(config), poses, torch.zeros(3)).check_files():
+        CONSOLE.print(f"Warning: {warning}", markup=False, soft_wrap=True)
     cache = cache_folder(trainer.base_dir)
     for folder in (cache if cache.exists() else cache.parent, trainer.base_dir):
         if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(
-                f"{folder} cannot be written, so the lift at the end of the training would fail. Allow it, or choose "
-                "another folder with --output-dir."
+                f"{folder} cannot be written, so the lift at the end of training would fail. Make the folder writable, "
+                "or choose another one with --output-dir."
             )
 
 
 def dataset_folder(config: TrainerConfig) -> Path:
-    """The folder of the dataset, as the config names it."""
+    """Return the folder of the dataset that the config names."""
     data = stored_data(config)
     return data.parent if data.suffix == ".json" else data
 
 
 def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
-    """What the config says to see in the images; LangSplat's features lie in the dataset if no folder is named.
+    """Make the feature source of a config; without a folder of features, LangSplat's are read from the dataset.
 
     Raises:
-        ValueError, FileNotFoundError: as `make_source`; the message names the flags of ns-train.
+        ValueError, FileNotFoundError: as `make_source`; the message names the options of ns-train.
     """
     options = _source_options(config)
     try:
@@ -132,7 +132,7 @@ def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
             raise
         raise FileNotFoundError(
             f"{error}. Write them there with LangSplat's preprocessing, name their folder with "
-            "--pipeline.source.features-dir, or look at the photographs instead: --pipeline.source.features none"
+            "--pipeline.source.features-dir, or compute features from the images: --pipeline.source.features none"
         ) from error
 
 
@@ -145,16 +145,16 @@ def _source_options(config: TrainerConfig) -> SourceOptions:
 
 
 def _lift_at_the_end(trainer: Trainer, step: int) -> None:
-    """Nothing that goes wrong here reaches the training, which is complete and saved."""
+    """Lift the trained scene; print any error instead of raising it, since training is complete and saved."""
     config = trainer.base_dir / "config.yml"
     try:
         lift_trained(trainer)
-    except Exception as error:  # whatever it is
+    except Exception as error:  # no error may make a completed training fail
         if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
         CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
-            f"The training is complete and saved, but lifting it at step {step} failed: {explain(error)[0]}\n"
+            f"Training is complete and saved, but lifting it at step {step} failed: {explain(error)[0]}\n"
             f"Lift it again with: ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,
@@ -163,7 +163,7 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
 
 
 def lift_trained(trainer: Trainer) -> Path:
-    """Lifts the last checkpoint of a trainer, writes the field and its config into the run, and shows it in the viewer.
+    """Lift the last checkpoint of a trainer, write the field and its config into the run, and show it in the viewer.
 
     Returns:
         Folder of the field.
@@ -183,8 +183,8 @@ def lift_trained(trainer: Trainer) -> Path:
     field.save(folder, overwrite=True, beside=digests_beside(folder, files))
     question = None
     if len(options.queries) > 0:
-        asked = make_question(field, source.text, options.queries)
-        question = answer(field, scene.gaussians.means, asked).question
+        question = make_question(field, source.text, options.queries)
+        question = answer(field, scene.gaussians.means, question).question
         save_question(folder, question)
     model: Any = trainer.config.pipeline.model
     model.semantics = Path(FIELD_FOLDER)
@@ -195,6 +195,6 @@ def lift_trained(trainer: Trainer) -> Path:
     viewer: Any = trainer.viewer_state
     if hasattr(viewer, "render_statemachines"):
         redraw(viewer)
-    again = f"ns-normlift-query --load-config {shlex.quote(str(path))} --text ..."
-    CONSOLE.print(f"Lifted: {folder}. Ask it with: {again}", markup=False, soft_wrap=True)
+    command = f"ns-normlift-query --load-config {shlex.quote(str(path))} --text ..."
+    CONSOLE.print(f"Lifted: {folder}. Query it with: {command}", markup=False, soft_wrap=True)
     return folder

@@ -1,4 +1,4 @@
-"""What the panel says of a state, as text that the viewer compiles as MDX."""
+"""Status text of the panel as MDX, which the viewer compiles."""
 
 from __future__ import annotations
 
@@ -11,34 +11,39 @@ from normlift_ns.session.state import State
 from normlift_ns.viewer.legend import clipped
 from normlift_ns.viewer.status import as_text, swatch
 
-_MOST_ROWS = 8
+_MAX_TABLE_ROWS = 8
 
 
 def drawable(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
-    """Gaussians that are ever drawn, by their logits."""
+    """Return the mask of Gaussians that are opaque enough to be drawn.
+
+    Args:
+        opacities: logits.
+    """
     return opacities.detach()[:, 0] >= LEAST_OPACITY
 
 
 def said(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"]) -> str:
-    """What runs, a message, how much is selected and why counts differ, and what to know of the evidence.
+    """Return the status: running work, message, size of the selection, reasons for differing counts, and warnings.
 
     Args:
-        drawn: as `drawable` has it.
+        busy: description of the running work; empty: none.
+        drawn: mask of Gaussians, as from `drawable`.
     """
     lines = [as_text(text) for text in (busy, clipped(message, 400)) if text]
-    chosen = state.selection
-    count, hidden = int(chosen.sum()), 0 if state.hidden is None else int(state.hidden.sum())
+    selection = state.selection
+    count, hidden = int(selection.sum()), 0 if state.hidden is None else int(state.hidden.sum())
     if state.question is None and count == 0:
         lines.append("No query yet.")
     else:
         lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand}")
-    faint = int((chosen & ~drawn.to(chosen.device)).sum())
+    faint = int((selection & ~drawn.to(selection.device)).sum())
     if faint > 0:
-        lines.append(f"{faint:,} of them are never drawn nor exported (opacity below 1/255).")
+        lines.append(f"{faint:,} of them are never drawn or exported (opacity below 1/255).")
     if state.answer is not None and state.from_answer and state.shown is None:
-        twice = int((state.answer.selected.sum(dim=1) > 1).sum())
-        if twice > 0:
-            lines.append(f"{twice:,} of them are selected by several prompts.")
+        several = int((state.answer.selected.sum(dim=1) > 1).sum())
+        if several > 0:
+            lines.append(f"{several:,} of them are selected by several prompts.")
     if hidden > 0:
         lines.append(f"{hidden:,} Gaussians are hidden.")
     if state.remark:
@@ -47,7 +52,7 @@ def said(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"]) -> st
 
 
 def found_table(state: State) -> str:
-    """Each prompt with its colour, its count and its best match, or with what is wrong with it."""
+    """Return a table with the color, count and highest relevancy of each prompt, or with the prompt's error."""
     answer = state.answer
     if len(state.prompts) == 0 or answer is None:
         return ""
@@ -58,11 +63,11 @@ def found_table(state: State) -> str:
     lines = [
         f"{as_text(answer.question.rule)} above {answer.question.threshold:g}",
         "",
-        "| | prompt | found | peak |",
+        "| | prompt | selected | peak |",
         "|---|---|---|---|",
     ]
-    troubled = [prompt for prompt in state.prompts if prompt.problem]  # first: they want to be seen
-    listed = [*troubled, *(prompt for prompt in state.prompts if not prompt.problem)][:_MOST_ROWS]
+    failed = [prompt for prompt in state.prompts if prompt.problem]  # listed first, to be noticed
+    listed = [*failed, *(prompt for prompt in state.prompts if not prompt.problem)][:_MAX_TABLE_ROWS]
     for prompt in listed:
         name = as_text(clipped(prompt.text, 40))
         if prompt.problem or prompt.text not in rows:

@@ -1,4 +1,4 @@
-"""The photographs of a run as splatfacto trained on them: undistorted, with the cameras that belong to them."""
+"""Images and cameras of a run as splatfacto trained on them, without lens distortion."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from normlift_ns.scenes.image_files import check_mask, read_head, remarks
 from normlift_ns.scenes.nerfstudio.views import image_name
 from normlift_ns.scenes.photographs import to_camera
 
-_READ_WELL = {"RGB", "RGBA", "L", "CMYK"}
-"""Kinds of pixels that nerfstudio can be trained on; CMYK in strange colours."""
-_DRAWN_AS_PINHOLE = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
+_SUPPORTED_MODES = {"RGB", "RGBA", "L", "CMYK"}
+"""Pillow image modes that nerfstudio can train on; CMYK images get wrong colors."""
+_SUPPORTED_CAMERAS = {CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value, CameraType.FISHEYE624.value}
 
 
 class DatasetViews:
-    """`Views`: photographs of one split of a dataset, in its order; each is read and undistorted when it is asked for.
+    """`Views` of one split of a dataset, in its order. Each image is read and undistorted on access.
 
-    Images, masks and intrinsics are those of `FullImageDatamanager.cached_train`, which holds all of them in memory
+    Images, masks and intrinsics equal those of `FullImageDatamanager.cached_train`, which holds all of them in memory
     (and pins that memory, which needs CUDA).
 
     Args:
-        dataset: a split as nerfstudio's datamanager made it; is not changed.
-        folder: where the dataset lies, for `names`.
-        poses: camera-to-world poses [V, 3, 4] in OpenGL convention; the dataset's, or as the training optimised them.
+        dataset: a split as made by nerfstudio's datamanager; it is not changed.
+        folder: folder of the dataset, to which `names` are relative.
+        poses: camera-to-world poses [V, 3, 4] in OpenGL convention, of the dataset or as optimized in training.
         background: RGB in 0..1 behind images with an alpha channel.
     """
 
@@ -52,9 +52,9 @@ class DatasetViews:
         self._poses = poses
         self._background = background
         self.files = list(dataset.image_filenames)
-        """Image files, absolute."""
+        """Absolute paths of the images."""
         self.names = [image_name(file, folder) for file in self.files]
-        """Image files relative to the dataset, with forward slashes."""
+        """Paths of the images relative to the dataset, with forward slashes."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -63,19 +63,19 @@ class DatasetViews:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index: int) -> View:
-        """Reads one photograph.
+        """Read one image with its mask and camera.
 
         Raises:
-            FileNotFoundError, ValueError: a file that is missing, cannot be read or has another size than its camera;
-                the message names it.
+            FileNotFoundError, ValueError: a file is missing, cannot be read, or differs in size from its camera; the
+                message names it.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
         index %= len(self)
         data = self._read(index)
-        taken = data["image"]
-        image, _, mask = _undistorted(self._dataset.cameras, index, data)
-        original = None if image is taken else (taken.shape[1], taken.shape[0])
+        distorted = data["image"]
+        image, _, mask = _undistort(self._dataset.cameras, index, data)
+        original = None if image is distorted else (distorted.shape[1], distorted.shape[0])
         if image.shape[2] == 4:
             alpha = image[:, :, 3:].float() / 255
             image = (alpha * image[:, :, :3] + (1 - alpha) * 255 * self._background).round().to(torch.uint8)
@@ -83,67 +83,67 @@ class DatasetViews:
 
     @property
     def cameras(self) -> list[Camera]:
-        """All cameras, those of the undistorted images; reads no image."""
+        """Cameras of all undistorted images; no image is read."""
         return self._cameras
 
     @cached_property
     def _cameras(self) -> list[Camera]:
-        undistorted: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}  # photographs of one camera share it
-        return [self._camera(i, undistorted) for i in range(len(self))]
+        pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]] = {}  # images of one camera share an entry
+        return [self._camera(i, pinholes) for i in range(len(self))]
 
-    def _camera(self, index: int, undistorted: dict[tuple[float, ...], tuple[Tensor, int, int]]) -> Camera:
+    def _camera(self, index: int, pinholes: dict[tuple[float, ...], tuple[Tensor, int, int]]) -> Camera:
         camera = self._dataset.cameras[index].reshape(())
-        numbers = (camera.camera_type, camera.width, camera.height, camera.get_intrinsics_matrices())
+        parameters = (camera.camera_type, camera.width, camera.height, camera.get_intrinsics_matrices())
         key = tuple(
-            float(x) for part in (*numbers, camera.distortion_params) if part is not None for x in part.flatten()
+            float(x) for part in (*parameters, camera.distortion_params) if part is not None for x in part.flatten()
         )
         try:
-            if key not in undistorted:
-                undistorted[key] = self._pinhole(index)
-            return to_camera(self._poses[index], *undistorted[key])
+            if key not in pinholes:
+                pinholes[key] = self._pinhole(index)
+            return to_camera(self._poses[index], *pinholes[key])
         except InputError as error:
             raise InputError(f"The camera of {self.files[index]} cannot be used: {error}") from error
 
     def _pinhole(self, index: int) -> tuple[Tensor, int, int]:
-        """Intrinsics, width and height without distortion."""
+        """Return intrinsics, width and height of an image without distortion."""
         camera = self._dataset.cameras[index].reshape(())
-        if int(camera.camera_type) not in _DRAWN_AS_PINHOLE:
+        if int(camera.camera_type) not in _SUPPORTED_CAMERAS:
             raise InputError(
                 f"{self.files[index]} was taken with a {CameraType(int(camera.camera_type)).name} camera; splatfacto "
-                "draws perspective and fisheye cameras only."
+                "supports only perspective and fisheye cameras."
             )
         blank = torch.zeros(int(camera.height), int(camera.width), 3, dtype=torch.uint8)
-        image, intrinsics, _ = _undistorted(self._dataset.cameras, index, {"image": blank})
+        image, intrinsics, _ = _undistort(self._dataset.cameras, index, {"image": blank})
         return intrinsics, image.shape[1], image.shape[0]
 
     def check_files(self) -> tuple[str, ...]:
-        """Looks at the heads of all photographs and masks; returns what a person should know, in whole sentences.
+        """Check the file headers of all images and masks; return warnings as whole sentences.
 
         Raises:
-            FileNotFoundError, ValueError: a photograph or mask that is no image, that nerfstudio reads into something
-                else, or that has another size than its camera or image; the message names it.
+            FileNotFoundError, ValueError: an image or mask is missing, is not a valid image, has pixel values that
+                nerfstudio misreads, or differs in size from its camera or image; the message names it.
         """
         heads = [read_head(file) for file in self.files]
         masks, scale = self._dataset._dataparser_outputs.mask_filenames, self._dataset.scale_factor
         cameras = self._dataset.cameras
         sizes = torch.stack([cameras.width, cameras.height]).reshape(2, -1).T.tolist() if len(self) > 0 else []
         for index, (file, head) in enumerate(zip(self.files, heads)):
-            if head.mode not in _READ_WELL:
+            if head.mode not in _SUPPORTED_MODES:
                 raise InputError(
-                    f"{file} has pixels of kind {head.mode}, which nerfstudio takes for other values than they are. "
-                    "Expected 8-bit RGB, RGBA or grey; convert the photographs, and train again."
+                    f"{file} has the pixel format {head.mode}, whose values nerfstudio misreads. Expected 8-bit RGB, "
+                    "RGBA or grayscale; convert the images, and train again."
                 )
-            found = head.size if scale == 1 else tuple(int(side * scale) for side in head.size)
-            self._check_size(index, found, sizes[index])
+            size = head.size if scale == 1 else tuple(int(side * scale) for side in head.size)
+            self._check_size(index, size, sizes[index])
             if masks is not None:
                 check_mask(masks[index], file, head.size)
         return remarks(self.files, heads)
 
-    def _check_size(self, index: int, found: Sequence[int], expected: Sequence[int]) -> None:
-        if tuple(found) != tuple(expected):
+    def _check_size(self, index: int, size: Sequence[int], expected: Sequence[int]) -> None:
+        if tuple(size) != tuple(expected):
             raise InputError(
-                f"{self.files[index]} is {found[0]} x {found[1]} pixels, its camera {expected[0]} x {expected[1]} "
-                "(width x height). Use the images that the run was trained with."
+                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{expected[1]} (width x height). Use the images that the run was trained with."
             )
 
     def _read(self, index: int) -> dict[str, Any]:
@@ -152,10 +152,10 @@ class DatasetViews:
             data = self._dataset.get_data(index, image_type="uint8")
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"{error.filename} is missing, which the dataset names. Put it back, or say where the dataset is "
+                f"{error.filename} is missing, but the dataset lists it. Put it back, or give the path of the dataset "
                 "with --data."
             ) from error
-        except Exception as error:  # Pillow's readers and nerfstudio's checks raise whatever a file leads them to
+        except Exception as error:  # Pillow's readers and nerfstudio's checks may raise anything
             raise InputError(
                 f"{file} or its mask cannot be read ({error}). Expected an 8-bit image; copy it again from the capture."
             ) from error
@@ -163,10 +163,10 @@ class DatasetViews:
         return data
 
 
-def _undistorted(
+def _undistort(
     cameras: Cameras, index: int, data: dict[str, Any]
 ) -> tuple[UInt8[Tensor, "h w c"], Float[Tensor, "3 3"], Bool[Tensor, "h w 1"] | None]:
-    """Image, intrinsics and mask by nerfstudio's undistortion, as `FullImageDatamanager` does it for every image."""
+    """Return image, intrinsics and mask after nerfstudio's undistortion, as in `FullImageDatamanager`."""
     camera = cameras[index].reshape(())
     intrinsics = camera.get_intrinsics_matrices()
     if camera.distortion_params is None or bool((camera.distortion_params == 0).all()):
@@ -176,35 +176,37 @@ def _undistorted(
         _check_aria(camera, masked="mask" in data)
     try:
         matrix, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics.numpy())
-    except Exception as error:  # OpenCV's errors, and what nerfstudio makes of the numbers that it gets
-        raise InputError(f"its distortion {distortion.tolist()} cannot be undone ({error})") from error
+    except Exception as error:  # OpenCV's errors, and any that nerfstudio raises for invalid coefficients
+        raise InputError(f"its distortion {distortion.tolist()} cannot be removed ({error})") from error
     if 0 in image.shape:
-        raise InputError(f"its distortion {distortion.tolist()} leaves no pixel of the image")
+        raise InputError(f"removing its distortion {distortion.tolist()} leaves no pixel of the image")
     pinhole = np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
     return torch.from_numpy(np.ascontiguousarray(image)), torch.from_numpy(pinhole).float(), mask
 
 
 def _check_aria(camera: Cameras, *, masked: bool) -> None:
-    """Refuses what nerfstudio has no undistortion for, or would make enormous pictures of."""
+    """Raise if nerfstudio cannot undistort images of an Aria camera, or would make enormous images of them."""
     if masked:
-        raise InputError("nerfstudio undistorts photographs of FISHEYE624 cameras without masks only")
+        raise InputError("nerfstudio cannot undistort images of FISHEYE624 cameras that have masks")
     radius = (camera.metadata or {}).get("fisheye_crop_radius")
     width, height = int(camera.width), int(camera.height)
     if not isinstance(radius, float) or not 0.5 <= radius <= width + height:
         raise InputError(
-            f"its fisheye_crop_radius is {radius!r}, where nerfstudio needs the radius in pixels of the circle that a "
-            f"FISHEYE624 camera sees: a number with a decimal point, up to {width + height}"
+            f"its fisheye_crop_radius is {radius!r}. Expected the radius, in pixels, of the circle that a FISHEYE624 "
+            f"camera sees: a number with a decimal point, from 0.5 to {width + height}"
         )
 
 
 def by_nerfstudio(
     config: Any, folder: Path, poses: Float[Tensor, "v 3 4"], background: Float[Tensor, " 3"]
 ) -> tuple[DatasetViews, DatasetViews]:
-    """Trained and held-out photographs of a run that was read without nerfstudio.
+    """Return the training views and the held-out views of a run that was read without nerfstudio.
 
     Args:
-        config: with absolute paths.
-        poses: of the training views.
+        config: the run's config with absolute paths.
+        folder: folder of the dataset.
+        poses: camera-to-world poses of the training views.
+        background: RGB in 0..1 behind images with an alpha channel.
     """
     manager: Any = as_nerfstudios(config).pipeline.datamanager.setup(
         device="cpu", test_mode="test", world_size=1, local_rank=0

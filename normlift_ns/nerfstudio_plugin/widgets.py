@@ -1,7 +1,7 @@
-"""The widgets of the panel: a tab of its own in nerfstudio's viewer, in front of the others.
+"""Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
 
-They are viser's, not nerfstudio's: its elements stand in a folder far down, forget who pressed them, and hold its
-render lock while they work.
+The widgets are viser's. nerfstudio's own elements appear in a folder far down, do not report which browser pressed
+them, and hold the render lock while their callbacks run.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ _SCRIPT = """
   });
 })();
 """
-"""Enter and Escape, which viser 0.2.7 does not know. It sends what is typed at most every 50 ms."""
+"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. It sends typed text at most every 50 ms."""
 
 
 class Widgets:
-    """The tab, for all browsers.
+    """The tab with its widgets, shared by all browsers.
 
     Args:
-        server: viser's.
-        act: called with the name of what was pressed or changed, its value and the client who did it.
-        lock: the panel's, held while a change is passed to `act`, so that no other thread takes it back meanwhile.
+        server: viser's server.
+        act: called with the name of the pressed or changed widget, its value, and the client of the browser.
+        lock: lock of the panel, held while a change is passed to `act`. No other thread can revert it meanwhile.
     """
 
     def __init__(self, server: Any, act: Callable[[str, Any, Any], None], lock: AbstractContextManager[Any]) -> None:
@@ -59,45 +59,48 @@ class Widgets:
         with first_tab(server.gui, TAB, "SEARCH"):
             self.prompts = self._gui.add_text("Prompts", "", hint="What to look for, separated by commas.")
             self.ask = self._button("Ask", hint="Or press Enter in the prompts.")
-            self.cancel = self._button("Cancel", hint="Or press Escape. Ends what waits or runs.")
+            self.cancel = self._button("Cancel", hint="Or press Escape. Stops a query or a pending click.")
             self.cancel.visible = False
             self.status = self._gui.add_markdown("")
             self.poor = self._button("Leave out what is poorly evidenced")
             self.poor.visible = False
             self._group("History", ("Undo", "Redo", "Clear"))
-            self.threshold = self._slider("Threshold", LOWEST, HIGHEST, 0.005, 0.5, "Relevancy to select.")
-            self.reliability = self._slider(
-                "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "R that what is selected must have."
+            self.threshold = self._slider(
+                "Threshold", LOWEST, HIGHEST, 0.005, 0.5, "Relevancy above which Gaussians are selected."
             )
-            self._button("Suggested", hint="The threshold that the histogram suggests, the dashed line in it.")
+            self.reliability = self._slider(
+                "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "Reliability R that selected Gaussians must have."
+            )
+            self._button("Suggested", hint="Use the threshold that the histogram suggests, its dashed line.")
             self._group("Selection", ("Hide", "Only", "All"))
-            self._button("Select likely floaters", hint="Gaussians of no surface. Look at them, then hide them.")
+            self._button("Select likely floaters", hint="Gaussians of no surface. Check them, then hide them.")
             self.found = self._gui.add_markdown("")
             self.histograms = self._gui.add_markdown("")
-            self.rows = Rows(self._gui, lambda deed, row, event: act(deed, row, event.client))
+            self.rows = Rows(self._gui, lambda action, row, event: act(action, row, event.client))
             with self._gui.add_folder("Why"):
-                self.why = self._button("Why?", hint="The photographs that voted for the selection.")
+                self.why = self._button("Why?", hint="Show the training images that voted for the selection.")
                 self.reasons = self._gui.add_markdown("")
             with self._gui.add_folder("Click in the scene"):
-                self._button("More like this", hint="Asks for everything similar to the Gaussian you click.")
+                self._button("More like this", hint="Ask for everything similar to the Gaussian you click.")
                 self._group("Objects", ("Select", "Add", "Drop"))
                 self.steps = self._slider(
-                    "Grow", -MOST_STEPS, MOST_STEPS, 1, 0, "Grows or shrinks the selection, from part to whole."
+                    "Grow", -MOST_STEPS, MOST_STEPS, 1, 0, "Grow or shrink the selection, from part to whole."
                 )
             with self._gui.add_folder("Keep"):
                 self._button("Download selection", hint="The selected Gaussians as a PLY file.")
-                self._button("Save prompts in run", hint="Beside those already there; ns-render draws them.")
+                self._button("Save prompts in run", hint="Add them to the stored prompts; ns-render draws them.")
                 self.replace = self._button("Replace the saved prompts")
                 self.replace.visible = False
             with self._gui.add_folder("How it is asked and drawn", expand_by_default=False):
                 self.shown = self._input(
                     "shown",
-                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Which one selects."),
+                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt that selects."),
                 )
                 self.colormap = self._input(
-                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Of relevancy.")
+                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
                 )
-                self.negatives = self._gui.add_text("Negatives", "", hint="What to compare with, separated by commas.")
+                hint = "Prompts to compare with, separated by commas."
+                self.negatives = self._gui.add_text("Negatives", "", hint=hint)
                 rules = ("auto", *RULES)
                 self.rule = self._gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
                 self.refined = self._input(
@@ -106,19 +109,23 @@ class Widgets:
         self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
 
     def forget(self, negatives: str) -> None:
-        """Sets back what the next question would take over."""
+        """Reset the settings that apply to the next query.
+
+        Args:
+            negatives: default negative prompts.
+        """
         self._reset("Minimum reliability", self.reliability, 0.0)
         self._reset("refined", self.refined, True)
         self.rule.value, self.negatives.value = "auto", negatives
 
     def follow(self, state: State) -> None:
-        """Shows a state in every widget but the boxes in which a person types."""
+        """Show a state in every widget except the text boxes."""
         texts = () if state.answer is None else state.answer.texts
         options = (ALL_PROMPTS, *(f"{i + 1}: {clipped(text, 30)}" for i, text in enumerate(texts)))
         if tuple(self.shown.options) != options:
             self._values["shown"] = ALL_PROMPTS
             self.shown.options = options
-            self._values["shown"] = self.shown.value  # viser keeps the choice where the new options have it
+            self._values["shown"] = self.shown.value  # viser keeps the choice if it is a new option
         self._set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
         if state.question is not None:
             threshold = min(HIGHEST, max(LOWEST, state.question.threshold))
@@ -129,13 +136,18 @@ class Widgets:
         self.poor.visible = state.remark != ""
 
     def explain(self, reasons: str, *, busy: bool) -> None:
-        """Shows why something is selected, as `viewer.reasons.Reasons` has it."""
+        """Show the explanation of a selection.
+
+        Args:
+            reasons: MDX, as `viewer.reasons.Reasons.content`.
+            busy: whether the explanation is being computed.
+        """
         self.why.disabled = busy
         if self.reasons.content != reasons:
             self.reasons.content = reasons
 
     def place(self, value: str) -> int | None:
-        """The prompt that a choice of the dropdown names."""
+        """Return the index of the prompt that an option of the dropdown names; None: all prompts."""
         return None if value == ALL_PROMPTS else int(value.split(":", maxsplit=1)[0]) - 1
 
     def _button(self, label: str, *, hint: str | None = None) -> Any:
@@ -145,14 +157,14 @@ class Widgets:
 
     def _group(self, label: str, options: tuple[str, ...]) -> None:
         group = self._gui.add_button_group(label, options)
-        group._impl.is_button = True  # viser 0.2.7 takes a second press of the same one for no change
+        group._impl.is_button = True  # else viser 0.2.7 ignores a second press of the same button
         group.on_click(lambda event: self._act(group.value, None, event.client))
 
     def _slider(self, label: str, low: float, high: float, step: float, value: float, hint: str) -> Any:
         return self._input(label, self._gui.add_slider(label, low, high, step, value, hint=hint))
 
     def _input(self, name: str, widget: Any) -> Any:
-        """A widget whose changes are told, but for those that the program made."""
+        """Pass the changes of a widget to `act`, except changes made by the program; return the widget."""
         self._values[name] = widget.value
 
         def changed(event: Any) -> None:
@@ -165,25 +177,26 @@ class Widgets:
         return widget
 
     def _set(self, name: str, widget: Any, value: Any) -> None:
-        """Sets a widget without telling `act`, unless a person has changed it and `act` has not been told yet."""
+        """Set a widget without calling `act`, unless it has a user's change that `act` has not received yet."""
         if widget.value == self._values[name]:
             self._reset(name, widget, value)
 
     def _reset(self, name: str, widget: Any, value: Any) -> None:
-        """Sets a widget without telling `act`, even where a person has just changed it."""
+        """Set a widget without calling `act`, even if a user has just changed it."""
         if widget.value != value:
             self._values[name] = value
             widget.value = value
 
 
 def first_tab(gui: Any, label: str, icon: str) -> Any:
-    """A tab in front of those that the viewer has; as a context, it takes the widgets that are made in it.
+    """Add a tab in front of the viewer's tabs. Widgets created in its context are placed in it.
 
-    viser adds tabs behind the others, and the viewer keeps its group of tabs to itself.
+    viser adds new tabs at the end, and the viewer does not expose its tab group.
     """
     from viser import Icon, _gui_handles  # noqa: PLC0415 (nerfstudio's commands without a viewer load this module)
 
-    tabs = [held for held in gui._container_handle_from_id.values() if isinstance(held, _gui_handles.GuiTabHandle)]
+    handles = gui._container_handle_from_id.values()
+    tabs = [handle for handle in handles if isinstance(handle, _gui_handles.GuiTabHandle)]
     group = tabs[0]._parent if len(tabs) > 0 else gui.add_tab_group()
     tab = group.add_tab(label, getattr(Icon, icon))
     rows: list[list[Any]] = [group._labels, group._icons_html, group._tabs]

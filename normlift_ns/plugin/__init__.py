@@ -1,1 +1,1 @@
-"""Names that config.yml files of version 0.1 use; the code is in `normlift_ns.nerfstudio_plugin`."""
+"""Module names used in config.yml files of version 0.1; the code is in `normlift_ns.nerfstudio_plugin`."""

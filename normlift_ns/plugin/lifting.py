@@ -1,4 +1,4 @@
-"""A name that config.yml files of `ns-train normlift` of version 0.1 use."""
+"""Class name used in config.yml files that `ns-train normlift` of version 0.1 wrote."""
 
 from normlift_ns.options import LiftOptions
 

@@ -1,4 +1,4 @@
-"""Names that config.yml files of version 0.1 use."""
+"""Class names used in config.yml files of version 0.1."""
 
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 

@@ -1,4 +1,4 @@
-"""Names that config.yml files of `ns-train normlift` of version 0.1 use."""
+"""Class names used in config.yml files that `ns-train normlift` of version 0.1 wrote."""
 
 from normlift_ns.nerfstudio_plugin.pipeline import NormLiftPipeline, NormLiftPipelineConfig
 

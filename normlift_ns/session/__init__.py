@@ -1,24 +1,25 @@
-"""What a person does in a viewer, whichever viewer it is, without a browser: asks, selects, hides, and takes it back.
+"""Viewer-independent session: what a user asks, selects, hides and undoes in any viewer, without a browser.
 
-Everything that is shown is a `State`, which is never changed: every action returns another one, and a `History` is a
-list of them. A viewer keeps one `Space` per run, and one `History` per person::
+Everything that is shown is an immutable `State`. Each action returns a new state, and a `History` is a list of states.
+A viewer keeps one `Space` per run, and one `History` per user::
 
-    space = Space(field, means)                          # shared by all persons; caches answers and the neighbour graph
+    space = Space(field, means)                          # shared by all users; caches answers and the neighbor graph
     history = History.of(State(space), lean=State.lean)
-    prompts = read_prompts("red, round mug; sky blue", encoder.rows)      # slow: outside of any lock
-    prompts, question = pose(field, prompts, encoder.rows)                # rows that cannot be read keep their problem
+    prompts = read_prompts("red, round mug; sky blue", encoder.rows)      # slow: without holding a lock
+    prompts, question = pose(field, prompts, encoder.rows)                # rows that cannot be encoded keep their error
     history = history.do(actions.ask(history.now, prompts, question))
-    history = history.do(actions.threshold(history.now, 0.6), key="threshold")  # drags of a slider are one step
+    history = history.do(actions.threshold(history.now, 0.6), key="threshold")  # a slider drag is one step
     history = history.do(actions.click(history.now, weights, "add"))      # the connected object under a ray
-    history = history.do(actions.hide(history.now))                       # hides add up
+    history = history.do(actions.hide(history.now))                       # adds to what is hidden already
     history = history.undo()
     history.now.selection, history.now.drawn, history.now.answer          # what the viewer draws
 
-What can be slow runs under a ticket of `Turns`, so that the button shows that it works and late answers are dropped.
+Slow work runs with a token from `Turns`: the viewer shows that it is busy, and drops stale results.
 
-* `prompts`: texts and clicks as rows, each with its vector or its problem; questions of them, and of what is saved.
-* `space`: the field and the places of the Gaussians; components, growing and shrinking over the neighbour graph, boxes.
-* `state`: what is asked, selected and hidden. `actions`: what a person can do about it.
-* `verdicts`: histograms, suggested thresholds, and what is probably not in the scene.
-* `history`: undo and redo. `found`: the objects of a selection. `turns`: busy or stale. `colours`: of the prompts.
+* `prompts`: prompts and clicks as rows, each with its vector or its error, and the queries made of them.
+* `space`: the field and the centers of its Gaussians; connected objects, growing and shrinking, boxes.
+* `state`: what is asked, selected and hidden. `actions`: functions from one state to the next.
+* `verdicts`: histograms, suggested thresholds, and prompts that are probably not in the scene.
+* `history`: undo and redo. `found`: objects of a selection. `viewpoint`: camera positions to look at them from.
+* `turns`: tokens of requests. `worker`: job queue. `colours`: colors of prompts.
 """

@@ -1,6 +1,6 @@
-"""What a person can do: each action takes a state and returns another one, or the same where nothing changes.
+"""User actions: each function takes a state and returns a new one, or the same state if nothing changes.
 
-All raise ValueError (`InputError`) with a message for the person where they cannot be done; the state stays then.
+An action that is not possible raises ValueError (`InputError`) with a message for the user; the state stays as it was.
 """
 
 from __future__ import annotations
@@ -22,42 +22,47 @@ from normlift_ns.session.state import POOR, State
 from normlift_ns.session.verdicts import suggested
 
 Mode = Literal["select", "add", "take away"]
-"""What a click does with the object that it meets."""
+"""What a click does with the object under it."""
 MOST_STEPS = 10
+"""Largest number of steps by which a selection can be grown or shrunk."""
 LOWEST, HIGHEST = -0.2, 1.0
-"""Thresholds that a slider offers."""
-LOOK_FIRST = "Likely floaters are selected. Look at them, then press Hide; Undo takes it back."
+"""Range of the threshold slider."""
+LOOK_FIRST = "Likely floaters are selected. Check them, then press Hide. Undo brings them back."
 
 
 def ask(state: State, prompts: Sequence[Prompt], question: Question) -> State:
-    """The answer to the prompts, as `pose` made a question of them. What is hidden stays hidden; clicks and cuts go.
+    """Answer a query. Hidden Gaussians stay hidden; selections by click and cuts are dropped.
 
+    Args:
+        prompts: all rows, from `pose`.
+        question: the query of these rows, from `pose`.
     Raises:
-        ValueError: vectors of another length than the field's.
+        ValueError: the vectors differ in length from the field's.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
-    return _settled(State(state.space, tuple(prompts), question, hidden=state.hidden, look=state.look, did=did))
+    state = State(state.space, tuple(prompts), question, hidden=state.hidden, look=state.look, did=did)
+    return _with_suggested_threshold(state)
 
 
 def ask_again(state: State, question: Question | None, did: str) -> State:
-    """The same prompts by another question: another rule, or refined features or not. Clicks and cuts stay."""
-    return state if question is None else _settled(replace(state, question=question, did=did))
+    """Answer the same prompts with another rule or other features. Selections by click and cuts are kept."""
+    return state if question is None else _with_suggested_threshold(replace(state, question=question, did=did))
 
 
-def _settled(state: State) -> State:
-    """The state with the threshold that its question suggests; what is wrong with the question shows here."""
+def _with_suggested_threshold(state: State) -> State:
+    """Apply the suggested threshold if the query asks for it. Invalid queries raise here."""
     if state.answer is None or state.question is None or not state.question.suggest:
         return state
     return replace(state, question=state.answer.question)
 
 
 def clear(state: State) -> State:
-    """No question and no selection. What is hidden stays hidden."""
+    """Remove the query and the selection. Hidden Gaussians stay hidden."""
     return State(state.space, hidden=state.hidden, look=state.look, did="Clear")
 
 
 def threshold(state: State, value: float) -> State:
-    """Another relevancy above which to select; one that the slider does not have becomes its end."""
+    """Set the relevancy above which Gaussians are selected, clamped to the range of the slider."""
     value = min(HIGHEST, max(LOWEST, value))
     if state.question is None or value == state.question.threshold:
         return state
@@ -66,7 +71,11 @@ def threshold(state: State, value: float) -> State:
 
 
 def suggest(state: State) -> State:
-    """The threshold that the relevancies of the prompts that select suggest; ValueError where nothing is asked."""
+    """Set the threshold suggested by the relevancies of the prompts that select.
+
+    Raises:
+        ValueError: there is no query.
+    """
     value = suggested(state)
     if value is None:
         raise InputError("No query yet; there is no threshold to suggest.")
@@ -74,7 +83,7 @@ def suggest(state: State) -> State:
 
 
 def min_reliability(state: State, value: float) -> State:
-    """Another R, in 0..1, that what is selected by the prompts must have."""
+    """Set the reliability R, clamped to 0..1, that Gaussians selected by prompts must have."""
     value = min(1.0, max(0.0, value))
     if state.question is None or value == state.question.min_reliability:
         return state
@@ -82,13 +91,13 @@ def min_reliability(state: State, value: float) -> State:
 
 
 def leave_out_poor(state: State) -> State:
-    """Takes what is poorly evidenced out of the selection, clicks included."""
+    """Remove Gaussians with weak evidence from the selection, including those selected by clicks."""
     poor = state.selection & (state.space.field.scalars.reliability < POOR)
     return take_away(state, poor, "Leave out what is poorly evidenced")
 
 
 def show(state: State, shown: int | None) -> State:
-    """Only one text of the question selects; None: all of them."""
+    """Let only one prompt of the query select; None: all of them."""
     count = 0 if state.question is None else len(state.question.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
         return state
@@ -97,49 +106,53 @@ def show(state: State, shown: int | None) -> State:
 
 
 def look(state: State, name: str) -> State:
-    """Draws the same otherwise."""
+    """Set the color mode in which the viewer draws the state."""
     return state if name == state.look else replace(state, look=name, did=f"Draw {name}")
 
 
 def met(state: State, weights: Float[Tensor, " n"]) -> int:
-    """The Gaussian that weighs most on a ray, among those that are drawn and have a direction.
+    """Return the index of the Gaussian with the largest weight on a ray, of those drawn that have a direction.
 
     Raises:
         ValueError: there is none.
     """
-    seen = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
-    found = int(seen.argmax()) if len(seen) > 0 else 0
-    if len(seen) == 0 or not float(seen[found]) > 0:
+    weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
+    index = int(weights.argmax()) if len(weights) > 0 else 0
+    if len(weights) == 0 or not float(weights[index]) > 0:
         raise InputError("There is nothing with semantics where you clicked.")
-    return found
+    return index
 
 
 def click(state: State, weights: Float[Tensor, " n"], mode: Mode = "select") -> State:
-    """Selects the connected object under a click, adds it, or takes it away; see `Space.object_at`.
+    """Select, add or remove the connected object under a click; see `Space.object_at`.
 
     Args:
-        weights: of the Gaussians on the ray, for instance by `raster.picking.ray_weights`.
+        weights: weights of the Gaussians on the ray, for instance from `raster.picking.ray_weights`.
     """
     gaussian = met(state, weights)
-    found = state.space.object_at(gaussian, state.selection, refined=state.refined)
+    mask = state.space.object_at(gaussian, state.selection, refined=state.refined)
     if mode == "take away":
-        return take_away(state, found, "Take away an object")
-    return add(state, found, "Add an object") if mode == "add" else select(state, found, "Select an object")
+        return take_away(state, mask, "Take away an object")
+    return add(state, mask, "Add an object") if mode == "add" else select(state, mask, "Select an object")
 
 
 def click_vector(state: State, weights: Float[Tensor, " n"]) -> Float[np.ndarray, " d"]:
-    """The direction under a click, to ask for everything like it: the vector of a prompt `click_name(...)`."""
+    """Return the direction of the Gaussian under a click: the vector of a prompt named `click_name(...)`.
+
+    Args:
+        weights: weights of the Gaussians on the ray.
+    """
     row = torch.tensor([met(state, weights)], device=state.space.means.device)
     return state.space.field.directions(row, refined=state.refined)[0].cpu().numpy()
 
 
 def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> State:
-    """Selects these Gaussians and no others."""
+    """Select these Gaussians and no others."""
     return replace(state, from_answer=False, added=chosen, removed=None, steps=0, box=None, did=did)
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Adds Gaussians to the selection. The prompts and thresholds go on as they are, unless it was grown or cut."""
+    """Add Gaussians to the selection. Prompts and thresholds stay in effect, unless it was grown, shrunk or cut."""
     if state.steps != 0 or state.box is not None:
         return select(state, state.selection | chosen, did)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -147,38 +160,46 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def take_away(state: State, chosen: Bool[Tensor, " n"], did: str = "Take away") -> State:
-    """Takes Gaussians out of the selection. The prompts and thresholds go on as they are, unless it was grown."""
+    """Remove Gaussians from the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
     if state.steps != 0:
         return select(state, state.selection & ~chosen, did)
     return replace(state, removed=chosen if state.removed is None else state.removed | chosen, did=did)
 
 
-def select_floaters(state: State, found: Bool[Tensor, " n"]) -> State:
-    """Selects what likely floats, as `insight.floaters` has found it.
+def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
+    """Select likely floaters.
 
+    Args:
+        floaters: mask of the floaters, from `insight.floaters.find_floaters`.
     Raises:
-        ValueError: nothing.
+        ValueError: there are none.
     """
-    if not bool(found.any()):
+    if not bool(floaters.any()):
         raise InputError("There are no likely floaters.")
-    return select(state, found, "Select likely floaters")
+    return select(state, floaters, "Select likely floaters")
 
 
 def resize(state: State, steps: int) -> State:
-    """Grows (above 0) or shrinks (below) what is selected, from part to whole, by -10 to 10 steps in all."""
+    """Set how far the selection is grown (steps > 0) or shrunk (steps < 0), from part to whole, clamped to -10..10."""
     steps = max(-MOST_STEPS, min(MOST_STEPS, int(steps)))
     return state if steps == state.steps else replace(state, steps=steps, did=f"Grow {steps:+d}")
 
 
 def cut(state: State, box: Box | None) -> State:
-    """Cuts the selection with a box; None: takes the box away."""
+    """Cut the selection with a box; None: remove the box."""
     if box == state.box:
         return state
     return replace(state, box=box, did="Remove the box" if box is None else "Cut with the box")
 
 
 def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
-    """Hides Gaussians beside those that are hidden already; None: the selection."""
+    """Hide Gaussians in addition to those hidden already.
+
+    Args:
+        chosen: mask of the Gaussians; None: the selection.
+    Raises:
+        ValueError: the mask is empty.
+    """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
         raise InputError("Nothing is selected. There is nothing to hide.")
@@ -187,7 +208,13 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
 
 
 def only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
-    """Draws these Gaussians alone, hidden or not before; None: the selection."""
+    """Draw these Gaussians alone, including hidden ones.
+
+    Args:
+        chosen: mask of the Gaussians; None: the selection.
+    Raises:
+        ValueError: the mask is empty.
+    """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
         raise InputError("Nothing is selected. The screen would be blank.")
@@ -195,5 +222,5 @@ def only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
 
 
 def show_all(state: State) -> State:
-    """Nothing is hidden any more."""
+    """Show all hidden Gaussians again."""
     return state if state.hidden is None else replace(state, hidden=None, did="Show everything")

@@ -1,4 +1,4 @@
-"""Colours of prompts, as tuples: those of `normlift_ns.colors`, which every viewer and picture has."""
+"""Colors of prompts as tuples, the same in every viewer and figure."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Colour = tuple[float, float, float]
 
 
 def prompt_colours(texts: Sequence[str]) -> list[Colour]:
-    """One colour per prompt: that of the first colour name in it, else one that tells it apart.
+    """Return a color for each prompt: that of the first color name in it, else a distinct one.
 
-    >>> [tuple(round(x, 2) for x in colour) for colour in prompt_colours(["yellow bowl", "fox"])]
+    >>> [tuple(round(x, 2) for x in color) for color in prompt_colours(["yellow bowl", "fox"])]
     [(1.0, 1.0, 0.08), (0.9, 0.62, 0.0)]
     """
     return [(red, green, blue) for red, green, blue in prompt_colors(texts).tolist()]

@@ -1,4 +1,4 @@
-"""Undo and redo of everything: a list of states, none of which is ever changed."""
+"""Undo and redo: a list of immutable states."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ T = TypeVar("T")
 MOST_STATES = 100
 
 
-def _same(state: T) -> T:
+def _identity(state: T) -> T:
     return state
 
 
 @dataclass(frozen=True, eq=False)
 class History(Generic[T]):
-    """States in the order in which they came, and which of them is shown.
+    """States in chronological order, and the index of the current one.
 
     >>> history = History.of("a").do("b").do("c").undo()
     >>> history.now, history.undo().now, history.redo().now, history.do("d").can_redo
@@ -25,60 +25,60 @@ class History(Generic[T]):
 
     states: tuple[T, ...]
     at: int = 0
-    """Index of the state that is shown."""
+    """Index of the current state."""
     key: str | None = None
-    """What the last step was called, where steps of the same name are one."""
+    """Key of the last step, if successive steps with this key are merged."""
 
-    lean: Callable[[T], T] = _same
-    """What is kept of a state that is not shown, for instance `State.lean`."""
+    lean: Callable[[T], T] = _identity
+    """Applied to a state when another one becomes current, for instance `State.lean`."""
 
     @staticmethod
-    def of(state: T, *, lean: Callable[[T], T] = _same) -> History[T]:
-        """A history that begins now."""
+    def of(state: T, *, lean: Callable[[T], T] = _identity) -> History[T]:
+        """Return a history with a single state."""
         return History((state,), lean=lean)
 
     @property
     def now(self) -> T:
-        """The state that is shown."""
+        """The current state."""
         return self.states[self.at]
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is a state before."""
+        """Whether there is an earlier state."""
         return self.at > 0
 
     @property
     def can_redo(self) -> bool:
-        """Whether a step was undone."""
+        """Whether there is a later state, after an undo."""
         return self.at < len(self.states) - 1
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:
-        """Shows another state; what was undone is forgotten. The state that is shown already makes no step.
+        """Make a new state current, and drop undone ones. The state that is current already adds no step.
 
         Args:
-            key: steps in a row of the same key become one, such as those of a slider that is dragged.
+            key: successive steps with the same key are merged into one, such as the drag of a slider.
         """
         if state is self.now:
             return self
-        again = key is not None and key == self.key and self.at > 0
-        kept = (*self._left[: self.at + (not again)], state)[-MOST_STATES:]
-        return History(kept, len(kept) - 1, key, self.lean)
+        merge = key is not None and key == self.key and self.at > 0
+        states = (*self._leaned[: self.at + (not merge)], state)[-MOST_STATES:]
+        return History(states, len(states) - 1, key, self.lean)
 
     def undo(self) -> History[T]:
-        """The state before; the same history where there is none."""
+        """Return to the previous state; the same history if there is none."""
         return self.go_to(self.at - 1)
 
     def redo(self) -> History[T]:
-        """The state that was undone last; the same history where there is none."""
+        """Return to the state undone last; the same history if there is none."""
         return self.go_to(self.at + 1)
 
     def go_to(self, index: int) -> History[T]:
-        """Any state of the list; the same history where there is no such."""
+        """Make any state of the list current; the same history if the index is out of range."""
         if index == self.at or not 0 <= index < len(self.states):
             return self
-        return replace(self, states=self._left, at=index, key=None)
+        return replace(self, states=self._leaned, at=index, key=None)
 
     @property
-    def _left(self) -> tuple[T, ...]:
-        """The states, once another one is shown."""
+    def _leaned(self) -> tuple[T, ...]:
+        """The states with `lean` applied to the current one."""
         return (*self.states[: self.at], self.lean(self.now), *self.states[self.at + 1 :])

@@ -1,4 +1,4 @@
-"""Prompts as rows: every text or click with its vector, or with what is wrong with it."""
+"""Prompts as rows: every text or click with its vector or its error, and the queries made of them."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from normlift_ns.text_encoders import Field
 
 MOST_PROMPTS = 64
 ALIKE = 0.9
-"""Cosine to a clicked direction above which a Gaussian is like what was clicked."""
-_SEPARATED = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
+"""Cosine to the direction of a clicked Gaussian above which another one counts as similar."""
+_PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
 _CLICK = re.compile(r"like (what was clicked|click \d+)")
-_RULED = "A click is compared by its cosine; ask it alone, or choose the rule cosine."
+_CLICK_RULE = "Clicks are compared by cosine; ask them alone, or choose the rule cosine."
 Read = Callable[[Sequence[str]], Any]
-"""Texts to vectors [Q, D], as `rows` of an encoder; raises ValueError for a text that it cannot read."""
+"""Function from texts to vectors [Q, D], such as `rows` of an encoder. Raises ValueError if it cannot encode a text."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """One row of a question."""
+    """One row of a query."""
 
     text: str
     vector: Float[np.ndarray, " d"] | None = None
-    """None where the row has a problem."""
+    """Vector of the prompt; None if there is an error."""
     problem: str = ""
-    """Why there is no answer to it, in words for the person who typed it."""
+    """Error message for the user; empty if there is none."""
 
     @property
     def clicked(self) -> bool:
-        """Whether it is a click in the scene, and no text."""
+        """Whether the prompt is a click on the scene instead of a text."""
         return is_click(self.text)
 
 
 def click_name(number: int) -> str:
-    """What a click is called in a row of prompts; the vector of its direction is kept under this name."""
+    """Return the prompt text that stands for a click; the direction of the clicked Gaussian is kept under it."""
     return f"like click {number}"
 
 
 def is_click(text: str) -> bool:
-    """Whether a text is the name of a click.
+    """Return whether a prompt text stands for a click.
 
     >>> is_click(click_name(3)), is_click("like what was clicked"), is_click("click")
     (True, True, False)
@@ -56,17 +56,17 @@ def is_click(text: str) -> bool:
 
 
 def split_prompts(text: str) -> list[str]:
-    """What stands between commas, semicolons and line breaks, each once; quotes keep a comma in a prompt.
+    """Split prompts at commas, semicolons and line breaks, without duplicates; quotes keep a comma in a prompt.
 
     >>> split_prompts('red mug , bowl;;"salt, pepper"; bowl')
     ['red mug', 'bowl', 'salt, pepper']
     """
-    found = (quoted or bare for quoted, bare in _SEPARATED.findall(text))
-    return list(dict.fromkeys(part for part in (" ".join(part.split()) for part in found) if part))
+    parts = (" ".join((quoted or bare).split()) for quoted, bare in _PROMPT.findall(text))
+    return list(dict.fromkeys(part for part in parts if part))
 
 
 def join_prompts(texts: Sequence[str]) -> str:
-    """The line that `split_prompts` reads as these texts.
+    """Join texts into a line that `split_prompts` splits into the same texts.
 
     >>> join_prompts(["red mug", "salt, pepper"])
     'red mug, "salt, pepper"'
@@ -76,40 +76,43 @@ def join_prompts(texts: Sequence[str]) -> str:
 
 
 def read_prompts(text: str, read: Read, known: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
-    """A line of prompts as rows. A text that cannot be read keeps the encoder's message, and the others their vectors.
+    """Encode a line of prompts. A text that cannot be encoded gets the encoder's message instead of a vector.
 
     Args:
-        known: vectors that need no reading, by their texts: of clicks, and of what is saved in the run.
+        text: prompts as typed.
+        read: encoder of texts.
+        known: vectors by text that need no encoder: those of clicks, and of prompts stored in the run.
     Raises:
-        ValueError: no prompt, or too many.
-        OSError, MemoryError: the encoder itself cannot be loaded.
+        ValueError: there are no prompts, or too many.
+        OSError, MemoryError: the encoder cannot be loaded.
     """
     texts, known = split_prompts(text), known or {}
     if len(texts) == 0:
         raise InputError("Type what to look for, then press Ask.")
     if len(texts) > MOST_PROMPTS:
-        raise InputError(f"{len(texts)} prompts; ask for {MOST_PROMPTS} at most at a time.")
+        raise InputError(f"{len(texts)} prompts were typed; ask at most {MOST_PROMPTS} at a time.")
     new = [one for one in texts if one not in known]
     try:
-        found: dict[str, Any] = dict(zip(new, read(new) if len(new) > 0 else []))
+        vectors: dict[str, Any] = dict(zip(new, read(new) if len(new) > 0 else []))
     except ValueError:
-        found = {one: _read_alone(one, read) for one in new}
-    return tuple(_row(one, known[one] if one in known else found[one]) for one in texts)
+        vectors = {one: _read_alone(one, read) for one in new}
+    return tuple(_row(one, known[one] if one in known else vectors[one]) for one in texts)
 
 
 def _read_alone(text: str, read: Read) -> Any:
+    """Return the vector of a text, or an error message."""
     if is_click(text):
-        return f"{text!r} is no click of this session or run; click the scene again."
+        return f"{text!r} is not a click of this session or run; click the scene again."
     try:
         return read([text])[0]
     except ValueError as error:
         return str(error)
 
 
-def _row(text: str, found: Any) -> Prompt:
-    if isinstance(found, str):
-        return Prompt(text, problem=found)
-    return Prompt(text, np.asarray(found, np.float32))
+def _row(text: str, result: Any) -> Prompt:
+    if isinstance(result, str):
+        return Prompt(text, problem=result)
+    return Prompt(text, np.asarray(result, np.float32))
 
 
 def pose(
@@ -123,59 +126,66 @@ def pose(
     min_reliability: float = 0.0,
     refined: bool = True,
 ) -> tuple[tuple[Prompt, ...], Question]:
-    """The question of all rows that have a vector; rows that it leaves out come back with their problem.
+    """Build the query of all rows that have a vector.
 
-    Clicks alone are asked by their cosine, above 0.9; clicks beside texts only where the rule is cosine.
+    Clicks alone are compared by cosine, above 0.9 by default. Together with texts, clicks need the rule cosine.
 
     Args:
-        read: for the negatives. The other arguments are those of `make_question`.
+        read: encoder of the negatives. The other arguments are those of `make_question`.
+    Returns:
+        The rows, in which clicks that the rule excludes have an error, and their query.
     Raises:
         ValueError: no row has a vector; as `make_question`.
     """
-    good = [prompt for prompt in prompts if prompt.vector is not None]
-    if len(good) == 0:
+    valid = [prompt for prompt in prompts if prompt.vector is not None]
+    if len(valid) == 0:
         raise InputError(prompts[0].problem if len(prompts) > 0 else "Type what to look for, then press Ask.")
-    how: dict[str, Any] = {"min_reliability": min_reliability, "refined": refined}
-    if all(prompt.clicked for prompt in good):
+    options: dict[str, Any] = {"min_reliability": min_reliability, "refined": refined}
+    if all(prompt.clicked for prompt in valid):
         threshold = ALIKE if threshold is None else threshold
-        question = _made(field, good, read, negatives=(), rule="cosine", threshold=threshold, **how)
+        question = _question(field, valid, read, negatives=(), rule="cosine", threshold=threshold, **options)
         return tuple(prompts), question
-    how |= {"negatives": negatives, "rule": rule, "threshold": threshold}
-    question = _made(field, good, read, **how)
-    if not RULES[question.rule].compares or not any(prompt.clicked for prompt in good):
+    options |= {"negatives": negatives, "rule": rule, "threshold": threshold}
+    question = _question(field, valid, read, **options)
+    if not RULES[question.rule].compares or not any(prompt.clicked for prompt in valid):
         return tuple(prompts), question
-    ruled = tuple(replace(p, vector=None, problem=_RULED) if p.clicked and p.vector is not None else p for p in prompts)
-    return ruled, _made(field, [prompt for prompt in ruled if prompt.vector is not None], read, **how)
+    error: dict[str, Any] = {"vector": None, "problem": _CLICK_RULE}
+    rows = tuple(replace(p, **error) if p.clicked and p.vector is not None else p for p in prompts)
+    return rows, _question(field, [prompt for prompt in rows if prompt.vector is not None], read, **options)
 
 
-def _made(field: Field, prompts: Sequence[Prompt], read: Read, **how: Any) -> Question:
+def _question(field: Field, prompts: Sequence[Prompt], read: Read, **options: Any) -> Question:
     vectors: dict[str, Any] = {prompt.text: prompt.vector for prompt in prompts}
 
     def rows(texts: Sequence[str]) -> np.ndarray:
         return np.stack([vectors[text] if text in vectors else read([text])[0] for text in texts])
 
-    return make_question(field, rows, list(vectors), **how)
+    return make_question(field, rows, list(vectors), **options)
 
 
 def prompts_of(question: Question | None) -> tuple[Prompt, ...]:
-    """The rows of a question, for instance of the one that a run stores; none of None."""
+    """Return the rows of a query, for instance of the one that a run stores. None: no rows."""
     if question is None:
         return ()
     return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.vectors))
 
 
 def merged(stored: Question | None, asked: Question) -> Question:
-    """What to save so that nothing is lost: the stored prompts and the new ones, a new one in place of its namesake.
+    """Merge stored and new prompts into one query; a new prompt replaces a stored one with the same text.
 
+    Args:
+        stored: query of the run; None: the run stores none.
+        asked: query to add.
     Raises:
-        ValueError: the two go by different rules, or by different negatives.
+        ValueError: the two differ in rule, negatives or features.
     """
     if stored is None:
         return asked
     if (stored.rule, stored.negatives, stored.refined) != (asked.rule, asked.negatives, asked.refined):
         raise InputError(
-            f"The run stores {len(stored.texts)} prompts with the rule {stored.rule}, these go by {asked.rule} or by "
-            "other negatives; they cannot be saved together. Replace the stored ones, or ask again with their rule."
+            f"The run stores {len(stored.texts)} prompts with the rule {stored.rule}. The new prompts use the rule "
+            f"{asked.rule}, other negatives or other features, and cannot be saved with them. Replace the stored "
+            "prompts, or ask again with the same settings."
         )
     rows: dict[str, Any] = {prompt.text: prompt.vector for prompt in (*prompts_of(stored), *prompts_of(asked))}
     return replace(asked, texts=tuple(rows), vectors=np.stack(list(rows.values())))

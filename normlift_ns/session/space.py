@@ -1,4 +1,4 @@
-"""Where a person selects: the field, the places of its Gaussians, and which of them are neighbours."""
+"""Selection in space: the field, the centers of its Gaussians, their neighbor graph, and boxes to cut with."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from normlift_ns.question import Question
 from normlift_ns.session.prompts import ALIKE
 
 _NEIGHBORS = 8
-_KEPT_ANSWERS = 4
-_SAMPLE = 4096
-"""Directions that a mean is made of, at most."""
-_PARTS = 11
-"""One more than steps of shrinking, so that the last one leaves something."""
-_STEP = 0.05
-"""How much less alike a neighbour may be with every step of growth."""
+_CACHED_ANSWERS = 4
+_MAX_SAMPLES = 4096
+"""Largest number of directions that are averaged."""
+_FRACTIONS = 11
+"""One more than the number of shrinking steps, so that the last step leaves Gaussians over."""
+_COSINE_STEP = 0.05
+"""Decrease of the minimum cosine per step of growth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """A field and the centres of its Gaussians. Shared by all persons: what it remembers changes no answer."""
+    """A field and the centers of its Gaussians. Users can share it: its caches do not change any answer."""
 
     field: SemanticField
     means: Float[Tensor, "n 3"]
@@ -45,49 +45,57 @@ class Space:
         return len(self.means)
 
     def none(self) -> Bool[Tensor, " n"]:
-        """A mask of no Gaussian."""
+        """Return an empty mask."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
 
     def answer(self, question: Question) -> Answer:
-        """As `asking.answer`; relevancies of the last few questions are kept.
+        """Answer a query as `asking.answer` does; the relevancies of the last four queries are cached.
 
         Raises:
-            ValueError: vectors of another length than the field's, a rule without its negatives.
+            ValueError: the vectors differ in length from the field's, or the rule lacks its negatives.
         """
         negative = None if question.negative_vectors is None else question.negative_vectors.tobytes()
         key = (question.texts, question.vectors.tobytes(), negative, question.rule, question.refined)
         with self._lock:
-            found = self._answers.pop(key, None)
-        found = answer(self.field, self.means, question) if found is None else found
+            result = self._answers.pop(key, None)
+        result = answer(self.field, self.means, question) if result is None else result
         with self._lock:
-            self._answers[key] = found
-            while len(self._answers) > _KEPT_ANSWERS:
+            self._answers[key] = result
+            while len(self._answers) > _CACHED_ANSWERS:
                 self._answers.popitem(last=False)
-        question = settled(question, found.relevancy, found.valid)
-        return reselect(found, question.threshold, question.min_reliability)
+        question = settled(question, result.relevancy, result.valid)
+        return reselect(result, question.threshold, question.min_reliability)
 
     def alike(self, vector: Float[Tensor, " d"], least: float = ALIKE, *, refined: bool = True) -> Bool[Tensor, " n"]:
-        """Gaussians whose cosine to a direction is at least so large."""
+        """Return the mask of Gaussians whose cosine to a direction is at least `least`."""
         cosine = self.field.query(vector[None], refined=refined)[:, 0]
         return (cosine >= least) & self.field.valid(refined=refined)
 
     def object_at(self, gaussian: int, selected: Bool[Tensor, " n"], *, refined: bool = True) -> Bool[Tensor, " n"]:
-        """The connected object of a Gaussian: of the selection where it is selected, else of all that is like it."""
+        """Return the mask of the connected object around a Gaussian.
+
+        The object is a component of the selection if the Gaussian is selected, else of all Gaussians similar to it.
+
+        Args:
+            gaussian: index of the Gaussian.
+            selected: mask of the selection.
+        """
         if not bool(selected[gaussian]):
             (direction,) = self.field.directions(torch.tensor([gaussian], device=self.means.device), refined=refined)
             selected = self.alike(direction, refined=refined)
         labels = connected_components(self.means, selected)
-        found = labels == labels[gaussian] if int(labels[gaussian]) >= 0 else self.none()
-        found[gaussian] = True
-        return found
+        mask = labels == labels[gaussian] if int(labels[gaussian]) >= 0 else self.none()
+        mask[gaussian] = True
+        return mask
 
     def resized(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
-        """The selection grown (steps > 0) or shrunk (steps < 0) over the neighbour graph.
+        """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
 
-        Growing takes in what hangs together with the selection and is like its mean direction: a cosine of at least
-        0.95 at the first step, 0.05 less with every further one. Shrinking keeps the middle of every connected part:
-        what is at most 10/11 of the way, counted in neighbours, from its middle to its farthest Gaussian, 9/11 at the
-        second step. Every step holds the one before it.
+        Growing adds Gaussians that are connected to the selection and similar to its mean direction. Their cosine is at
+        least 0.95 at the first step, and 0.05 less at each further step. Shrinking keeps the middle of each connected
+        component: Gaussians within a fraction of the largest graph distance from the middle. The fraction is 10/11 at
+        the first step, and 1/11 less at each further step. The results are nested: more steps of growth never remove
+        a Gaussian, and more steps of shrinking never add one.
         """
         if steps == 0 or not bool(selected.any()):
             return selected
@@ -97,77 +105,77 @@ class Space:
         rows = (selected & self.field.valid(refined=refined)).nonzero().squeeze(1)
         if len(rows) == 0:
             return selected
-        mean = self.field.directions(rows[:: 1 + len(rows) // _SAMPLE], refined=refined).mean(dim=0)
+        mean = self.field.directions(rows[:: 1 + len(rows) // _MAX_SAMPLES], refined=refined).mean(dim=0)
         if not bool(mean.any()):
             return selected
-        chosen = selected.cpu().numpy()
-        able = chosen | self.alike(mean, 1 - _STEP * steps, refined=refined).cpu().numpy()
-        _, labels = _components(self._graph(able))
+        seeds = selected.cpu().numpy()
+        candidates = seeds | self.alike(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
+        _, labels = _components(self._graph(candidates))
         reached = np.zeros(labels.max() + 1, bool)
-        reached[labels[chosen]] = True
-        return torch.from_numpy(reached[labels] & able).to(selected.device)
+        reached[labels[seeds]] = True
+        return torch.from_numpy(reached[labels] & candidates).to(selected.device)
 
     def _shrunk(self, selected: Bool[Tensor, " n"], steps: int) -> Bool[Tensor, " n"]:
-        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415 (a lift does without)
+        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415 (a lift does not need it)
 
         rows = np.flatnonzero(selected.cpu().numpy())
         graph = self._graph(selected.cpu().numpy())[rows][:, rows]
         count, labels = _components(graph)
-        places = np.nan_to_num(self.means.detach().double().cpu().numpy()[rows])
+        means = np.nan_to_num(self.means.detach().double().cpu().numpy()[rows])
         size = np.bincount(labels, minlength=count)
-        centre = np.stack([np.bincount(labels, x, count) / size for x in places.T], axis=1)
-        order = np.lexsort((((places - centre[labels]) ** 2).sum(axis=1), labels))
+        center = np.stack([np.bincount(labels, x, count) / size for x in means.T], axis=1)
+        order = np.lexsort((((means - center[labels]) ** 2).sum(axis=1), labels))
         middles = order[np.unique(labels[order], return_index=True)[1]]
         hops = dijkstra(graph, directed=False, indices=middles, unweighted=True, min_only=True)
         farthest = np.zeros(count)
         np.maximum.at(farthest, labels, hops)
-        kept = torch.from_numpy(rows[hops * _PARTS <= farthest[labels] * (_PARTS - steps)])
-        found = self.none()
-        found[kept.to(found.device)] = True
-        return found
+        inner = torch.from_numpy(rows[hops * _FRACTIONS <= farthest[labels] * (_FRACTIONS - steps)])
+        mask = self.none()
+        mask[inner.to(mask.device)] = True
+        return mask
 
-    def _graph(self, able: np.ndarray) -> Any:
-        """The neighbours among some of the Gaussians, as a sparse matrix."""
-        from scipy.sparse import csr_array  # noqa: PLC0415 (a lift does without)
+    def _graph(self, mask: np.ndarray) -> Any:
+        """Return the neighbor graph restricted to a mask of Gaussians, as a sparse matrix."""
+        from scipy.sparse import csr_array  # noqa: PLC0415 (a lift does not need it)
 
         first, second = self._edges
-        inside = able[first] & able[second]
+        inside = mask[first] & mask[second]
         pairs = (first[inside], second[inside])
-        return csr_array((np.ones(len(pairs[0])), pairs), shape=(len(able), len(able)))
+        return csr_array((np.ones(len(pairs[0])), pairs), shape=(len(mask), len(mask)))
 
     @cached_property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of neighbours: 8 nearest, not farther than `REACH` medians of the distance to the last of them."""
-        found = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
-        last = found.distance[:, -1]
+        """Pairs of neighbors: the 8 nearest, within `REACH` times the median distance to the 8th neighbor."""
+        neighbors = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
+        last = neighbors.distance[:, -1]
         last = last[last.isfinite()]
         limit = REACH * float(last.median()) if len(last) > 0 else np.inf
-        near = ((found.index >= 0) & (found.distance <= limit)).numpy()
+        near = ((neighbors.index >= 0) & (neighbors.distance <= limit)).numpy()
         first, slot = np.nonzero(near)
-        return first.astype(np.int32), found.index.numpy()[first, slot]
+        return first.astype(np.int32), neighbors.index.numpy()[first, slot]
 
 
 def _components(graph: Any) -> tuple[int, np.ndarray]:
-    from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415 (likewise)
+    from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415 (as above)
 
     return components_of_graph(graph, directed=False)
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box to cut with, in the scene's own units."""
+    """Box that cuts a selection, in scene units."""
 
     centre: tuple[float, float, float]
     size: tuple[float, float, float]
-    """Lengths of its sides, > 0."""
+    """Side lengths, > 0."""
     wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Its rotation as a quaternion."""
+    """Rotation as a quaternion."""
     keeps_inside: bool = True
-    """Whether what is inside stays selected, or what is outside."""
+    """Whether Gaussians inside the box stay selected; False: those outside."""
 
     @property
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Its corners: the lowest bit of their numbers is along the first axis of the box, the highest along the last.
+        """Corners. Bit i of a corner's index says on which side it lies along axis i of the box.
 
         >>> Box((0, 0, 0), (2, 4, 6)).corners[[0, 1, 7]].tolist()
         [[-1.0, -2.0, -3.0], [1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
@@ -179,7 +187,7 @@ class Box:
         return np.array(self.centre) + local + w * turn + np.cross(axis, turn)
 
     def kept(self, means: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Gaussians whose centres the box keeps.
+        """Return the mask of Gaussians whose centers the box keeps.
 
         >>> Box((0, 0, 0), (2, 2, 2)).kept(torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.0, 0.0]])).tolist()
         [True, False]

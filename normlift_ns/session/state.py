@@ -1,4 +1,4 @@
-"""What a person has asked, selected and hidden."""
+"""Immutable state of a session: what a user has asked, selected and hidden."""
 
 from __future__ import annotations
 
@@ -14,70 +14,71 @@ from normlift_ns.session.prompts import Prompt, join_prompts
 from normlift_ns.session.space import Box, Space
 
 POOR = 0.6
-"""R below which a Gaussian is poorly evidenced."""
+"""R below which the evidence of a Gaussian is weak."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that is shown to one person, but for the camera. Never changed; masks in it are not either.
+    """Everything that one user sees, except the camera. Neither the state nor its masks are ever changed.
 
-    The selection is made in this order: what the prompts select (unless `from_answer` is False), with `added` and
-    without `removed`, grown or shrunk, cut by the box.
+    The selection starts with the Gaussians that the prompts select, unless `from_answer` is False. `added` is added to
+    it and `removed` is removed; the result is grown or shrunk, then cut by the box.
     """
 
     space: Space
     prompts: tuple[Prompt, ...] = ()
-    """All rows, those with a problem too."""
+    """All rows, including those with errors."""
     question: Question | None = None
-    """Of the rows without a problem; it also has the threshold and the minimum reliability."""
+    """Query of the rows without errors, with the threshold and the minimum reliability."""
     shown: int | None = None
-    """The text of the question that selects; None: all of them."""
+    """Index of the only prompt of the query that selects; None: all of them select."""
     from_answer: bool = True
+    """Whether the prompts select; False: the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     steps: int = 0
-    """Of growth over the neighbour graph; below 0 of shrinking."""
+    """Steps of growth over the neighbor graph; negative: steps of shrinking."""
     box: Box | None = None
     hidden: Bool[Tensor, " n"] | None = None
-    """What is not drawn."""
+    """Gaussians that are not drawn."""
     look: str = "colours"
-    """How the viewer draws it; the viewer has the names."""
+    """Color mode; each viewer defines the names."""
     did: str = ""
-    """The action that led here, for the list of steps."""
+    """Description of the action that led to this state."""
 
     @cached_property
     def answer(self) -> Answer | None:
-        """To the question; None without one."""
+        """Answer to the query; None without one."""
         return None if self.question is None else self.space.answer(self.question)
 
     @cached_property
     def unresized(self) -> Bool[Tensor, " n"]:
-        """What the prompts and clicks select, before it is grown and cut."""
-        found = self.space.none()
+        """Gaussians selected by prompts and clicks, before growing and cutting."""
+        mask = self.space.none()
         if self.answer is not None and self.from_answer:
-            found = self.answer.mask if self.shown is None else self.answer.selected[:, self.shown]
-        found = found if self.added is None else found | self.added
-        return found if self.removed is None else found & ~self.removed
+            mask = self.answer.mask if self.shown is None else self.answer.selected[:, self.shown]
+        mask = mask if self.added is None else mask | self.added
+        return mask if self.removed is None else mask & ~self.removed
 
     @cached_property
     def selection(self) -> Bool[Tensor, " n"]:
-        """The selected Gaussians, hidden or not."""
-        found = self.space.resized(self.unresized, self.steps, refined=self.refined)
-        return found if self.box is None else found & self.box.kept(self.space.means)
+        """Selected Gaussians, whether hidden or not."""
+        mask = self.space.resized(self.unresized, self.steps, refined=self.refined)
+        return mask if self.box is None else mask & self.box.kept(self.space.means)
 
     @property
     def drawn(self) -> Bool[Tensor, " n"]:
-        """Everything that is not hidden."""
+        """Gaussians that are not hidden."""
         return ~self.space.none() if self.hidden is None else ~self.hidden
 
     @property
     def by_hand(self) -> str:
-        """What to say after the number of selected Gaussians where prompts do not select; empty: they do."""
+        """Suffix for the number of selected Gaussians if the selection was made by hand; empty if prompts select."""
         return "" if self.from_answer else ", by hand"
 
     @property
     def name(self) -> str:
-        """What a file of the selection is called: the prompts that select, or where none does "selection"."""
+        """Name for a file of the selection: the prompts that select, or "selection" if none does."""
         if self.question is None or not self.from_answer:
             return "selection"
         texts = self.question.texts
@@ -85,25 +86,25 @@ class State:
 
     @property
     def refined(self) -> bool:
-        """Whether refined features are asked."""
+        """Whether the query uses refined features."""
         return True if self.question is None else self.question.refined
 
     @cached_property
     def poor(self) -> float:
-        """Share of the selection that is poorly evidenced; 0 where nothing is selected."""
-        chosen = self.space.field.scalars.reliability[self.selection]
-        return float((chosen < POOR).float().mean()) if len(chosen) > 0 else 0.0
+        """Fraction of the selection with weak evidence; 0 if nothing is selected."""
+        reliability = self.space.field.scalars.reliability[self.selection]
+        return float((reliability < POOR).float().mean()) if len(reliability) > 0 else 0.0
 
     @property
     def remark(self) -> str:
-        """What a person should know of the evidence before they trust the selection; empty: nothing.
+        """Warning if at least a quarter of the selection has weak evidence, else empty.
 
-        `actions.leave_out_poor` does what it offers.
+        `actions.leave_out_poor` removes the Gaussians in question.
         """
         if self.poor < 0.25:
             return ""
-        return f"{self.poor:.0%} of this selection is poorly evidenced (R < {POOR:g})."
+        return f"{self.poor:.0%} of this selection has weak evidence (R < {POOR:g})."
 
     def lean(self) -> State:
-        """The same without what it has computed, for a history: it computes it again where it is shown again."""
+        """Return a copy without cached results, for a history. They are computed again when it is shown again."""
         return replace(self)

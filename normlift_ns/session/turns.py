@@ -1,4 +1,4 @@
-"""Who works, and whose answer still counts: a number per person that rises with every question."""
+"""Request tokens that discard stale results: a number per user that increases with every request."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from threading import Lock
 
 @dataclass(frozen=True)
 class Turn:
-    """A ticket for one piece of work."""
+    """Token of one request."""
 
     number: int
     what: str
-    """What a person reads while it runs."""
+    """Description of the request, shown while it runs."""
 
 
 @dataclass
 class Turns:
-    """Tickets of one person. May be used from any thread.
+    """Tokens of one user. Methods may be called from any thread.
 
     >>> turns = Turns()
     >>> first, second = turns.start("Reading red"), turns.start("Reading blue")
@@ -29,32 +29,32 @@ class Turns:
     _last: Turn = Turn(0, "")
     _running: bool = False
 
-    def start(self, what: str) -> Turn:
-        """A ticket; those before it are stale from now on."""
+    def start(self, description: str) -> Turn:
+        """Return a new token; all earlier ones become stale."""
         with self._lock:
-            self._last, self._running = Turn(self._last.number + 1, what), True
+            self._last, self._running = Turn(self._last.number + 1, description), True
             return self._last
 
-    def wanted(self, turn: Turn) -> bool:
-        """Whether the answer of a ticket still counts."""
+    def wanted(self, token: Turn) -> bool:
+        """Return whether the result of a request is still wanted."""
         with self._lock:
-            return self._running and turn.number == self._last.number
+            return self._running and token.number == self._last.number
 
-    def finish(self, turn: Turn) -> bool:
-        """Whether the answer of a ticket still counts; it is not busy any more then."""
+    def finish(self, token: Turn) -> bool:
+        """End a request; return whether its result is still wanted."""
         with self._lock:
-            current = self._running and turn.number == self._last.number
+            current = self._running and token.number == self._last.number
             self._running = self._running and not current
             return current
 
     def cancel(self) -> bool:
-        """Makes what runs stale; whether anything ran."""
+        """Make the running request stale; return whether there was one."""
         with self._lock:
-            was, self._running = self._running, False
-            return was
+            running, self._running = self._running, False
+            return running
 
     @property
     def busy(self) -> str:
-        """What runs, in words; empty: nothing."""
+        """Description of the running request; empty if there is none."""
         with self._lock:
             return self._last.what if self._running else ""

@@ -1,4 +1,4 @@
-"""What an answer says of itself: how relevancies are spread, where to cut, and whether a prompt is in the scene."""
+"""Diagnostics of a query: relevancy histograms, suggested thresholds, and prompts that may not be in the scene."""
 
 from __future__ import annotations
 
@@ -14,56 +14,58 @@ from normlift_ns.session.state import State
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What the relevancies of one prompt say."""
+    """Diagnostics of one prompt."""
 
     text: str
+    """The prompt."""
     colour: Colour
-    """Of the prompt."""
+    """Color of the prompt."""
     histogram: Histogram
+    """Histogram of its relevancies."""
     words: str
-    """That it is probably not in the scene, or that nothing reaches the threshold, and where the scene is most like it;
-    empty: something is selected that stands out, or nobody can tell."""
+    """Warning that the prompt is probably not in the scene, or that nothing reaches the threshold, with the nearest
+    match; empty if a selected match stands out, or if presence cannot be judged."""
     nearest: tuple[float, float, float] | None = None
-    """Where the scene is most like it, if there are words."""
+    """Position of the nearest match, if there is a warning."""
 
 
 def verdicts(state: State, *, most: int = 3) -> tuple[Verdict, ...]:
-    """Of the prompts that select, the first `most` of them; none where the selection was made by hand."""
+    """Return the diagnostics of the first `most` prompts that select; none if the selection was made by hand."""
     answer = state.answer
     if answer is None or not state.from_answer:
         return ()
-    colours = prompt_colours(answer.texts)
-    which = range(len(answer.texts)) if state.shown is None else [state.shown]
-    found = []
-    for index in which[:most]:
+    colors = prompt_colours(answer.texts)
+    prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
+    results = []
+    for index in prompts[:most]:
         finding = Finding(answer, index)
         if finding.histogram is not None:
-            words = _words(finding, finding.histogram)
-            x = finding.nearest if words else None
-            place = None if x is None else (x[0], x[1], x[2])
-            found.append(Verdict(finding.text, colours[index], finding.histogram, words, place))
-    return tuple(found)
+            warning = _warning(finding, finding.histogram)
+            x = finding.nearest if warning else None
+            position = None if x is None else (x[0], x[1], x[2])
+            results.append(Verdict(finding.text, colors[index], finding.histogram, warning, position))
+    return tuple(results)
 
 
-def _words(finding: Finding, histogram: Histogram) -> str:
+def _warning(finding: Finding, histogram: Histogram) -> str:
     if is_click(finding.text) or histogram.stands_out is None:
         return ""
-    place = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
+    position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
     if not histogram.stands_out:
         return (
-            f"{finding.text}: probably not in this scene. The nearest match{place} has relevancy {histogram.top:.2f}; "
-            f"things that are in a scene reach {histogram.limit:.2g} or more."
+            f"{finding.text}: probably not in this scene. The nearest match{position} has relevancy "
+            f"{histogram.top:.2f}; objects in a scene reach {histogram.limit:.2g} or more."
         )
     if finding.peak is None or bool(finding.mask.any()):
         return ""
     return (
         f"{finding.text}: nothing is above the threshold of {finding.answer.question.threshold:.2f}. "
-        f"The nearest match{place} has relevancy {finding.peak:.2f}; lower the threshold, or press Suggested."
+        f"The nearest match{position} has relevancy {finding.peak:.2f}; lower the threshold, or press Suggested."
     )
 
 
 def suggested(state: State) -> float | None:
-    """The threshold that the histogram of the prompts that select suggests; None where there is none."""
+    """Return the threshold suggested by the histogram of the prompts that select; None without a suggestion."""
     answer = state.answer
     if answer is None:
         return None
@@ -73,17 +75,17 @@ def suggested(state: State) -> float | None:
 
 
 def carried(state: State, question: Question) -> Question:
-    """The next question with the threshold of the one before, where both go by the same rule.
+    """Return a new query with the threshold of the previous one, if both use the same rule.
 
-    A question that asks for a suggested threshold gets one of its own, unless the person has chosen the one before.
+    A query that asks for a suggested threshold keeps its own, unless the user has chosen the previous one.
     """
-    before = state.question
-    if before is None or (before.rule, _clicked(before)) != (question.rule, _clicked(question)):
+    previous = state.question
+    if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
         return question
-    if question.suggest and before.threshold in (suggested(state), suggested(replace(state, shown=None))):
+    if question.suggest and previous.threshold in (suggested(state), suggested(replace(state, shown=None))):
         return question
-    return replace(question, threshold=before.threshold, suggest=False)
+    return replace(question, threshold=previous.threshold, suggest=False)
 
 
-def _clicked(question: Question) -> bool:
+def _only_clicks(question: Question) -> bool:
     return all(is_click(text) for text in question.texts)

@@ -1,4 +1,4 @@
-"""Where a camera goes to look at something."""
+"""Camera positions to look at an object from."""
 
 from __future__ import annotations
 
@@ -15,87 +15,97 @@ from normlift_ns.raster.picking import ray_weights
 from normlift_ns.session.found import FoundObject
 
 Place = tuple[float, float, float]
-_CLEAR = 0.25
-"""Opacity of what may stand in the way."""
-_TURNS, _TILTS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
-"""Degrees, around the vertical and from above."""
+"""x, y, z in scene units."""
+_MAX_OCCLUSION = 0.25
+"""Opacity in front of the object up to which the view counts as clear."""
+_AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
+"""Degrees around the vertical and above the current height."""
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A place to go to that is no object."""
+    """Point to look at that is not an object."""
 
     centre: Place
     extent: float
-    """How much around it is to be seen."""
+    """Size of the region around the point that is to be visible."""
 
 
 def clear_viewpoint(
-    found: FoundObject | Spot,
+    target: FoundObject | Spot,
     scene: GaussianScene,
     drawn: Bool[Tensor, " n"] | None,
-    from_: Sequence[float] | np.ndarray,
+    camera_position: Sequence[float] | np.ndarray,
     up: Sequence[float] | np.ndarray,
     field_of_view: float = 0.9,
 ) -> Place:
-    """As `viewpoint`, from the first side from which nothing stands before it; where there is none, from the best.
+    """Return the first camera position with a clear view of an object, or the one with the least occlusion.
 
-    The sides are tried from where the camera is: turned around the vertical, at its height first and then from above.
+    Candidates start from the current side of the camera: turned around the vertical, first at its height, then from
+    above.
 
     Args:
-        drawn: Gaussians that can stand in the way; None: all.
-        up: the vertical.
+        target: object or point to look at.
+        scene: Gaussians that may occlude it.
+        drawn: mask of the Gaussians that are drawn; None: all.
+        camera_position: current position of the camera.
+        up: direction of the vertical.
+        field_of_view: of the camera, in radians.
     """
-    first = viewpoint(found, from_, field_of_view)
-    centre = torch.tensor(found.centre, dtype=torch.float64)
-    reach = float(np.linalg.norm(np.asarray(first) - np.asarray(found.centre)))
+    first = viewpoint(target, camera_position, field_of_view)
+    center = torch.tensor(target.centre, dtype=torch.float64)
+    distance = float(np.linalg.norm(np.asarray(first) - np.asarray(target.centre)))
     means = scene.means.detach().double().cpu()
-    near = (means - centre).norm(dim=1) - 3 * scene.scales.detach().double().cpu().amax(dim=1) < reach
+    near = (means - center).norm(dim=1) - 3 * scene.scales.detach().double().cpu().amax(dim=1) < distance
     near = near if drawn is None else near & drawn.cpu()
     parts = (x.detach().cpu()[near] for x in (scene.means, scene.quats, scene.scales, scene.opacities))
-    around, best, least = GaussianScene(*parts), first, np.inf
-    for place in _sides(np.asarray(first), np.asarray(found.centre), np.asarray(up, float)):
-        hidden = _in_the_way(around, torch.from_numpy(place), centre, found.extent / 2)
-        if hidden < least:
-            best, least = (float(place[0]), float(place[1]), float(place[2])), hidden
-        if least <= _CLEAR:
+    occluders, best, least = GaussianScene(*parts), first, np.inf
+    for position in _candidates(np.asarray(first), np.asarray(target.centre), np.asarray(up, float)):
+        occlusion = _occlusion(occluders, torch.from_numpy(position), center, target.extent / 2)
+        if occlusion < least:
+            best, least = (float(position[0]), float(position[1]), float(position[2])), occlusion
+        if least <= _MAX_OCCLUSION:
             break
     return best
 
 
-def viewpoint(found: FoundObject | Spot, from_: Sequence[float] | np.ndarray, field_of_view: float = 0.9) -> Place:
-    """Where a camera goes that looks at an object or a spot: from the side where it is, so far that it fills half the
-    picture.
+def viewpoint(
+    target: FoundObject | Spot, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
+) -> Place:
+    """Return the camera position on the current side of an object from which it fills half of the image.
 
     Args:
-        from_: where the camera is now.
+        target: object or point to look at.
+        camera_position: current position of the camera.
         field_of_view: of the camera, in radians.
     """
-    centre = np.asarray(found.centre)
-    away = np.asarray(from_, float) - centre
-    length = float(np.linalg.norm(away))
-    away = away / length if length > 0 else np.array([0.0, -1.0, 0.0])
-    distance = max(found.extent, 1e-6) / np.tan(field_of_view / 2)
-    place = centre + away * distance
-    return float(place[0]), float(place[1]), float(place[2])
+    center = np.asarray(target.centre)
+    offset = np.asarray(camera_position, float) - center
+    length = float(np.linalg.norm(offset))
+    offset = offset / length if length > 0 else np.array([0.0, -1.0, 0.0])
+    distance = max(target.extent, 1e-6) / np.tan(field_of_view / 2)
+    position = center + offset * distance
+    return float(position[0]), float(position[1]), float(position[2])
 
 
-def _sides(place: np.ndarray, centre: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
-    """Places around a centre, as far away as the first one, which is the first."""
-    away = place - centre
-    distance, up = np.linalg.norm(away), up / max(float(np.linalg.norm(up)), 1e-12)
-    along = (away @ up) * up
-    level, across = away - along, np.cross(up, away)
-    for tilt in _TILTS:
-        for turn in _TURNS:
-            turned = np.cos(np.radians(turn)) * level + np.sin(np.radians(turn)) * across + along
-            turned = turned + np.tan(np.radians(tilt)) * distance * up
-            yield centre + turned * (distance / max(float(np.linalg.norm(turned)), 1e-12))
+def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield positions at the same distance around a center, the given one first."""
+    offset = position - center
+    distance, up = np.linalg.norm(offset), up / max(float(np.linalg.norm(up)), 1e-12)
+    along = (offset @ up) * up
+    level, across = offset - along, np.cross(up, offset)
+    for elevation in _ELEVATIONS:
+        for azimuth in _AZIMUTHS:
+            turned = np.cos(np.radians(azimuth)) * level + np.sin(np.radians(azimuth)) * across + along
+            turned = turned + np.tan(np.radians(elevation)) * distance * up
+            yield center + turned * (distance / max(float(np.linalg.norm(turned)), 1e-12))
 
 
-def _in_the_way(scene: GaussianScene, place: Float[Tensor, " 3"], centre: Float[Tensor, " 3"], margin: float) -> float:
-    """Opacity of what is met between a place and what is looked at there, without the last `margin` before it."""
-    direction = centre - place
+def _occlusion(
+    scene: GaussianScene, position: Float[Tensor, " 3"], center: Float[Tensor, " 3"], margin: float
+) -> float:
+    """Return the opacity between a position and a center, without the last `margin` in front of the center."""
+    direction = center - position
     length = direction.norm().clamp(min=1e-12)
-    before = (scene.means.double() - place) @ (direction / length) < length - margin
-    return float(ray_weights(scene, place, direction)[before].sum())
+    before = (scene.means.double() - position) @ (direction / length) < length - margin
+    return float(ray_weights(scene, position, direction)[before].sum())

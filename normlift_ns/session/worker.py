@@ -1,4 +1,4 @@
-"""Work that waits its turn without holding up a thread of viser's: its few threads serve all pages."""
+"""Job queue that keeps slow work out of viser's few threads, which serve all pages."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from collections.abc import Callable
 
 
 class Worker:
-    """Does one thing after another, in a thread that lives as long as there is something to do.
+    """Queue that runs jobs one after another, in a thread that ends when the queue is empty.
 
-    >>> done, worker = threading.Event(), Worker()
-    >>> worker.put(done.set)
-    >>> done.wait(5)
+    >>> event, worker = threading.Event(), Worker()
+    >>> worker.put(event.set)
+    >>> event.wait(5)
     True
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._jobs: deque[tuple[str, Callable[[], None]]] = deque()
-        self._works = self._ended = False
+        self._running = self._ended = False
 
     def put(self, job: Callable[[], None], key: str = "") -> None:
-        """Does something after what was put before.
+        """Add a job to the end of the queue.
 
         Args:
-            job: raises nothing.
-            key: of those of the same key that wait in a row only the last is done; empty: all.
+            job: must not raise.
+            key: of successive waiting jobs with the same key, only the last one runs; empty: all run.
         """
         with self._lock:
             if self._ended:
@@ -34,27 +34,27 @@ class Worker:
             if key and self._jobs and self._jobs[-1][0] == key:
                 self._jobs.pop()
             self._jobs.append((key, job))
-            if self._works:
+            if self._running:
                 return
-            self._works = True
-        threading.Thread(target=self._work, daemon=True).start()
+            self._running = True
+        threading.Thread(target=self._run, daemon=True).start()
 
     def drop(self) -> None:
-        """Forgets what waits; what is being done is done to its end."""
+        """Discard the waiting jobs; the running one continues."""
         with self._lock:
             self._jobs.clear()
 
     def end(self) -> None:
-        """Takes nothing any more."""
+        """Discard the waiting jobs and accept no further ones."""
         with self._lock:
             self._ended = True
             self._jobs.clear()
 
-    def _work(self) -> None:
+    def _run(self) -> None:
         while True:
             with self._lock:
                 if not self._jobs:
-                    self._works = False
+                    self._running = False
                     return
                 _, job = self._jobs.popleft()
             job()

@@ -1,1 +1,1 @@
-"""What a viewer shows of a field, whichever viewer it is."""
+"""Web viewer, and the parts that it shares with the panel in nerfstudio's viewer."""

@@ -1,9 +1,10 @@
-"""All that is known of viser, and of the two lines of it: 0.2.7, which nerfstudio 1.1.5 pins, and 1.x.
+"""Adapter for viser in its two versions: 0.2.7, which nerfstudio 1.1.5 pins, and 1.x.
 
-0.2.7 draws Gaussians by a private helper that fails on thin ones (it adds 1e-7 to every entry of a covariance and takes
-its Cholesky factor) and never repaints a resend under the same name. Its message is therefore made here, and names are
-swapped. 1.x, which cannot be installed beside nerfstudio 1.1.5, has `add_gaussian_splats` for it; `make test-viser1`
-runs the tests of this file with it. Where the two differ a comment says so.
+viser 0.2.7 draws Gaussians with a private helper that fails on thin ones: it adds 1e-7 to every entry of a covariance
+before the Cholesky decomposition. It also ignores Gaussians that are sent again under the same name. This module
+therefore builds the message itself, and uses a new name each time. 1.x has `add_gaussian_splats` instead, but cannot be
+installed together with nerfstudio 1.1.5; `make test-viser1` runs the tests of this module with it. Comments mark
+differences between the versions.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from normlift_ns.viewer.blind.page import picture_script
 from normlift_ns.viewer.serving.guard import guarded
 
 SESSION = "Session"
-"""Label of the text box through which the page's script tells the server its token and its link; it is not shown."""
+"""Label of the hidden text box through which the page's script sends its token and its link to the server."""
 _EDGES = (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)
-"""Corners on a way along all edges of a box."""
-_HELD = (None, "shift", "alt")
-"""Keys with which a click counts."""
+"""Corners of a box along a path that contains all edges."""
+_MODIFIERS = (None, "shift", "alt")
+"""Modifier keys with which a click is handled."""
 _SCRIPT = """
 (() => {
   const labelled = (text) => [...document.querySelectorAll("label")].find((l) => l.textContent === text);
@@ -42,9 +43,9 @@ _SCRIPT = """
     while (row && !row.querySelector("input")) row = row.parentElement;
     return row;
   };
-  const tell = (held = "") => {
+  const send = (held = "") => {
     const row = rowOf("SESSION");
-    if (!row) return setTimeout(tell, 50);
+    if (!row) return setTimeout(send, 50);
     const box = row.querySelector("input");
     row.parentElement.style.display = "none";
     let token = sessionStorage.getItem("normlift");
@@ -53,12 +54,12 @@ _SCRIPT = """
       sessionStorage.setItem("normlift", token);
     }
     const webgl = !window.normliftBlind;
-    const asked = new URLSearchParams(location.search).get("q");
-    const value = JSON.stringify({token, link: asked ? "q=" + asked : "", webgl, held});
+    const query = new URLSearchParams(location.search).get("q");
+    const value = JSON.stringify({token, link: query ? "q=" + query : "", webgl, held});
     Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(box, value);
     box.dispatchEvent(new Event("input", {bubbles: true}));
   };
-  tell();
+  send();
   if (window.normlift) return;
   window.normlift = true;
   const style = document.createElement("style");
@@ -67,11 +68,11 @@ _SCRIPT = """
     .mantine-ActionIcon-root:has(.tabler-icon-share) { display: none; }`;
   document.head.append(style);
   const typing = (event) => ["INPUT", "TEXTAREA"].includes(event.target.tagName);
-  const deeds = {Shift: "Add", Alt: "Take away"};
+  const actions = {Shift: "Add", Alt: "Take away"};
   let held = "";
   const hold = (key, wait) => {
     held = key;
-    setTimeout(() => { if (held === key) tell(deeds[key] || ""); }, wait);
+    setTimeout(() => { if (held === key) send(actions[key] || ""); }, wait);
   };
   addEventListener("keydown", (event) => {
     const row = rowOf("Prompts");
@@ -79,7 +80,7 @@ _SCRIPT = """
     if (event.key === "Enter" && event.target === box) setTimeout(() => press("Ask"), 150);
     if (event.key === "Escape") press("Cancel");
     if (typing(event) || event.repeat) return;
-    if (event.key in deeds) hold(event.key, 0);
+    if (event.key in actions) hold(event.key, 0);
     if (event.key === "Alt") event.preventDefault();
     if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") press(event.shiftKey ? "Redo" : "Undo");
   });
@@ -90,11 +91,14 @@ _SCRIPT = """
 
 
 class Server:
-    """A viser server.
+    """viser server with a page for each browser.
 
     Args:
-        on_page: called in a thread of its own for every browser that opens the page, or comes back to it.
-        on_gone: called when it is closed or cut off.
+        host: address to bind to.
+        port: port to bind to.
+        label: text above the panel of every page.
+        on_page: called in a separate thread for every browser that connects or reconnects.
+        on_gone: called with the number of the page when it is closed or its connection is lost.
     """
 
     def __init__(
@@ -107,7 +111,7 @@ class Server:
     ) -> None:
         import viser  # noqa: PLC0415 (--help should not wait for it)
 
-        with guarded(), contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
+        with guarded(), contextlib.redirect_stdout(io.StringIO()):  # hides viser's table of addresses
             self._server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         self.host, self.port = host, self._server.get_port()
         self._refuse_tunnels()
@@ -119,7 +123,7 @@ class Server:
             gui.configure_theme(control_layout="collapsible", show_logo=False)
 
         @self._server.on_client_connect
-        def _(client: Any) -> None:  # under a lock of viser's
+        def _(client: Any) -> None:  # viser holds a lock during this call
             threading.Thread(target=on_page, args=(Page(client),), daemon=True).start()
 
         @self._server.on_client_disconnect
@@ -127,10 +131,10 @@ class Server:
             on_gone(client.client_id)
 
     def _refuse_tunnels(self) -> None:
-        """A page could ask viser to publish the server on the internet; nobody told it to.
+        """Remove the handlers through which a page could make viser publish the server on the internet.
 
-        The script hides the button. viser could itself, but 0.2.7's page then loses count of React's hooks, and stays
-        white on a phone.
+        The script hides the button. viser has an option for that, but with it, 0.2.7's page calls React hooks in a
+        varying order and stays blank on a phone.
         """
         from viser import _messages  # noqa: PLC0415
 
@@ -140,27 +144,27 @@ class Server:
                 self._server._websock_server.unregister_handler(message)  # pyright: ignore[reportArgumentType]
 
     def label(self, text: str) -> None:
-        """Stands over the panel of every page."""
+        """Set the text above the panel of every page."""
         self._server.gui.set_panel_label(text)
 
     def stop(self) -> None:
-        """Closes all pages."""
+        """Stop the server, which closes all pages."""
         self._server.stop()
 
 
 class Page:
-    """The page of one browser, from its connection to its loss."""
+    """Page in one browser, for the lifetime of its connection."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
         if hasattr(client._websock_connection, "unsafe_send_message"):  # 0.2.7
-            _in_order(client._websock_connection)
+            _send_in_order(client._websock_connection)
         else:
-            _in_html(client._websock_connection)
-        _hear_sense(client._websock_connection)
-        self._waiting: Any = client._websock_connection._state.message_buffer
+            _send_html(client._websock_connection)
+        _ignore_invalid_values(client._websock_connection)
+        self._buffer: Any = client._websock_connection._state.message_buffer
         self.number: int = client.client_id
-        """Of the connection."""
+        """Number of the connection."""
         self._splats: Any = None
         self._box: Any = None
         self._notice: Any = None
@@ -168,36 +172,36 @@ class Page:
 
     @property
     def gui(self) -> Any:
-        """Widgets of this page alone: viser's `GuiApi`."""
+        """viser's `GuiApi` for widgets of this page only."""
         return self._client.gui
 
     @property
     def camera(self) -> Any:
-        """viser's camera of this page, in the browser's units."""
+        """viser's camera of this page, in units of the viser scene."""
         return self._client.camera
 
     @property
     def gone(self) -> bool:
         """Whether the connection is lost."""
-        return self._waiting.done
+        return self._buffer.done
 
     @property
     def behind(self) -> bool:
-        """Whether messages wait for the page to take those before."""
-        return len(self._waiting.message_from_id) > 0
+        """Whether messages wait until the page has received earlier ones."""
+        return len(self._buffer.message_from_id) > 0
 
     def together(self) -> Any:
-        """A context whose messages the page shows at once."""
+        """Return a context whose messages take effect on the page at the same time."""
         return self._client.atomic()
 
     def notice(self, text: str) -> None:
-        """Shows a text in the panel, in place of that before; an empty one: none."""
+        """Show a text in the panel in place of the previous one; empty: show none."""
         if self._notice is not None:
             self._notice.remove()
         self._notice = self._client.gui.add_markdown(text) if text else None
 
     def draw(self, buffer: UInt32[np.ndarray, "k 8"]) -> None:
-        """Draws Gaussians in place of those before."""
+        """Draw Gaussians in place of the previous ones."""
         with self.together():
             if self._splats is not None:
                 self._splats.remove()
@@ -208,53 +212,52 @@ class Page:
         self._client.flush()
 
     def outline(self, corners: Float[np.ndarray, "8 3"] | None) -> None:
-        """Draws the edges of a box in place of those before; None: of none."""
+        """Draw the edges of a box in place of the previous one; None: draw no box."""
         if self._box is not None:
             self._box.remove()
         self._box = None
         if corners is not None:
             add = self._client.scene.add_spline_catmull_rom
             old = "line_width" in inspect.signature(add).parameters  # 0.2.7
-            wide: dict[str, Any] = {"line_width": 4.0} if old else {"thickness": 4.0, "thickness_units": "screen"}
-            straight = {"curve_type": "catmullrom", "tension": 0.0, "segments": 240}  # between corners
+            width: dict[str, Any] = {"line_width": 4.0} if old else {"thickness": 4.0, "thickness_units": "screen"}
+            straight = {"curve_type": "catmullrom", "tension": 0.0, "segments": 240}  # straight lines between corners
             path = np.asarray(corners, float)[list(_EDGES)]
             points = tuple(map(tuple, path.tolist())) if old else path
-            self._box = add("/box", points, color=(255, 140, 0), **straight, **wide)
+            self._box = add("/box", points, color=(255, 140, 0), **straight, **width)
 
     def _add(self, name: str, buffer: UInt32[np.ndarray, "k 8"]) -> Any:
         scene = self._client.scene
         if hasattr(scene, "add_gaussian_splats"):  # 1.x
-            return scene.add_gaussian_splats(name, **_unpacked(buffer))
+            return scene.add_gaussian_splats(name, **_unpack_splats(buffer))
         from viser import GaussianSplatHandle, _messages  # noqa: PLC0415
 
         scene._websock_interface.queue_message(_messages.GaussianSplatsMessage(name=name, buffer=buffer))
         return GaussianSplatHandle._make(scene, name, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), True)
 
     def on_camera(self, moved: Callable[[], None]) -> None:
-        """Calls a function whenever the person moves the camera or changes the size of the page."""
+        """Call a function whenever the user moves the camera or resizes the page."""
         self._client.camera.on_update(lambda _: moved())
 
     def show_picture(self, jpeg: bytes) -> None:
-        """Shows a picture in place of the scene."""
+        """Show a JPEG image in place of the scene."""
         self._run(picture_script(jpeg))
 
     def up(self, direction: np.ndarray) -> None:
-        """Which way is up, for turning the camera."""
+        """Set the up direction around which the camera orbits."""
         self._client.scene.set_up_direction(direction)
 
     def listen(self) -> None:
-        """Runs the script that knows keys; it writes the token, the link and the key that is held into the box called
-        `SESSION`.
-        """
+        """Run the script that handles keys; it writes the token, the link and the held key into the box `SESSION`."""
         self._run(_SCRIPT)
 
     def become(self, token: str) -> None:
-        """Gives the page another token."""
+        """Set the session token of the page."""
         self._run(f'sessionStorage.setItem("normlift", {json.dumps(token)});')
 
     def address(self, query: str) -> None:
-        """Writes a link into the browser's address bar, and onto the clipboard where it lets us. It is the query of the
-        address: viser takes a fragment for part of the server's name.
+        """Set the query of the URL in the address bar, and copy the URL to the clipboard if the browser allows it.
+
+        The link is a query, because viser parses a fragment as part of the server's name.
         """
         self._run(
             f'history.replaceState(null, "", "?" + {json.dumps(query)});'
@@ -267,37 +270,38 @@ class Page:
         self._client._websock_connection.queue_message(_messages.RunJavascriptMessage(source=script))
 
     def download(self, name: str, content: bytes) -> None:
-        """Lets the browser save a file."""
+        """Send a file to the browser's downloads."""
         self._client.send_file_download(name, content)
 
     def on_click(self, clicked: Callable[[tuple[float, ...], tuple[float, ...]], None] | None) -> None:
-        """Calls a function with origin and direction of the ray of every click on the scene; None: of none."""
+        """Set the callback for clicks on the scene, called with origin and direction of the ray; None: remove it."""
         scene = self._client.scene
-        one = hasattr(scene, "on_click")  # 1.x, which also tells which keys are held
-        if one:
+        viser1 = hasattr(scene, "on_click")  # 1.x, where callbacks are registered per modifier key
+        if viser1:
             scene.remove_click_callback()
         elif clicked is None and scene._scene_pointer_cb is not None:
             scene.remove_pointer_callback()
         if clicked is None:
             return
-        told = clicked
-        for listen in [scene.on_click(modifier=keys) for keys in _HELD] if one else [scene.on_pointer_event("click")]:
-            listen(lambda event: told(event.ray_origin, event.ray_direction))
+        callback = clicked
+        events = [scene.on_click(modifier=key) for key in _MODIFIERS] if viser1 else [scene.on_pointer_event("click")]
+        for register in events:
+            register(lambda event: callback(event.ray_origin, event.ray_direction))
 
 
-def _in_order(connection: Any) -> None:
-    """Messages of a connection go in the order in which they are made, and those of `together` at once.
+def _send_in_order(connection: Any) -> None:
+    """Make a connection send its messages in order, and those within `Page.together` in one go.
 
-    viser 0.2.7 hands each message that is made within its `atomic` to one of 32 threads that serve all pages, where it
-    waits: a panel of sixty widgets stops all pages while it is made. Two threads can lock each other out for ever, an
-    error within does it surely, and messages overtake those that wait.
+    viser 0.2.7 passes each message created within its `atomic` to one of 32 threads that serve all pages, where the
+    message waits. A panel of sixty widgets therefore blocks all pages while it is created. Messages can overtake those
+    that wait, two threads can deadlock, and an exception within the context always causes a deadlock.
     """
-    lock, held, depth = threading.RLock(), [], [0]
+    lock, waiting, depth = threading.RLock(), [], [0]
 
     def queue_message(message: Any) -> None:
         with lock:
             if depth[0] > 0:
-                held.append(message)
+                waiting.append(message)
             else:
                 connection.unsafe_send_message(message)
 
@@ -310,64 +314,65 @@ def _in_order(connection: Any) -> None:
             finally:
                 depth[0] -= 1
                 if depth[0] == 0:
-                    for message in held:
+                    for message in waiting:
                         connection.unsafe_send_message(message)
-                    held.clear()
+                    waiting.clear()
 
     connection.queue_message, connection.atomic = queue_message, atomic
 
 
-def _in_html(connection: Any) -> None:
-    """Texts of a connection, which are MDX as 0.2.7 reads it, as the HTML that 1.x reads."""
+def _send_html(connection: Any) -> None:
+    """Make a connection convert texts from MDX, which 0.2.7 reads, to HTML, which 1.x reads."""
     queue = connection.queue_message
 
     def queue_message(message: Any) -> None:
-        for some in (getattr(message, "updates", None), vars(getattr(message, "props", connection))):
-            if isinstance(some, dict) and isinstance(some.get("_markdown"), str):
-                some["_markdown"] = html_of(some["_markdown"])
+        for props in (getattr(message, "updates", None), vars(getattr(message, "props", connection))):
+            if isinstance(props, dict) and isinstance(props.get("_markdown"), str):
+                props["_markdown"] = html_of(props["_markdown"])
         queue(message)
 
     connection.queue_message = queue_message
 
 
 def html_of(mdx: str) -> str:
-    """What MDX writes as an object, HTML writes as a text.
+    """Convert MDX to HTML: style objects become style strings.
 
     >>> html_of('<i style={{fontSize: "1em", color: "red"}}>a</i>')
     '<i style="font-size: 1em; color: red">a</i>'
     """
 
-    def style(found: re.Match[str]) -> str:
-        pairs = re.findall(r'(\w+): "([^"]*)"', found[1])
-        words = [f"{re.sub('[A-Z]', lambda big: '-' + big[0].lower(), name)}: {value}" for name, value in pairs]
-        return f'style="{"; ".join(words)}"'
+    def style(match: re.Match[str]) -> str:
+        pairs = re.findall(r'(\w+): "([^"]*)"', match[1])
+        rules = [f"{re.sub('[A-Z]', lambda upper: '-' + upper[0].lower(), name)}: {value}" for name, value in pairs]
+        return f'style="{"; ".join(rules)}"'
 
     return re.sub(r"style=\{\{(.*?)\}\}", style, mdx)
 
 
-def _hear_sense(connection: Any) -> None:
-    """What a page sends as the value of a widget is passed over where it is no such value: a lone minus in a box for
-    numbers is sent as one that is none, on which viser raises.
+def _ignore_invalid_values(connection: Any) -> None:
+    """Make a connection ignore invalid widget values from the page.
+
+    For example, a lone minus sign in a number box is sent as a value that is not a number, on which viser raises.
     """
     from viser import _messages  # noqa: PLC0415
 
-    def sensible(hear: Callable[[int, Any], Any]) -> Callable[[int, Any], Any]:
-        odd = contextlib.suppress(ArithmeticError, AssertionError, TypeError, ValueError)
+    def checked(handler: Callable[[int, Any], Any]) -> Callable[[int, Any], Any]:
+        invalid = contextlib.suppress(ArithmeticError, AssertionError, TypeError, ValueError)
 
-        def heard(number: int, message: Any) -> None:
+        def handle(number: int, message: Any) -> None:
             if all(map(_finite, message.updates.values())):
-                with odd:
-                    hear(number, message)
+                with invalid:
+                    handler(number, message)
 
-        async def heard_one(number: int, message: Any) -> None:  # 1.x
+        async def handle_async(number: int, message: Any) -> None:  # 1.x
             if all(map(_finite, message.updates.values())):
-                with odd:
-                    await hear(number, message)
+                with invalid:
+                    await handler(number, message)
 
-        return heard_one if inspect.iscoroutinefunction(hear) else heard
+        return handle_async if inspect.iscoroutinefunction(handler) else handle
 
     handlers = connection._incoming_handlers
-    handlers[_messages.GuiUpdateMessage] = [sensible(hear) for hear in handlers.get(_messages.GuiUpdateMessage, [])]
+    handlers[_messages.GuiUpdateMessage] = [checked(old) for old in handlers.get(_messages.GuiUpdateMessage, [])]
 
 
 def _finite(value: Any) -> bool:
@@ -377,10 +382,12 @@ def _finite(value: Any) -> bool:
 
 
 def button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
-    """Buttons in a row, without room for a label that is empty; `pressed` is called with the name of the one that is,
-    and with viser's event.
+    """Add a row of buttons to a panel; an empty label takes no room.
 
-    viser 0.2.7 passes over a button of a group that was the last to be pressed, and at first over the first one.
+    viser 0.2.7 ignores the button of a group that was pressed last, and initially the first button.
+
+    Args:
+        pressed: called with the caption of the pressed button and viser's event.
     """
     group = gui.add_button_group(label, options)
 
@@ -394,34 +401,34 @@ def button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable
 
 
 def pass_over_the_gone(server: Any) -> None:
-    """Nothing is printed about messages of a page that was closed before they were read.
+    """Silence tracebacks about messages from a page that was closed before they were handled.
 
-    viser 0.2.7 reads them in another thread, where it and nerfstudio 1.1.5 look up the page by its number, and prints a
-    traceback when it is not there any more.
+    viser 0.2.7 handles messages in another thread. There, it and nerfstudio 1.1.5 look up the page by its number, and
+    viser prints a traceback if the page no longer exists.
 
     Args:
-        server: viser's.
+        server: viser's server.
     """
 
-    def quiet(line: Any) -> None:
-        handle = line._handle_incoming_message
+    def silence(connection: Any) -> None:
+        handle = connection._handle_incoming_message
 
-        def read(number: int, message: Any) -> None:
+        def handle_quietly(number: int, message: Any) -> None:
             try:
                 handle(number, message)
             except KeyError as error:
                 if any(type(key) is not int or key in server.get_clients() for key in error.args):
                     raise
 
-        if not inspect.iscoroutinefunction(handle):  # as 1.x has it
-            line._handle_incoming_message = read
+        if not inspect.iscoroutinefunction(handle):  # in 1.x it is a coroutine
+            connection._handle_incoming_message = handle_quietly
 
-    quiet(server._websock_server)
-    server.on_client_connect(lambda client: quiet(client._websock_connection))
+    silence(server._websock_server)
+    server.on_client_connect(lambda client: silence(client._websock_connection))
 
 
-def _unpacked(buffer: UInt32[np.ndarray, "k 8"]) -> dict[str, np.ndarray]:
-    """Records as the arguments of viser 1.x."""
+def _unpack_splats(buffer: UInt32[np.ndarray, "k 8"]) -> dict[str, np.ndarray]:
+    """Return records as the arguments of viser 1.x's `add_gaussian_splats`."""
     factors = np.ascontiguousarray(buffer[:, 4:7]).view(np.float16).astype(np.float64)
     lower = np.zeros((len(buffer), 3, 3))
     lower[:, [0, 1, 2, 1, 2, 2], [0, 0, 0, 1, 1, 2]] = factors

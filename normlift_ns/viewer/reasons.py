@@ -1,4 +1,4 @@
-"""Why something is selected, as a panel shows it: the photographs that voted, and those that disagree most."""
+"""Explanation of a selection for a panel: the training images that voted for it, and those that disagree most."""
 
 from __future__ import annotations
 
@@ -19,95 +19,95 @@ from normlift_ns.viewer.legend import clipped
 from normlift_ns.viewer.status import as_text
 
 SHOWN = 3
-"""Photographs that weigh most, and as many that disagree most."""
-_BUSY = "Looking for the photographs that voted."
-_one_at_a_time = Lock()
-"""Votes read files and keep tables; two threads would do both twice."""
+"""Number of images shown with the largest weight, and of those shown with the largest disagreement."""
+_BUSY = "Looking for the training images that voted."
+_explain_lock = Lock()
+"""Held while votes are read and cached, so that two threads do not do both twice."""
 
 
 def reasons_mdx(votes: Votes, selected: Bool[Tensor, " n"], *, refined: bool = True) -> str:
-    """How far the photographs agree, in words, and the photographs with the regions that voted for a selection.
+    """Return the agreement of the images in words, and the images with the regions that voted for a selection.
 
-    Where they cannot be shown, as those of features that were given from Python, a sentence says why.
+    If the images cannot be shown, for instance because features were passed from Python, a sentence gives the reason.
 
     Raises:
-        ValueError: nothing is selected; what the cache no longer holds.
-        FileNotFoundError: a photograph that is needed to count the votes is gone.
+        ValueError: nothing is selected, or the cache lacks the votes.
+        FileNotFoundError: an image needed to count the votes is missing.
     """
     why = votes.explain(selected.cpu(), refined=refined)
-    most, different = why.views[:SHOWN], why.most_different[:SHOWN]
-    shown, problem = {}, ""
+    heaviest, different = why.views[:SHOWN], why.most_different[:SHOWN]
+    images, problem = {}, ""
     try:
-        for picture in votes.pictures(dict.fromkeys((*most, *different))):
-            shown[picture.vote.view] = photograph_mdx(picture.image)
+        for picture in votes.pictures(dict.fromkeys((*heaviest, *different))):
+            images[picture.vote.view] = photograph_mdx(picture.image)
     except (InputError, OSError) as error:
-        problem = f"The photographs cannot be shown: {error}"
+        problem = f"The images cannot be shown: {error}"
     lines = [as_text(why.sentence), *filter(None, [as_text(clipped(problem, 400))])]
-    for title, some in (("These weigh most:", most), ("These disagree most:", different)):
-        if len(some) > 0:
-            lines += [f"**{title}**", *_listed(some, votes.names, shown)]
+    for title, view_votes in (("Images that weigh most:", heaviest), ("Images that disagree most:", different)):
+        if len(view_votes) > 0:
+            lines += [f"**{title}**", *_list_votes(view_votes, votes.names, images)]
     return "\n\n".join(lines)
 
 
-def _listed(some: Sequence[ViewVote], names: Sequence[str], shown: dict[int, str]) -> list[str]:
-    """Each photograph with its numbers, and its picture where it was not shown before."""
+def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[int, str]) -> list[str]:
+    """List each view with its numbers, and with its image at the first mention."""
     lines = []
-    for vote in some:
+    for vote in votes:
         regions = "1 region" if len(vote.regions) == 1 else f"{len(vote.regions)} regions"
-        facts = f"{vote.share:.0%} of the weight ({vote.weight:,.0f} pixels, {regions}), cosine {vote.agreement:.2f}"
+        numbers = f"{vote.share:.0%} of the weight ({vote.weight:,.0f} pixels, {regions}), cosine {vote.agreement:.2f}"
         if vote.disagreement >= 0.005:
-            facts += f", {vote.disagreement:.0%} of the disagreement"
-        lines.append(f"{as_text(clipped(names[vote.view], 60))}: {as_text(facts)}")
-        lines += filter(None, [shown.pop(vote.view, "")])
+            numbers += f", {vote.disagreement:.0%} of the disagreement"
+        lines.append(f"{as_text(clipped(names[vote.view], 60))}: {as_text(numbers)}")
+        lines += filter(None, [images.pop(vote.view, "")])
     return lines
 
 
 class Reasons:
-    """What one person is told; what belongs to a selection before is dropped.
+    """Explanation shown to one user. It is dropped when the selection changes.
 
     Args:
-        votes: of the run; opened when they are first wanted.
+        votes: returns the votes of the run; called at the first explanation.
     """
 
     def __init__(self, votes: Callable[[], Votes]) -> None:
         self._votes, self._turns = votes, Turns()
-        self._of: Bool[Tensor, " n"] | None = None
+        self._selection: Bool[Tensor, " n"] | None = None
         self.content = ""
-        """As MDX; empty: nobody asked why."""
+        """MDX of the explanation; empty if there is none."""
 
     @property
     def busy(self) -> str:
-        """What runs, in words; empty: nothing."""
+        """Description of the running work; empty if there is none."""
         return self._turns.busy
 
     def start(self, state: State) -> Turn:
-        """A ticket to `find` the reasons of a selection; those before are dropped."""
-        self._of, self.content = state.selection, ""
+        """Return a token to `find` the explanation of a selection; the previous explanation is dropped."""
+        self._selection, self.content = state.selection, ""
         return self._turns.start(_BUSY)
 
-    def find(self, turn: Turn, state: State) -> None:
-        """Looks for the reasons of a selection, which can take seconds: to be called without a lock, in any thread.
+    def find(self, token: Turn, state: State) -> None:
+        """Compute the explanation of a selection. This can take seconds: call it without a lock, from any thread.
 
         Raises:
-            ValueError, FileNotFoundError: as `reasons_mdx`, unless nobody waits for them any more.
+            ValueError, FileNotFoundError: as `reasons_mdx`, unless the request is stale.
         """
-        found = ""
+        content = ""
         try:
-            with _one_at_a_time:
-                if self._turns.wanted(turn):
-                    found = reasons_mdx(self._votes(), state.selection, refined=state.refined)
+            with _explain_lock:
+                if self._turns.wanted(token):
+                    content = reasons_mdx(self._votes(), state.selection, refined=state.refined)
         except Exception:
-            if self._turns.finish(turn):
+            if self._turns.finish(token):
                 raise
-        if self._turns.finish(turn):
-            self.content = found
+        if self._turns.finish(token):
+            self.content = content
 
     def follow(self, state: State) -> None:
-        """Forgets the reasons of another selection than that of this state."""
-        if self._of is not None and not torch.equal(self._of, state.selection):
+        """Drop the explanation if the selection of this state is another one."""
+        if self._selection is not None and not torch.equal(self._selection, state.selection):
             self.forget()
 
     def forget(self) -> None:
-        """Drops what is shown and what runs."""
+        """Drop the explanation and any running computation."""
         self._turns.cancel()
-        self._of, self.content = None, ""
+        self._selection, self.content = None, ""

@@ -107,7 +107,7 @@ def viewer(viewed: tuple[Any, Any]) -> Any:
 @pytest.fixture
 def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The pipeline as loaded; what the panel writes goes to a folder of the test."""
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.insights._CALM", 0.01)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.insights._DELAY", 0.01)
     model, output = viewed[0].model, viewed[1].control_panel._output_render
     field = model.field
     model.config.semantics = tmp_path / "run" / "normlift"
@@ -370,7 +370,7 @@ def test_fifty_prompts_and_markup(panel: Any, pipeline: Any) -> None:
 
 def listed(panel: Any) -> list[Any]:
     """The buttons of the found objects, once they are listed for what is selected."""
-    until(lambda: panel._rest._turns.busy == "")
+    until(lambda: panel._details._turns.busy == "")
     with panel._lock:  # which is held from then on, until they are shown
         return [group for _, group in panel._widgets.rows._rows if group.visible]
 
@@ -403,7 +403,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert "up: probably not in this scene" in html.unescape(panel._widgets.histograms.content)
     press_row(groups[0], "hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
-    assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._remark.content)
+    assert "Nothing that is drawn is selected" in html.unescape(panel._widgets.rows._summary.content)
     panel.act("Clear")
     listed(panel)
     assert panel._widgets.histograms.content == ""
@@ -447,7 +447,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     assert all(name in text for name in names)
     assert text.count("data:image/jpeg;base64,") == len(names)
     panel._reasons = reasons
-    panel._follow()
+    panel._update_widgets()
     assert panel._widgets.reasons.content == reasons.content
     ask(panel, "left")  # another selection
     assert panel._widgets.reasons.content == ""

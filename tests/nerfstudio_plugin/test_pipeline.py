@@ -138,7 +138,7 @@ def test_mistakes_show_before_the_training(train: Any, workspace: Path, methods:
         with pytest.raises(PermissionError, match=r"trained/.* cannot be written"):
             train("locked")
     Image.new("P", (WIDTH, HEIGHT)).save(workspace / "scene" / "images" / "003.jpg", "PNG")
-    with pytest.raises(InputError, match=r"003\.jpg has pixels of kind P"):
+    with pytest.raises(InputError, match=r"003\.jpg has the pixel format P"):
         train("palette")
 
 

@@ -186,7 +186,7 @@ def test_objects_are_listed_with_what_their_buttons_need():
     assert first.colour[0] > 0.8 > first.colour[2]
     assert (first.views, blue.views) == pytest.approx((2.0, 1.0))
     for row in (first, blue):
-        grade = "well" if row.reliability >= 0.8 else "fairly" if row.reliability >= 0.6 else "poorly"
+        grade = "strong" if row.reliability >= 0.8 else "fair" if row.reliability >= 0.6 else "weak"
         assert row.evidence.startswith(grade) and f"{row.reliability:.2f}" in row.evidence
     assert [row.size for row in found_objects(actions.hide(asked("red"), first.mask)).objects] == [64]
     few = found_objects(asked("red, blue"), most=2)

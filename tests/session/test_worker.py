@@ -37,6 +37,6 @@ def test_what_waits_is_forgotten_and_nothing_is_taken_in_the_end():
         getattr(worker, forget)()
         worker.put(lambda done=done: done.append(3))
         gate.set()
-        while worker._works:
+        while worker._running:
             time.sleep(0.001)
         assert done == expected, forget

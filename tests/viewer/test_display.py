@@ -14,7 +14,7 @@ from normlift_ns.errors import visible
 from normlift_ns.question import Question
 from normlift_ns.viewer.display import color_scale, draw, make_display, overlay, reliability_picture, segmentation
 from normlift_ns.viewer.legend import clipped
-from normlift_ns.viewer.status import as_text, report
+from normlift_ns.viewer.status import as_text
 
 
 def pictured() -> tuple[torch.Tensor, torch.Tensor]:
@@ -98,21 +98,9 @@ def test_the_scale_is_that_of_all_prompts_and_views() -> None:
     )  # fmt: skip
 
 
-def test_the_report_counts_and_escapes() -> None:
-    relevancy = torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]])
-    question, unused = Question(("a|b", "x" * 90), torch.eye(2)), None
-    answer = Answer(question, unused, torch.zeros(3, 3), relevancy, torch.ones(3).bool(), relevancy > 0.5)
-    lines = report(answer, None).splitlines()
-    assert lines[0] == "**3** of 3 Gaussians selected"
-    assert "a&#124;b | 2 | 0.90 |" in lines[-2]
-    assert f"{'x' * 39}&#8230; | 2 | 0.70 |" in lines[-1]
-    assert report(answer, 1).startswith("**2** of 3")
-    assert not any(letter.isdigit() for letter in report(None, None))
+def test_markup_is_text_and_choices_of_a_dropdown_can_be_sent_and_shown() -> None:
     assert as_text("1 < 2 {}\n") == "1 &#60; 2 &#123;&#125;&#10;"
     assert clipped("a\n  b", 9) == "a b"
-
-
-def test_markup_is_text_and_choices_of_a_dropdown_can_be_sent_and_shown() -> None:
     for text in (
         "<script>x</script>", "{1+1}", "| a | b |", "**b**", "a\n# b", "`x`", "\x1b[31m", "\u202ex", "\udc80", "\0",
         "&lt;",

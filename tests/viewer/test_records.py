@@ -9,7 +9,7 @@ from normlift_ns.session import actions
 from normlift_ns.session.colours import prompt_colours
 from normlift_ns.session.prompts import pose, read_prompts
 from normlift_ns.session.state import State
-from normlift_ns.viewer.adapter import _unpacked
+from normlift_ns.viewer.adapter import _unpack_splats
 from normlift_ns.viewer.paint import legend, opacities, painted
 from normlift_ns.viewer.records import BYTES, Units, cholesky, make_records
 from tests.session.worlds import BLOCK, read, rows, world
@@ -60,7 +60,7 @@ def test_records_hold_the_scene_in_units_of_the_browser():
     np.testing.assert_array_equal(records.rows, expected)
     buffer = records.buffer(records.colours, np.ones(len(expected), bool))
     assert buffer.nbytes == BYTES * len(expected)
-    back = _unpacked(buffer)
+    back = _unpack_splats(buffer)
     np.testing.assert_allclose(records.units.to_scene(back["centers"]), found.means.numpy()[expected], atol=1e-6)
     np.testing.assert_allclose(back["rgbs"] / 255, rgb.numpy()[expected], atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(back["opacities"][:, 0], found.opacities.numpy()[expected], atol=0.5 / 255 + 1e-6)
