@@ -176,8 +176,8 @@ def _rank_gaussians(
 
     Args:
         member: Gaussians at every position, from `_members`.
-        queries: positions to search from.
-        near: nearest positions of every query, in ascending order of distance.
+        queries: indices of the positions to search from.
+        near: indices of the nearest positions of every query, nearest first.
         reach: distances to `near`.
         count: number of Gaussians per query; rows with fewer are padded with -1.
     """
