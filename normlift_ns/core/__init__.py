@@ -1,1 +1,1 @@
-"""The method on tensors: needs torch, numpy, scipy and safetensors, and knows nothing of nerfstudio."""
+"""The method on plain tensors, built on torch, numpy, scipy and safetensors; nerfstudio is not needed."""

@@ -1,4 +1,4 @@
-"""The paper's ablation of the refinement (its table 2) and what goes beyond it, behind one switch."""
+"""Variants of the refinement: those of the paper's ablation (its table 2), and the posterior vote."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def refine_variant(
     beta: float = 1.0,
     neighbors: Neighbors | None = None,
 ) -> Float[Tensor, "n d"]:
-    """Directions after one variant of the refinement, unit rows or 0.
+    """Return the directions after one variant of the refinement, as unit rows or 0.
 
     Args:
-        variant: "none": the lift as it is. "linear": distance-weighted linear averaging of the directions of N+,
-            weighted by R d_ik and normalised. The others vote, by `variant_config` and with `variant_reliability`.
-        beta: as in `lift`.
+        variant: "none" returns the directions of the lift. "linear" averages the directions of N+ with the weights
+            R d_ik and normalizes the result. The others vote with `variant_config` and `variant_reliability`.
+        beta: prior strength of the shrinkage of R, as in `lift`.
     Raises:
-        ValueError: an unknown variant.
+        ValueError: if the variant is unknown.
 
     >>> import torch
     >>> from normlift_ns import Evidence, RefineConfig, lift, refine_variant
     >>> from normlift_ns.core.evidence import Entries
-    >>> seen = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 2, 1]), torch.ones(3), (2,))
-    >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
+    >>> entries = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 2, 1]), torch.ones(3), (2,))
+    >>> lifted = lift(Evidence.from_entries([entries], 3), torch.eye(2))
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     >>> [refine_variant(name, means, lifted, RefineConfig(k=2))[1] for name in ("none", "linear", "paper")]
     [tensor([0., 1.]), tensor([0.7716, 0.6361]), tensor([1., 0.])]
@@ -66,19 +66,20 @@ def variant_source(
     beta: float = 1.0,
     neighbors: Neighbors | None = None,
 ) -> Int32[Tensor, " n"]:
-    """`refine` as a variant that votes.
+    """Run `refine` as one of the variants that vote.
 
     Raises:
-        ValueError: as `refine`; an unknown variant.
+        ValueError: if the variant is unknown, or `refine` rejects the arguments.
     """
     reliability, config = variant_reliability(variant, scalars, beta), variant_config(variant, config)
     return refine(means, directions, reliability, config, own=scalars.own_evidence, neighbors=neighbors)
 
 
 def variant_config(variant: Variant, config: RefineConfig) -> RefineConfig:
-    """The parameters of a variant: those given where they are for its kind of vote, else the defaults of its kind.
+    """Return the options of a variant's vote.
 
-    All but "posterior" are variants of the paper's vote.
+    The result is `config` if that is for the variant's kind of vote. Otherwise it has the defaults of that kind, with
+    the `k` and `prior` of `config`. All variants but "posterior" use the paper's vote.
 
     >>> variant_config("posterior", RefineConfig(vote="paper", k=12, sigma_d=3.0)).numbers.sigma_d
     2.0
@@ -88,13 +89,13 @@ def variant_config(variant: Variant, config: RefineConfig) -> RefineConfig:
 
 
 def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
-    """R that a variant votes with.
+    """Return the R that a variant votes with.
 
-    "plain_knn": 1 for every Gaussian with a direction. "norm_only": ||f||. "support_only": N_eff / (N_eff + beta). Any
-    other: their product, NormLift's R.
+    "plain_knn" uses 1 for every Gaussian with a direction, "norm_only" uses ||f||, and "support_only" uses
+    N_eff / (N_eff + beta). All others use NormLift's R, the product of the last two.
 
     Raises:
-        ValueError: an unknown variant.
+        ValueError: if the variant is unknown.
     """
     if variant not in get_args(Variant):
         raise InputError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
@@ -109,7 +110,7 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
 def linear_average(
     directions: Float[Tensor, "n d"], reliability: Float[Tensor, " n"], neighbors: Neighbors, config: RefineConfig
 ) -> Float[Tensor, "n d"]:
-    """normalise(sum_{k in N+} R_k d_ik u_k); u_i where nobody counts."""
+    """Return normalize(sum_{k in N+} R_k d_ik u_k), or u_i if that sum is 0."""
     out, width = torch.empty_like(directions), decay_width(neighbors.spacing, config)
     for i in torch.arange(len(directions), device=directions.device).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)

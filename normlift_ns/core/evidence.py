@@ -1,5 +1,6 @@
-"""Evidence E_js: how much weight Gaussian j has in image region s. Independent of any feature, it is all that
-rasterizing yields.
+"""Evidence E_js: the weight of Gaussian j in image region s.
+
+Evidence is all that a lift needs from rasterization, and does not depend on features.
 """
 
 from __future__ import annotations
@@ -20,27 +21,26 @@ from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
 
 UNLABELED, MASKED = -1, -2
-"""Labels of pixels without a region, and of pixels that are no observation at all."""
+"""Labels of pixels that have no region, and of pixels that do not count as observations."""
 
 
 class Entries(NamedTuple):
-    """What a rasterizer finds in one or a few views: distinct places, sorted by (gaussian, column)."""
+    """Nonzero weights that a rasterizer returns for one or more views: distinct and sorted by (gaussian, column)."""
 
     gaussian: Int[Tensor, " nnz"]
     column: Int[Tensor, " nnz"]
-    """View by view, a column for the unlabelled pixels and then one per region."""
+    """Column of every weight. Each view has one column for unlabeled pixels, followed by one per region."""
     weight: Float[Tensor, " nnz"]
     num_regions: tuple[int, ...]
-    """Of each view."""
+    """Number of regions of each view."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """E_js = sum of A_ij over the pixels i of region s, sparse, by Gaussian; unlabelled pixels kept apart by view.
+    """Sparse matrix E_js, the sum of A_ij over the pixels i of region s; unlabeled pixels are kept apart, by view.
 
-    Columns s number the regions of all views one after the other, like the rows of the feature table. Within a row
-    they ascend, so the
-    order is the same on every run. Raises ValueError on construction if the arrays do not fit each other.
+    Columns s number the regions of all views consecutively, like the rows of the feature table. They ascend within a
+    row, so the order is the same in every run. The constructor raises ValueError if the arrays do not fit together.
 
     >>> import torch
     >>> from normlift_ns import Evidence
@@ -55,17 +55,17 @@ class Evidence:
     """
 
     rows: SparseRows
-    """E, [N, S]: E_js > 0 of every entry, the sum of A_ij ** weight_power."""
+    """E, [N, S]. Every entry E_js is the sum of A_ij ** weight_power, > 0."""
     region_view: Int32[Tensor, " s"]
     """View of every column, non-decreasing."""
     unlabeled: SparseRows
-    """[N, views]: weight of Gaussian j in the unlabelled pixels of view v."""
+    """Weight of Gaussian j in the unlabeled pixels of view v, [N, views]."""
     num_views: int
-    """Number of views, those without any region included."""
+    """Number of views, including those without regions."""
     weight_power: int = 1
     """1: E sums A_ij (the paper). 2: E sums A_ij ** 2 (SFS's code)."""
     num_excluded: int = 0
-    """Gaussians that were not drawn because a parameter was not finite or out of range."""
+    """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 
     def __post_init__(self) -> None:
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
@@ -91,12 +91,12 @@ class Evidence:
 
     @property
     def num_gaussians(self) -> int:
-        """N, those without evidence included."""
+        """N, including Gaussians without evidence."""
         return len(self.rows)
 
     @property
     def num_regions(self) -> int:
-        """S, the columns: regions of all views, those that show no Gaussian included."""
+        """S, the number of regions of all views, including regions that show no Gaussian."""
         return self.region_view.numel()
 
     @property
@@ -108,16 +108,16 @@ class Evidence:
     def from_entries(
         parts: Sequence[Entries], num_gaussians: int, *, weight_power: int = 1, num_excluded: int = 0
     ) -> Evidence:
-        """Joins the entries of all views, in their order."""
+        """Join the entries of all views, in their order."""
         device = parts[0].weight.device if parts else torch.device("cpu")
         counts = [count for part in parts for count in part.num_regions]
-        rows, unlabeled = (_joined_by_sorting if device.type == "cuda" else _joined)(parts, num_gaussians, device)
+        rows, unlabeled = (_join_by_sorting if device.type == "cuda" else _join)(parts, num_gaussians, device)
         region_view = torch.repeat_interleave(torch.arange(len(counts), dtype=torch.int32), torch.tensor(counts).int())
         return Evidence(rows, region_view.to(device), unlabeled, len(counts), weight_power, num_excluded)
 
     @cached_property
     def view_group_offsets(self) -> Int64[Tensor, " g_plus_1"]:
-        """Entry offsets of the (Gaussian, view) groups: entries of a row that share a view stand next to each other."""
+        """Entry offsets of the (Gaussian, view) groups; entries of a row that share a view are adjacent."""
         offsets, view = self.rows.offsets, self.region_view[self.rows.column.long()]
         starts = torch.ones(self.nnz, dtype=torch.bool, device=view.device)
         if self.nnz > 0:
@@ -126,16 +126,18 @@ class Evidence:
         return torch.cat([starts.nonzero().squeeze(1), offsets[-1:]])
 
     def view_weights(self) -> SparseRows:
-        """W_jv: weight of Gaussian j in the labelled pixels of view v, [N, views], one entry per pair with evidence,
-        float64.
+        """Return W_jv, the weight of Gaussian j in the labeled pixels of view v.
+
+        The result is [N, views] in float64, with one entry per pair that has evidence.
         """
         groups = self.view_group_offsets
         view = self.region_view[self.rows.column[groups[:-1]].long()]
         return SparseRows(torch.searchsorted(groups, self.rows.offsets), view, segment_sum(self.rows.weight, groups))
 
     def columns_of(self, views: Sequence[int] | Tensor) -> Int64[Tensor, " columns"]:
-        """Columns of the given views, in their order: features[evidence.columns_of(v)] is the table of
-        evidence.select_views(v).
+        """Return the columns of the given views, in their order.
+
+        `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
         """
         bounds = torch.searchsorted(
             self.region_view, torch.arange(self.num_views + 1, dtype=torch.int32, device=self.region_view.device)
@@ -150,10 +152,10 @@ class Evidence:
         return chosen
 
     def select_views(self, views: Sequence[int] | Tensor) -> Evidence:
-        """The evidence of some views only, renumbered in the given order.
+        """Return the evidence of some views, renumbered in the given order.
 
         Raises:
-            ValueError: a view that does not exist or is named twice.
+            ValueError: if a view does not exist or is given twice.
         """
         columns = self.columns_of(views)
         chosen = torch.tensor(self._checked_views(views), dtype=torch.int64, device=columns.device)
@@ -165,23 +167,25 @@ class Evidence:
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=chosen.numel())
 
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
-        """The evidence of some Gaussians only, in the given order."""
+        """Return the evidence of some Gaussians, in the given order."""
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
         return replace(self, rows=rows, unlabeled=unlabeled)
 
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
-        """The evidence of coarser regions, without rasterizing: E'_jt = sum over levels and the columns s of t of E_js.
+        """Return the evidence of coarser regions without rasterizing again.
 
-        Rasterized on the cells of a partition, evidence becomes that of any regions made of whole cells, exactly but
-        for rounding: sums of A_ij ** weight_power add up whatever the power. What maps to -1 joins the unlabelled
-        weight of its view. With several levels every pixel is observed once per level, so that W_jv, unlabelled weight
-        included, counts it as often; N_eff and R do not change with the scale of W.
+        E'_jt is the sum of E_js over all levels and over the columns s that become part of t. Evidence on the cells of
+        a partition yields that of any regions made of whole cells. It is exact up to rounding, because sums of
+        A_ij ** weight_power add up for any power. Columns that map to -1 join the unlabeled weight of their view.
+
+        With several levels, every pixel is observed once per level, and W_jv counts it that many times, including
+        unlabeled weight. N_eff and R do not depend on the scale of W.
 
         Args:
             columns: the new column of every column, one row per level; -1: none.
             region_view: view of every new column, non-decreasing.
         Raises:
-            ValueError: a new column that does not exist, or of another view than its old one.
+            ValueError: if a new column does not exist, or belongs to a different view than the columns that it joins.
         """
         if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
             raise InputError(
@@ -191,29 +195,29 @@ class Evidence:
         columns, region_view = (x.to(self.region_view.device) for x in (columns.long(), region_view))
         level, column = (columns >= 0).nonzero(as_tuple=True)
         if not torch.equal(region_view[columns[level, column]], self.region_view[column]):
-            raise InputError("a new column must be of the same view as the columns that it joins")
+            raise InputError("a new column must belong to the same view as the columns that it joins")
         if torch.equal(columns, torch.arange(len(region_view), device=columns.device)[None]):
             return self
         old = self.rows.column.long()
         new = columns[:, old]
-        kept = new >= 0
+        keep = new >= 0
         row, view, weight = (x.expand_as(new) for x in (self.rows.row_index(), self.region_view[old], self.rows.weight))
-        rows = SparseRows.from_coo(row[kept], new[kept], weight[kept], self.num_gaussians)
+        rows = SparseRows.from_coo(row[keep], new[keep], weight[keep], self.num_gaussians)
         blank = self.unlabeled
         unlabeled = SparseRows.from_coo(
-            torch.cat([blank.row_index(), row[~kept]]),
-            torch.cat([blank.column, view[~kept]]),
-            torch.cat([blank.weight * len(columns), weight[~kept]]),
+            torch.cat([blank.row_index(), row[~keep]]),
+            torch.cat([blank.column, view[~keep]]),
+            torch.cat([blank.weight * len(columns), weight[~keep]]),
             self.num_gaussians,
         )
         return replace(self, rows=rows, region_view=region_view, unlabeled=unlabeled)
 
     @staticmethod
     def merge(*parts: Evidence) -> Evidence:
-        """Appends views and columns in argument order; feature tables concatenate likewise.
+        """Append the views and columns of all parts in argument order; concatenate feature tables in the same order.
 
         Raises:
-            ValueError: no part, or parts of different scenes or weight powers.
+            ValueError: if there is no part, or the parts differ in scene or weight power.
         """
         if not parts:
             raise InputError("Evidence.merge needs at least one part")
@@ -229,18 +233,18 @@ class Evidence:
         return replace(parts[0], rows=rows, region_view=region_view, unlabeled=unlabeled, num_views=views[-1])
 
     def prune(self, *, relative: float) -> tuple[Evidence, Float64[Tensor, " n"]]:
-        """Drops entries below `relative` times the largest entry of their Gaussian, and says what that can cost.
+        """Drop entries below `relative` times the largest entry of their Gaussian, and bound the effect on f_j.
 
-        With d_j the dropped share of W_j, f_j moves by at most 2 d_j for any table of unit features (f' - f = d_j f'
-        - dropped / W_j), so
-        ||f_j|| by at most as much and the direction by at most 4 d_j / (||f_j|| + ||f'_j||). Unlabelled weight stays.
+        Let d_j be the dropped share of W_j. For any table of unit features, f_j and ||f_j|| change by at most 2 d_j,
+        because f' - f = d_j f' - dropped / W_j. The direction changes by at most 4 d_j / (||f_j|| + ||f'_j||).
+        Unlabeled weight stays.
 
         Args:
-            relative: in 0..1; the largest entry of a Gaussian always stays.
+            relative: threshold in 0..1; the largest entry of a Gaussian always stays.
         Returns:
-            The smaller evidence, and per Gaussian the bound 2 d_j on |f_j - f'_j|.
+            The smaller evidence, and the bound 2 d_j on |f_j - f'_j| for every Gaussian.
         Raises:
-            ValueError: `relative` outside 0..1.
+            ValueError: if `relative` is outside 0..1.
         """
         if not 0 <= relative <= 1:
             raise InputError(f"relative must be in 0..1, got {relative}")
@@ -250,11 +254,11 @@ class Evidence:
         total = self.rows.row_sums()
         dropped = segment_sum(torch.where(keep, 0.0, weight.double()), self.rows.offsets)
         bound = torch.where(total > 0, 2 * dropped / total, 0.0)
-        kept = SparseRows(row_offsets(row[keep], self.num_gaussians), self.rows.column[keep], weight[keep])
-        return replace(self, rows=kept), bound
+        rows = SparseRows(row_offsets(row[keep], self.num_gaussians), self.rows.column[keep], weight[keep])
+        return replace(self, rows=rows), bound
 
     def to(self, device: torch.device | str) -> Evidence:
-        """A copy on another device."""
+        """Return a copy on another device."""
         return replace(
             self,
             rows=self.rows.to(device),
@@ -263,76 +267,78 @@ class Evidence:
         )
 
     def save(self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None) -> str:
-        """Writes a safetensors file, complete or not at all, in place of an earlier one; returns its digest.
+        """Write a safetensors file atomically, replacing an earlier one, and return its digest.
 
         Args:
-            key: what finds the file again in a cache.
-            remarks: what the head of the file says besides, by name.
+            key: cache key, which is part of the digest.
+            remarks: additional metadata for the file header, by name.
         Raises:
-            OSError: it cannot be written, for instance because the disk is full.
+            OSError: if the file cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled
         tensors = {"offsets": rows.offsets, "region": rows.column, "weight": rows.weight}
         tensors |= {f"unlabeled_{name}": getattr(blank, name) for name in ("offsets", "column", "weight")}
         tensors["region_view"] = self.region_view
         counts = {name: str(getattr(self, name)) for name in EVIDENCE_COUNTS}
-        facts = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
-        return save_tensors(Path(path), tensors, facts, key=key, overwrite=True)
+        metadata = {**(remarks or {}), "format": EVIDENCE_FORMAT, **counts}
+        return save_tensors(Path(path), tensors, metadata, key=key, overwrite=True)
 
     @staticmethod
     def load(path: str | Path, *, key: str = "") -> Evidence:
-        """Reads what `save` wrote.
+        """Read a file that `save` wrote.
 
         Args:
-            key: as it was given then; a file with a key that has no digest, as version 0.1 wrote it, is refused.
+            key: the key that was given to `save`. With a key, files without a digest (of version 0.1) are rejected.
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: not an evidence file, or a damaged one.
+            FileNotFoundError: if the file does not exist.
+            ValueError: if it is not an evidence file, or is damaged.
         """
         return Evidence.read(Path(path), key=key)[0]
 
     @staticmethod
     def read(path: Path, *, key: str = "", remedy: str = "rasterize again") -> tuple[Evidence, str | None]:
-        """`load`, with the digest of the file; None for one of version 0.1.
+        """Read a file like `load`, and also return its digest, or None for a file of version 0.1.
 
         Args:
-            remedy: what to do about a damaged file, for the message.
+            key: as in `load`.
+            remedy: what the message suggests if the file is damaged.
         """
-        found = read_evidence(path, key=key, remedy=remedy)
+        arrays = read_evidence(path, key=key, remedy=remedy)
         try:
-            return Evidence.of_arrays(found), found.digest
+            return Evidence.of_arrays(arrays), arrays.digest
         except ValueError as error:
             raise InputError(f"{path} is damaged ({error}); {remedy}") from error
 
     @staticmethod
-    def of_arrays(found: EvidenceArrays) -> Evidence:
-        """What a file held, without a copy."""
-        rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (found.rows, found.unlabeled))
-        return Evidence(rows, torch.from_numpy(found.region_view), unlabeled, *found.counts)
+    def of_arrays(arrays: EvidenceArrays) -> Evidence:
+        """Wrap the arrays of a file without copying them."""
+        rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (arrays.rows, arrays.unlabeled))
+        return Evidence(rows, torch.from_numpy(arrays.region_view), unlabeled, *arrays.counts)
 
 
-def _joined(parts: Sequence[Entries], num_gaussians: int, device: torch.device) -> tuple[SparseRows, SparseRows]:
-    """Regions and unlabelled pixels of all parts, every entry put straight to its place."""
+def _join(parts: Sequence[Entries], num_gaussians: int, device: torch.device) -> tuple[SparseRows, SparseRows]:
+    """Join regions and unlabeled pixels of all parts, writing every entry directly to its position."""
     labeled, blank = [], []
     first, view = 0, 0
     for part in parts:
         is_region, new = _column_table(part.num_regions, first, view)
         is_region, new = is_region.to(device)[part.column], new.to(device)[part.column]
-        for found, keep in ((labeled, is_region), (blank, ~is_region)):
-            found.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
+        for entries, keep in ((labeled, is_region), (blank, ~is_region)):
+            entries.append(tuple(x[keep] for x in (part.gaussian, new, part.weight)))
         first, view = first + sum(part.num_regions), view + len(part.num_regions)
-    rows, unlabeled = (SparseRows.stack(found, num_gaussians, device) for found in (labeled, blank))
+    rows, unlabeled = (SparseRows.stack(entries, num_gaussians, device) for entries in (labeled, blank))
     return rows, unlabeled
 
 
-def _joined_by_sorting(
+def _join_by_sorting(
     parts: Sequence[Entries], num_gaussians: int, device: torch.device
 ) -> tuple[SparseRows, SparseRows]:
-    """The same by one stable sort, which suits a GPU: the rows of the regions, and behind them those of the unlabelled
-    pixels.
+    """Join the same entries by one stable sort, which is faster on a GPU.
+
+    The rows of the unlabeled pixels follow those of the regions.
     """
     is_region, new = _column_table([count for part in parts for count in part.num_regions], 0, 0)
-    code = torch.where(is_region, new, -1 - new).to(device)  # of a region its number, of the others -1 - view
+    code = torch.where(is_region, new, -1 - new).to(device)  # index of the region, or -1 - view
     widths = torch.tensor([0, *(sum(part.num_regions) + len(part.num_regions) for part in parts)]).cumsum(0).tolist()
     column = torch.cat([code[first:][part.column] for part, first in zip(parts, widths)])
     weight = torch.cat([part.weight for part in parts])
@@ -351,7 +357,7 @@ def _joined_by_sorting(
 def _column_table(
     num_regions: Sequence[int], first_region: int, first_view: int
 ) -> tuple[Bool[Tensor, " columns"], Int32[Tensor, " columns"]]:
-    """Of every column of `Entries`: whether it is a region, and the number of that region, or else of the view."""
+    """Return which columns of `Entries` are regions, and the index of each region or, for the others, of the view."""
     start = torch.tensor([0, *(count + 1 for count in num_regions)]).cumsum(0)
     is_region = torch.ones(int(start[-1]), dtype=torch.bool)
     is_region[start[:-1]] = False

@@ -1,5 +1,6 @@
-"""`SemanticField`: what a lift leaves on disk, in the smallest storage that meets the asked tolerance, and how it
-answers text.
+"""`SemanticField`: the result of a lift, its queries and its files.
+
+By default, a field uses the smallest storage that meets the requested tolerance.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ from normlift_ns.options import RULES, Rule, Storage
 
 @dataclass(frozen=True)
 class SemanticField:
-    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three ways of storage.
+    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three storage forms.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
     >>> from normlift_ns.core.evidence import Entries
-    >>> seen = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
-    >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
+    >>> entries = Entries(torch.tensor([0, 1]), torch.tensor([1, 2]), torch.ones(2), (2,))
+    >>> lifted = lift(Evidence.from_entries([entries], 3), torch.eye(2))
     >>> field = SemanticField.build(lifted, torch.zeros(3, 3), source=torch.tensor([0, 1, 1]))
     >>> texts = torch.tensor([[3.0, 4.0]])
     >>> field.query(texts, refined=False)[:, 0], field.query(texts)[:, 0]
@@ -56,27 +57,26 @@ class SemanticField:
 
     scalars: Scalars
     source: Int32[Tensor, " n"]
-    """The refined direction of Gaussian i is that of source[i]; source[i] = i where nothing was refined."""
+    """The refined direction of Gaussian i is that of source[i]; source[i] = i if the vote left i unchanged."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    """What is known of the field: its storage (key `form`), sizes and bounds of all three ways (key `forms`),
-    fingerprint of the means, provenance. JSON types only.
-    """
+    """Metadata of JSON types: the storage (key `form`), sizes and bounds of all three storage forms (key `forms`), the
+    fingerprint of the means, and the provenance."""
     means: Float[Tensor, "n 3"] | None = None
-    """Centres of the Gaussians, float32, as they were lifted; None in fields that version 0.1 wrote."""
+    """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
 
     def __len__(self) -> int:
         return self.source.numel()
 
     def to(self, device: torch.device | str) -> SemanticField:
-        """A copy on another device."""
+        """Return a copy on another device."""
         scalars = self.scalars.map(lambda x: x.to(device))
         means = None if self.means is None else self.means.to(device)
         return SemanticField(scalars, self.source.to(device), self.store.to(device), self.manifest, means)
 
     @property
     def dimension(self) -> int:
-        """D, length of the feature vectors."""
+        """D, the length of the feature vectors."""
         return int(self.manifest["dimension"])
 
     @staticmethod
@@ -89,16 +89,16 @@ class SemanticField:
         storage: Storage | Literal["auto"] = "auto",
         provenance: Mapping[str, Any] | None = None,
     ) -> SemanticField:
-        """Chooses the storage and reports the size in bytes and the error bound of all three.
+        """Build a field, and record size and error bound of all three storage forms in its manifest.
 
         Args:
-            source: result of `refine`; none: unrefined.
-            tolerance: largest error of any cosine of any Gaussian to any unit vector, > 0.
-            storage: "auto" takes the smallest whose bound is within the tolerance.
-            provenance: JSON-ready facts for the manifest: source config and step, encoder, regions, hyper-parameters.
+            source: result of `refine`; None: unrefined.
+            tolerance: largest error of the cosine of any Gaussian to any unit vector, > 0.
+            storage: "auto" chooses the smallest storage whose bound is within the tolerance.
+            provenance: JSON-ready metadata for the manifest: source config and step, encoder, regions, hyperparameters.
         Raises:
-            ValueError: `means` or `source` of another length, a tolerance <= 0, an unknown storage, or "low_rank" where
-                no rank meets the tolerance.
+            ValueError: if `means` or `source` has another length, `tolerance` is not positive, `storage` is unknown,
+                or `storage` is "low_rank" and no rank meets the tolerance.
         """
         n = len(lifted.scalars.norm)
         if len(means) != n or (source is not None and len(source) != n):
@@ -106,10 +106,10 @@ class SemanticField:
                 f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
                 f"{None if source is None else len(source)}"
             )
-        given = {"tolerance": tolerance, "storage": storage, "provenance": provenance}
-        built = SemanticField.build_together(lifted, means, source, Portion.of(ALONE, means), **given)
-        assert built is not None
-        return built
+        options = {"tolerance": tolerance, "storage": storage, "provenance": provenance}
+        result = SemanticField.build_together(lifted, means, source, Portion.of(ALONE, means), **options)
+        assert result is not None
+        return result
 
     @staticmethod
     def build_together(
@@ -122,12 +122,15 @@ class SemanticField:
         storage: Storage | Literal["auto"],
         provenance: Mapping[str, Any] | None,
     ) -> SemanticField | None:
-        """`build` by a team, each process with the lift of its portion; process 0 alone gets the field.
+        """Build a field from the lifts of several processes; return it in process 0 and None in the others.
 
         Args:
-            means: of all Gaussians.
-            source: of the portion's Gaussians.
-            provenance: that of process 0 counts.
+            lifted: lift of this process's Gaussians.
+            means: centers of all Gaussians.
+            source: result of `refine` for this process's Gaussians.
+            portion: Gaussians of this process.
+            tolerance, storage: as in `build`.
+            provenance: as in `build`; only that of process 0 is used.
         """
         dimension, team = lifted.features.shape[1], portion.team
         if not tolerance > 0:
@@ -135,23 +138,23 @@ class SemanticField:
         if storage not in (*get_args(Storage), "auto"):
             raise InputError(f"storage must be auto, {', '.join(get_args(Storage))}; got {storage!r}")
         basis = smallest_basis(lifted, tolerance, team)
-        ways = sizes_and_bounds(lifted, basis, portion)
+        forms = sizes_and_bounds(lifted, basis, portion)
         if storage == "auto":
             storage = min(
-                (name for name, facts in ways.items() if facts["bound"] <= tolerance),
-                key=lambda name: ways[name]["bytes"],
+                (name for name, form in forms.items() if form["bound"] <= tolerance),
+                key=lambda name: forms[name]["bytes"],
             )  # type: ignore[assignment]
-        if storage not in ways:
+        if storage not in forms:
             raise InputError(
-                f"no basis keeps every Gaussian within tolerance {tolerance}; raise it, or take storage float16 or "
-                "evidence"
+                f"no basis keeps every Gaussian within tolerance {tolerance}; raise the tolerance, or use storage "
+                "float16 or evidence"
             )
         if storage == "evidence":
             store = store_evidence(lifted, portion)
         else:
-            chosen = basis.rows if storage == "low_rank" and basis is not None else None
-            store = store_directions(lifted, chosen, portion)
-        scalars = lifted.scalars.map(_single).map(portion.join)
+            rows = basis.rows if storage == "low_rank" and basis is not None else None
+            store = store_directions(lifted, rows, portion)
+        scalars = lifted.scalars.map(_to_single).map(portion.join)
         sources = portion.join(portion.gaussians.int() if source is None else source.int())
         if store is None:
             return None
@@ -163,20 +166,22 @@ class SemanticField:
             "means_fingerprint": fingerprint(means),
             "form": storage,
             "tolerance": tolerance,
-            "forms": ways,
+            "forms": forms,
         }
         return SemanticField(scalars, sources, store, manifest, means.detach().float())
 
     def valid(self, *, refined: bool = True) -> Bool[Tensor, " n"]:
-        """True where a Gaussian has a direction: evidence of its own or, refined, that of the neighbour it copies."""
-        found = self.scalars.norm > 0
-        return found[self.source.long()] if refined else found
+        """Return a mask of the Gaussians with a direction: their own or, if refined, that of the Gaussian they copy."""
+        mask = self.scalars.norm > 0
+        return mask[self.source.long()] if refined else mask
 
     def query(self, text_vectors: Float[Tensor, "q d"], *, refined: bool = True) -> Float[Tensor, "n q"]:
-        """Cosine of every Gaussian's direction to Q vectors of any length > 0; 0 where `valid` is False.
+        """Return the cosine of every Gaussian's direction to Q vectors of any length > 0.
+
+        The cosine is 0 for Gaussians without a direction.
 
         Raises:
-            ValueError: vectors of another dimension, zero or not finite.
+            ValueError: if a vector has another dimension, is zero or is not finite.
         """
         if text_vectors.ndim != 2 or text_vectors.shape[1] != self.dimension:
             raise InputError(
@@ -198,8 +203,12 @@ class SemanticField:
         rule: Rule = "cosine",
         refined: bool = True,
     ) -> Float[Tensor, "n q"]:
-        """`query` followed by `relevancy` of module query; a Gaussian without a direction gets 0 (rule "margin": -2),
-        never a find.
+        """Return the relevancy of every Gaussian to Q text vectors: `query` followed by `relevancy`.
+
+        A Gaussian without a direction gets the smallest value of the rule, 0 or -2 ("margin"), and is never selected.
+
+        Args:
+            negatives: vectors of the negative prompts, for rules that need them.
         """
         count = len(text_vectors)
         cosine = self.query(
@@ -209,7 +218,7 @@ class SemanticField:
         return torch.where(self.valid(refined=refined)[:, None], values, RULES[rule].least)
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
-        """Unit directions of all or some Gaussians, 0 where `valid` is False."""
+        """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
         rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
         rows = self.source.long()[rows] if refined else rows
         return torch.cat([self.store.directions(block, self.scalars) for block in rows.split(2**14)])
@@ -217,22 +226,22 @@ class SemanticField:
     def save(
         self, folder: str | Path, *, overwrite: bool = False, beside: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Writes field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
+        """Write field.safetensors, evidence.safetensors (storage "evidence") and, last, manifest.json.
 
         A folder with a manifest is complete. The manifest holds the digests of the files.
 
         Args:
-            beside: digests of other files that belong to the field, by their paths from the folder.
+            beside: digests of other files that belong to the field, by their paths relative to the folder.
         Raises:
-            FileExistsError: the folder holds a field and `overwrite` is False.
-            OSError: it cannot be written, for instance because the disk is full.
+            FileExistsError: if the folder holds a field and `overwrite` is False.
+            OSError: if a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
         if (folder / MANIFEST).exists() and not overwrite:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
-        (folder / MANIFEST).unlink(missing_ok=True)  # without it the folder is incomplete, and may be written to
+        (folder / MANIFEST).unlink(missing_ok=True)  # a folder without a manifest is incomplete and may be overwritten
         digests = {FIELD_FILE: save_tensors(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
             digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
@@ -244,13 +253,15 @@ class SemanticField:
     def load(
         folder: str | Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
     ) -> SemanticField:
-        """Reads what `save` wrote; with `means`, only if the field belongs to them.
+        """Read a field that `save` wrote.
 
         Args:
-            checkpoint: where the means come from, for the message.
+            means: centers of the Gaussians that the field must belong to; None: any.
+            checkpoint: source of the means, for the message.
         Raises:
-            FileNotFoundError: no complete field in the folder.
-            ValueError: another schema, a damaged file, or a field of other Gaussians; the message names it.
+            FileNotFoundError: if the folder holds no complete field.
+            ValueError: if the schema is not supported, a file is damaged, or the field belongs to other Gaussians. The
+                message names the file or folder.
         """
         folder = Path(folder)
         manifest, arrays, evidence, _ = read_field(folder)
@@ -266,11 +277,11 @@ class SemanticField:
 
 
 def fingerprint(means: Float[Tensor, "n 3"]) -> str:
-    """BLAKE2 of the float32 bytes of the means: tells two sets of Gaussians apart."""
+    """Return the BLAKE2 hash of the float32 bytes of the means, which identifies a set of Gaussians."""
     return hashlib.blake2b(means.detach().float().contiguous().cpu().numpy().tobytes(), digest_size=16).hexdigest()
 
 
-def _single(values: Tensor) -> Tensor:
+def _to_single(values: Tensor) -> Tensor:
     return values.float() if values.dtype == torch.float64 else values
 
 
@@ -292,7 +303,7 @@ def _tensors(semantic_field: SemanticField) -> Iterator[tuple[str, Tensor]]:
 def _check_belongs(
     manifest: Mapping[str, Any], stored: Tensor | None, means: Tensor, folder: Path, checkpoint: str | Path
 ) -> None:
-    """Makes sure that a field is one of these means, bit for bit."""
+    """Raise if a field does not belong to these means, bit for bit."""
     if manifest["num_gaussians"] != len(means):
         raise InputError(
             f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "

@@ -1,4 +1,4 @@
-"""The two inputs of every lift: a trained Gaussian scene and the cameras that looked at it."""
+"""The two inputs of every lift: a trained Gaussian scene and the cameras of its images."""
 
 from __future__ import annotations
 
@@ -11,45 +11,43 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 
-LARGEST_SCALE = 4.8517e8
-"""e^20 world units, however an exponential is rounded. The projected covariance of a larger Gaussian may not be a
-float32 number."""
-LARGEST_MEAN = 1e18
-"""In world units along each axis: the square of a distance must be a float32 number."""
-QUATERNION_LENGTHS = (1e-18, 1e18)
-"""Range of the largest component: the squared length must be a normal float32 number, or else the rotation is NaN, or
-silently none at all.
-"""
+MAX_SCALE = 4.8517e8
+"""Largest scale in world units, e^20 with a margin for rounding. The projected covariance of a larger Gaussian may
+overflow float32."""
+MAX_MEAN = 1e18
+"""Largest coordinate of a mean in world units; squared distances must fit into float32."""
+QUATERNION_RANGE = (1e-18, 1e18)
+"""Range of a quaternion's largest component. If its squared length is not a normal float32 number, the rotation is NaN
+or silently the identity."""
 
 
 @dataclass(frozen=True)
 class GaussianScene:
     """N Gaussians with activated parameters, as the rasterizer sees them.
 
-    A Gaussian whose parameters are not finite or out of range stays in the scene, so that rows keep their meaning, but
-    is never drawn: see `drawable`.
+    A Gaussian with parameters that are not finite or out of range keeps its row, but is never drawn (see `drawable`).
 
     Raises:
-        ValueError: wrong shapes, no floating point, mixed devices, a negative scale or an opacity outside 0..1 (NaN is
-            neither).
+        ValueError: if a shape is wrong, a tensor is not floating-point, devices differ, a scale is negative, or an
+            opacity is outside 0..1. NaN is accepted.
 
     >>> import torch
     >>> from normlift_ns import GaussianScene
     >>> means, quats = torch.tensor([[0.0, 0, 2], [0, 0, torch.nan]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
-    >>> logarithms, logits = torch.zeros(2, 3), torch.zeros(2)  # as splatfacto trains them
-    >>> scene = GaussianScene(means, quats, scales=logarithms.exp(), opacities=logits.sigmoid())
+    >>> log_scales, logits = torch.zeros(2, 3), torch.zeros(2)  # as splatfacto trains them
+    >>> scene = GaussianScene(means, quats, scales=log_scales.exp(), opacities=logits.sigmoid())
     >>> scene.scales[0].tolist(), scene.opacities.tolist(), scene.drawable.tolist()
     ([1.0, 1.0, 1.0], [0.5, 0.5], [True, False])
     """
 
     means: Float[Tensor, "n 3"]
-    """Centres in world units."""
+    """Centers in world units."""
     quats: Float[Tensor, "n 4"]
     """Rotations as (w, x, y, z); any non-zero length."""
     scales: Float[Tensor, "n 3"]
-    """Standard deviations along the three axes in world units, linear (not the logarithm), >= 0."""
+    """Standard deviations along the three axes in world units, >= 0; linear, not logarithms."""
     opacities: Float[Tensor, " n"]
-    """Opacities in 0..1 (not logits)."""
+    """Opacities in 0..1, not logits."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim > 0 else 0
@@ -69,7 +67,7 @@ class GaussianScene:
             )
         if bool(((self.opacities < 0) | (self.opacities > 1)).any()):
             raise InputError(
-                "GaussianScene.opacities leaves 0..1; pass activated opacities: sigmoid() of a splatfacto "
+                "GaussianScene.opacities has values outside 0..1; pass activated opacities: sigmoid() of a splatfacto "
                 "checkpoint's `opacities`"
             )
 
@@ -77,35 +75,34 @@ class GaussianScene:
         return self.means.shape[0]
 
     def to(self, device: torch.device | str) -> GaussianScene:
-        """A copy on another device."""
+        """Return a copy on another device."""
         return GaussianScene(*(x.to(device) for x in (self.means, self.quats, self.scales, self.opacities)))
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:
-        """True where all parameters are finite and small enough for float32, and the quaternion is not too short.
+        """Mask of the Gaussians that are drawn: finite, small enough for float32, with a quaternion of valid length.
 
-        The limits are those of float32 whatever the precision, so that every backend draws the same Gaussians. Scales
-        that are 0 are drawn as dots.
+        The limits are those of float32 for any precision, so every backend draws the same Gaussians. Gaussians with a
+        scale of 0 are drawn as dots.
         """
-        length = self.quats.float().abs().amax(dim=1)  # but for a factor of 2
-        least, most = QUATERNION_LENGTHS
-        small = (self.means.float().abs() <= LARGEST_MEAN).all(dim=1) & (self.scales.float() <= LARGEST_SCALE).all(
-            dim=1
-        )
-        return small & (length >= least) & (length <= most) & self.opacities.isfinite()
+        length = self.quats.float().abs().amax(dim=1)  # up to a factor of 2
+        low, high = QUATERNION_RANGE
+        small = (self.means.float().abs() <= MAX_MEAN).all(dim=1) & (self.scales.float() <= MAX_SCALE).all(dim=1)
+        return small & (length >= low) & (length <= high) & self.opacities.isfinite()
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in the OpenCV convention: x right, y down, z forward; pixel centres at half integers.
+    """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
 
     Raises:
-        ValueError: wrong shapes, non-finite or skewed intrinsics, a pose that is not rigid, a size below one pixel.
+        ValueError: if a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the image
+            is smaller than one pixel.
 
     >>> import torch
     >>> from normlift_ns import Camera
     >>> pose = torch.eye(4)
-    >>> pose[2, 3] = 2.0  # the origin of the world lies two units before the camera
+    >>> pose[2, 3] = 2.0  # the world origin lies two units in front of the camera
     >>> camera = Camera(torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), pose, width=160, height=120)
     >>> x, y, depth = (camera.K @ (camera.world_to_camera @ torch.tensor([0.5, 0.25, 0.0, 1.0]))[:3]).tolist()
     >>> x / depth, y / depth, depth
@@ -136,8 +133,8 @@ class Camera:
             )
         pose = self.world_to_camera.double()
         rotation = pose[:3, :3]
-        gap = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=pose.device)).abs().max().item()
-        if gap > 1e-3 or torch.linalg.det(rotation).item() < 0 or pose[3].tolist() != [0, 0, 0, 1]:
+        deviation = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device=pose.device)).abs().max().item()
+        if deviation > 1e-3 or torch.linalg.det(rotation).item() < 0 or pose[3].tolist() != [0, 0, 0, 1]:
             raise InputError(
                 "Camera.world_to_camera must be a rotation and a translation (no scale, no mirror), got "
                 f"{self.world_to_camera.tolist()}"

@@ -1,4 +1,4 @@
-"""Where the Triton kernels of `normlift_ns.kernels` apply, and what to do when a GPU's memory is full."""
+"""Choice of the device, availability of the Triton kernels, and recovery when GPU memory runs out."""
 
 from __future__ import annotations
 
@@ -16,35 +16,41 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.ranges import check_device
 
-OLDEST_TRITON = 3
+MIN_TRITON_VERSION = 3
 Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
 Result = TypeVar("Result")
 
 
 @cache
 def has_triton() -> bool:
-    """Whether torch came with a Triton that the kernels are written for: 3 or newer, as from torch 2.4 on Linux on.
+    """Return whether Triton 3 or newer is installed, as with torch 2.4 and later on Linux.
 
-    Elsewhere stock gsplat rasterizes on the GPU.
+    Without it, stock gsplat rasterizes on the GPU.
     """
     if find_spec("triton") is None:
         return False
     try:
-        return int(version("triton").partition(".")[0]) >= OLDEST_TRITON
-    except (PackageNotFoundError, ValueError):  # of another distribution, which says nothing
+        return int(version("triton").partition(".")[0]) >= MIN_TRITON_VERSION
+    except (PackageNotFoundError, ValueError):  # from another distribution, whose version is not comparable
         return True
 
 
 def kernels_apply(tensor: Tensor) -> bool:
-    """Whether a tensor is where kernels run."""
+    """Return whether the Triton kernels can process a tensor: it is on a GPU, and Triton is installed."""
     return tensor.is_cuda and has_triton()
 
 
 def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[Result]:
-    """[run(items)]; where the GPU's memory does not hold that, the results of both halves, and so on.
+    """Run a function on all items; if the GPU runs out of memory, split them into halves recursively.
 
+    Args:
+        run: function of a part of the items.
+        items: sequence, or tensor that is split along its first dimension.
+        advice: remedy that the message of the MemoryError suggests.
+    Returns:
+        The results of all parts, in order.
     Raises:
-        MemoryError: one item alone is too large; says so, and what to do: `advice`.
+        MemoryError: if a single item is too large.
     """
     try:
         return [run(items)]
@@ -57,24 +63,24 @@ def in_parts(run: Callable[[Items], Result], items: Items, advice: str) -> list[
 
 
 def wake(device: str) -> None:
-    """Lets a GPU start, which takes a second, while other work goes on.
+    """Initialize CUDA in the background, which takes a second.
 
-    What fails then fails again where the GPU is wanted, and is told there.
+    Errors are ignored here, because they recur and are reported when the GPU is used.
     """
 
     def start() -> None:
-        with suppress(Exception):  # as the docstring says
+        with suppress(Exception):
             torch.empty(1, device=device)
 
     if device.startswith("cuda"):
-        Thread(target=start, name="wake", daemon=True).start()
+        Thread(target=start, name="init-cuda", daemon=True).start()
 
 
 def choose_device(device: str) -> str:
-    """The device to work on; auto: cuda if there is one.
+    """Return the device to use; "auto" is cuda if available, else cpu.
 
     Raises:
-        ValueError: an unknown device, or one that this machine lacks.
+        ValueError: if the device is unknown or this machine does not have it.
     """
     device = check_device(device)
     if device.startswith("cuda"):
@@ -82,7 +88,7 @@ def choose_device(device: str) -> str:
         if count == 0:
             raise InputError(f"--device {device}: this machine has no CUDA device; use --device cpu")
         if int(device[5:] or 0) >= count:
-            raise InputError(f"--device {device}: this machine has {count}, of which the last is cuda:{count - 1}")
+            raise InputError(f"--device {device}: no such device; the last one is cuda:{count - 1}")
     if device != "auto":
         return device
     return "cuda" if torch.cuda.is_available() else "cpu"

@@ -1,6 +1,6 @@
-"""The lift: directions and reliability of every Gaussian, from evidence and one table of unit features.
+"""The lift: direction and reliability of every Gaussian, from evidence and one table of unit features.
 
-For Gaussian j, with E_js the evidence and F_s the unit feature of region s (equation numbers of the NormLift paper)::
+Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equation numbers are those of the paper::
 
     f_j     = sum_s E_js F_s / W_j,   W_j = sum_s E_js        eq. 3, back-projection
     u_j     = f_j / ||f_j||                                   eq. 5, optimum of the cosine alignment problem, eq. 4
@@ -28,20 +28,23 @@ from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, MANY_ENTRIES, Spa
 from normlift_ns.errors import InputError
 from normlift_ns.options import Unlabeled
 
-_LEAST_WEIGHT, _LARGEST_WEIGHT = 1e-15, 1e15
-"""Range of W_j with evidence and of E_js: squares of sums are float32 numbers. A rasterizer's are in 1e-13..1e9."""
+_MIN_WEIGHT, _MAX_WEIGHT = 1e-15, 1e15
+"""Smallest W_j that counts as evidence, and largest valid E_js; squares of sums then fit into float32. Weights of a
+rasterizer are in 1e-13..1e9."""
 
 
 @dataclass(frozen=True)
 class Scalars:
-    """The numbers of every Gaussian. Without evidence (W_j < 1e-15 or f_j = 0) all are 0 but `view_count` and `weight`.
+    """Scalars of every Gaussian.
+
+    Without evidence (W_j < 1e-15 or f_j = 0), all but `view_count` and `weight` are 0.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
     >>> from normlift_ns.core.evidence import Entries
-    >>> seen = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 2, 1, 4]), torch.ones(4), num_regions=(2, 1))
+    >>> entries = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 2, 1, 4]), torch.ones(4), num_regions=(2, 1))
     >>> features = torch.tensor([[0.6, 0.8], [0.6, -0.8], [0.6, -0.8]])  # two regions of view 0, one of view 1
-    >>> scalars = lift(Evidence.from_entries([seen], 2), features).scalars
+    >>> scalars = lift(Evidence.from_entries([entries], 2), features).scalars
     >>> scalars.norm, scalars.c_intra, scalars.c_inter
     (tensor([0.6000, 0.6000]), tensor([0.6000, 1.0000]), tensor([1.0000, 0.6000]))
     >>> scalars.n_eff, scalars.reliability
@@ -55,7 +58,7 @@ class Scalars:
     c_inter: Float[Tensor, " n"]
     """Agreement between views, in 0..1."""
     n_eff: Float[Tensor, " n"]
-    """Effective number of views, in 1..view_count (0 without evidence)."""
+    """Effective number of views, in 1..view_count, or 0 without evidence."""
     reliability: Float[Tensor, " n"]
     """R_j, in 0..1."""
     weight: Float[Tensor, " n"]
@@ -65,23 +68,23 @@ class Scalars:
 
     @property
     def own_evidence(self) -> Float[Tensor, " n"]:
-        """||f_j|| N_eff: how many views agree on the direction of a Gaussian, for `refine`."""
+        """||f_j|| N_eff, the number of views that agree on the direction of a Gaussian, for `refine`."""
         return self.norm * self.n_eff
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Scalars:
-        """The same numbers, each array changed."""
-        return Scalars(**{f.name: change(getattr(self, f.name)) for f in fields(Scalars)})
+    def map(self, function: Callable[[Tensor], Tensor]) -> Scalars:
+        """Apply a function to every array."""
+        return Scalars(**{f.name: function(getattr(self, f.name)) for f in fields(Scalars)})
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """What a lift knows of every Gaussian: its numbers, and all that its direction is made of.
+    """Result of a lift: the scalars of every Gaussian, and the evidence and features that its direction follows from.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
     >>> from normlift_ns.core.evidence import Entries
-    >>> seen = Entries(torch.tensor([0, 0, 1]), torch.tensor([1, 2, 2]), torch.tensor([3.0, 4.0, 1.0]), (2,))
-    >>> lifted = lift(Evidence.from_entries([seen], 3), torch.eye(2))
+    >>> entries = Entries(torch.tensor([0, 0, 1]), torch.tensor([1, 2, 2]), torch.tensor([3.0, 4.0, 1.0]), (2,))
+    >>> lifted = lift(Evidence.from_entries([entries], 3), torch.eye(2))
     >>> lifted.directions(torch.tensor([0])), lifted.scalars.weight
     (tensor([[0.6000, 0.8000]]), tensor([7., 1., 0.]))
     """
@@ -89,30 +92,32 @@ class Lifted:
     scalars: Scalars
     evidence: Evidence
     features: Float[Tensor, "s d"]
-    """The feature table, normalised, in the precision of the lift."""
+    """The feature table, normalized, in the precision of the lift."""
 
     def directions(
         self, gaussians: Int[Tensor, " m"] | None = None, *, dtype: torch.dtype | None = None
     ) -> Float[Tensor, "m d"]:
-        """u_j of all or some Gaussians, unit rows, 0 without evidence. Any subset gives the same rows as the whole.
+        """Return u_j of all or some Gaussians: unit rows, 0 without evidence.
+
+        The row of a Gaussian does not depend on which others are requested.
 
         Args:
-            dtype: of the result; half precision needs half the memory, and no more than it on the way.
+            dtype: type of the result; half precision also halves the peak memory.
         """
         dtype = dtype or self.features.dtype
         n, device = self.evidence.num_gaussians, self.features.device
         gaussians = torch.arange(n, device=device) if gaussians is None else gaussians
         if _has_kernel(self.features):
             return self._directions(gaussians, dtype)
-        found = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
+        result = self.features.new_empty(len(gaussians), self.features.shape[1], dtype=dtype)
         first = 0
         for rows in gaussians.split(self._step):
-            found[first : first + len(rows)] = self._directions(rows, dtype)
+            result[first : first + len(rows)] = self._directions(rows, dtype)
             first += len(rows)
-        return found
+        return result
 
     def iter_directions(self) -> Iterator[tuple[int, Float[Tensor, "m d"]]]:
-        """u_j in blocks of consecutive Gaussians, (first Gaussian, block), with bounded memory."""
+        """Yield u_j with bounded memory, as (first Gaussian, block of consecutive Gaussians)."""
         n, device = self.evidence.num_gaussians, self.features.device
         for first in range(0, n, self._step):
             rows = torch.arange(first, min(n, first + self._step), device=device)
@@ -135,7 +140,7 @@ class Lifted:
 
 
 class _Sums(NamedTuple):
-    """Per Gaussian, in float64 but for the last."""
+    """Sums per Gaussian, in float64 except for the last."""
 
     total: Tensor
     """||sum_v S_jv||"""
@@ -151,19 +156,21 @@ class _Sums(NamedTuple):
 def lift(
     evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: Unlabeled = "ignore"
 ) -> Lifted:
-    """Directions u_j and reliability R_j of all Gaussians (eq. 3 to 8 of the paper; formulas at the top of this file).
+    """Compute directions u_j and reliability R_j of all Gaussians.
+
+    These are equations 3 to 8 of the paper, with the formulas at the top of this file.
 
     Args:
         evidence: E, from `rasterize_evidence`.
-        features: one unit row per column of the evidence; half-precision rows are normalised again.
+        features: one unit row per column of the evidence; half-precision rows are normalized again.
         beta: prior strength of the shrinkage of R, in virtual views, >= 0.
-        unlabeled: "ignore": unlabelled pixels do not exist. "dilute": they count as observations of the zero vector,
-            in W_jv everywhere.
+        unlabeled: "ignore" leaves unlabeled pixels out. "dilute" counts them as observations of the zero vector, in
+            every W_jv.
     Returns:
         `Lifted`, in float64 if the evidence or the features are, else in float32.
     Raises:
-        ValueError: a table of another length; zero, non-finite or non-unit rows; weights outside 0..1e15; beta < 0; an
-            unknown `unlabeled`.
+        ValueError: if the table has another length, a row is not a finite unit vector, a weight is outside 0..1e15,
+            `beta` is negative, or `unlabeled` is unknown.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, lift, rasterize_evidence
@@ -179,24 +186,24 @@ def lift(
         raise InputError(f'unlabeled must be "ignore" or "dilute", got {unlabeled!r}')
     if not beta >= 0:
         raise InputError(f"beta must be >= 0, got {beta}")
-    for what, rows in (("regions", evidence.rows), ("unlabelled pixels", evidence.unlabeled)):
-        if not bool(((rows.weight >= 0) & (rows.weight <= _LARGEST_WEIGHT)).all()):
+    for name, rows in (("regions", evidence.rows), ("unlabeled pixels", evidence.unlabeled)):
+        if not bool(((rows.weight >= 0) & (rows.weight <= _MAX_WEIGHT)).all()):
             low, high = (float(x) for x in rows.weight.aminmax())
-            raise InputError(f"weights of {what} must be in 0..{_LARGEST_WEIGHT:g}, found {low:g}..{high:g}")
+            raise InputError(f"weights of {name} must be in 0..{_MAX_WEIGHT:g}, found {low:g}..{high:g}")
     table = _unit_table(evidence, features)
     total, by_view, weight, weight_squared, view_count = _sums(evidence, table)
     if unlabeled == "dilute":
         weight, weight_squared, view_count = _weights(SparseRows.add(evidence.view_weights(), evidence.unlabeled))
 
-    found = (weight >= _LEAST_WEIGHT) & (total > (1e-12 if table.dtype == torch.float64 else 1e-6) * weight)
-    norm = _ratio(total, weight, found).clamp(max=1)
-    n_eff = _ratio(weight**2, weight_squared, found)
+    has_direction = (weight >= _MIN_WEIGHT) & (total > (1e-12 if table.dtype == torch.float64 else 1e-6) * weight)
+    norm = _ratio(total, weight, has_direction).clamp(max=1)
+    n_eff = _ratio(weight**2, weight_squared, has_direction)
     values = {
         "norm": norm,
-        "c_intra": _ratio(by_view, weight, found).clamp(max=1),
-        "c_inter": _ratio(total, by_view, found).clamp(max=1),
+        "c_intra": _ratio(by_view, weight, has_direction).clamp(max=1),
+        "c_inter": _ratio(total, by_view, has_direction).clamp(max=1),
         "n_eff": n_eff,
-        "reliability": _ratio(norm * n_eff, n_eff + beta, found),
+        "reliability": _ratio(norm * n_eff, n_eff + beta, has_direction),
         "weight": weight,
     }
     scalars = Scalars(**{name: x.to(table.dtype) for name, x in values.items()}, view_count=view_count.int())
@@ -211,7 +218,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
             f"{features.dtype} {tuple(features.shape)}"
         )
     exact = features.to(evidence.rows.weight.device, torch.float64)
-    length = check_unit_rows(exact, "feature rows", "normalise them, and label regions without a feature -1")
+    length = check_unit_rows(exact, "feature rows", "normalize them, and label regions without a feature -1")
     double = torch.float64 in (evidence.rows.weight.dtype, features.dtype)
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
@@ -229,7 +236,7 @@ def _sums(evidence: Evidence, table: Tensor) -> _Sums:
 
 
 def _weights(view_weights: SparseRows) -> tuple[Tensor, Tensor, Tensor]:
-    """W_j, sum_v W_jv ** 2 and the number of views, of W_jv."""
+    """Return W_j, sum_v W_jv ** 2 and the number of views with weight."""
     squared = segment_sum(view_weights.weight.double() ** 2, view_weights.offsets)
     return view_weights.row_sums(), squared, segment_sum((view_weights.weight > 0).float(), view_weights.offsets)
 
@@ -243,8 +250,9 @@ def _row_norms(rows: SparseRows, table: Tensor) -> Tensor:
 
 
 def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
-    """sum_v ||S_jv|| per Gaussian. A view that shows a Gaussian in one region only, the common case, needs no vector:
-    ||S_jv|| = E_js.
+    """Return sum_v ||S_jv|| of every Gaussian.
+
+    If a view shows a Gaussian in one region only, the common case, ||S_jv|| = E_js and no vector is needed.
     """
     groups = evidence.view_group_offsets
     rows = evidence.rows

@@ -1,6 +1,4 @@
-"""Directions in a low-rank basis of the scene's own feature table, with a bound on what that costs every Gaussian in
-any query.
-"""
+"""Low-rank bases of a scene's feature table, with a bound on the query error of every Gaussian."""
 
 from __future__ import annotations
 
@@ -14,36 +12,36 @@ from normlift_ns.core.lift import Lifted
 from normlift_ns.core.portions import ALONE, Team
 
 _ROUNDING = 1e-6
-"""Relative float32 rounding of the stored weights, norms and directions, added to x_j."""
+"""Relative rounding error of weights, norms and directions stored in float32, added to x_j."""
 
 
 def half_precision_error(dimension: int) -> float:
-    """Bound on the length of the error of a unit vector rounded to float16: 2**-11 relative, and 2**-25 per component
-    near zero.
+    """Return a bound on the length of the error of a unit vector rounded to float16.
+
+    It is 2**-11 relative, plus 2**-25 for every component near zero.
     """
     return 2.0**-11 + dimension**0.5 * 2.0**-25
 
 
 class Basis(NamedTuple):
-    """r orthonormal rows and the bound that they give each Gaussian."""
+    """Orthonormal basis of rank r, and the error bound of every Gaussian."""
 
     rows: Float64[Tensor, "r d"]
     bound: Float64[Tensor, " n"]
-    """Largest |<u_j, t> - <u'_j, t>| over all unit t, with u' the projected and renormalised direction; 0 without
-    evidence.
-    """
+    """Bound on |<u_j, t> - <u'_j, t>| over all unit t, with u' the projected and renormalized direction; 0 without
+    evidence."""
 
 
 class SpectralTable(NamedTuple):
-    """Eigenvectors of F^T F by falling eigenvalue, and the residual of every feature row for every rank."""
+    """Eigenvectors of F^T F by descending eigenvalue, and the residual of every feature row for every rank."""
 
     vectors: Float64[Tensor, "d d"]
     residual: Float64[Tensor, "s ranks"]
-    """|F_s - F_s B B^T| of the first r eigenvectors, r = 0 ... D, in column r."""
+    """|F_s - F_s B B^T| in column r, with B the first r eigenvectors, r = 0 ... D."""
 
 
 def spectral_table(features: Float[Tensor, "s d"], team: Team = ALONE) -> SpectralTable:
-    """Eigenvectors of the feature table, in float64; in a team those that process 0 finds."""
+    """Compute the eigenvectors of the feature table in float64; all processes use those of process 0."""
     exact = features.double()
     vectors = team.spread(torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1))
     power = (exact @ vectors) ** 2
@@ -52,12 +50,11 @@ def spectral_table(features: Float[Tensor, "s d"], team: Team = ALONE) -> Spectr
 
 
 def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
-    """The first `rank` eigenvectors with their bound.
+    """Return the first `rank` eigenvectors with their bound.
 
-    With r_s the residual of row s and x_j = sum_s E_js r_s / (W_j ||f_j||), the part of u_j outside the basis is at
-    most x_j long.
-    Projecting loses at most x_j; projecting and renormalising moves u_j by at most sqrt(2 - 2 sqrt(1 - x_j^2)) if x_j
-    <= 1, else by at most 2.
+    Let r_s be the residual of row s and x_j = sum_s E_js r_s / (W_j ||f_j||). The part of u_j outside the basis then
+    has at most the length x_j. Projecting and renormalizing moves u_j by at most sqrt(2 - 2 sqrt(1 - x_j^2)) if
+    x_j <= 1, else by at most 2.
     """
     residual = table.residual[:, rank : rank + 1].contiguous()
     lost = lifted.evidence.rows.matmul(residual).squeeze(1)
@@ -68,8 +65,9 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
 
 
 def smallest_basis(lifted: Lifted, tolerance: float, team: Team = ALONE) -> Basis | None:
-    """The basis of least rank that keeps every Gaussian's bound, float16 coordinates included, within `tolerance`;
-    None if none does. Every process of a team has Gaussians of its own, and all get the same basis.
+    """Return the basis of lowest rank for which the bound of every Gaussian is within `tolerance`, or None.
+
+    The bound includes the rounding of coordinates to float16. Processes with different Gaussians get the same basis.
     """
     table = spectral_table(lifted.features, team)
     low, high, best = 1, lifted.features.shape[1] + 1, None

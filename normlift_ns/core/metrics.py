@@ -1,4 +1,4 @@
-"""Metrics of segmentation, localisation and ranking, for labels in any number of dimensions."""
+"""Metrics of segmentation, localization and ranking, for labels of any dimension."""
 
 from __future__ import annotations
 
@@ -15,50 +15,57 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import WithoutDirection
 
 NO_CLASS = -1
-"""Truth of a point that does not count; answer of a Gaussian that has none."""
+"""True class of a point that does not count, and predicted class of a Gaussian without a direction."""
 
 
 class ClassScores(NamedTuple):
-    """Per class, and the means over the classes that the truth contains."""
+    """Scores per class, and their means over the classes that the ground truth contains."""
 
     iou: Float64[Tensor, " c"]
-    """|truth and found| / |truth or found| over the points that count; NaN where the truth lacks the class."""
+    """|truth and predicted| / |truth or predicted| over the points that count; NaN if the truth lacks the class."""
     accuracy: Float64[Tensor, " c"]
-    """Recall |truth and found| / |truth|; NaN where the truth lacks the class."""
+    """Recall |truth and predicted| / |truth|; NaN if the truth lacks the class."""
 
     @property
     def miou(self) -> float:
-        """Mean IoU over present classes, in 0..1; NaN if there is none."""
+        """Mean IoU over the present classes, in 0..1; NaN if there are none."""
         return float(self.iou.nanmean())
 
     @property
     def macc(self) -> float:
-        """Mean recall over present classes, in 0..1; NaN if there is none."""
+        """Mean recall over the present classes, in 0..1; NaN if there are none."""
         return float(self.accuracy.nanmean())
 
 
-def confusion(truth: Int[Tensor, "*m"], found: Int[Tensor, "*m"], classes: int) -> Int64[Tensor, "c c_plus_1"]:
-    """How many points of each true class (row) were found to be of each class (column); the last column: of none.
+def confusion(truth: Int[Tensor, "*m"], predicted: Int[Tensor, "*m"], classes: int) -> Int64[Tensor, "c c_plus_1"]:
+    """Count the points of each true class (row) by predicted class (column); the last column is for no class.
 
-    Points whose truth is negative do not count, whatever was found there.
+    Points with a negative true class do not count.
 
+    Args:
+        truth: true classes.
+        predicted: predicted classes, negative for none.
+        classes: number of classes.
     Raises:
-        ValueError: a class that is not below `classes`.
+        ValueError: if a class is not below `classes`.
 
     >>> confusion(torch.tensor([0, 0, 1, -1]), torch.tensor([0, 1, -1, 1]), 2).tolist()
     [[1, 1, 0], [0, 0, 1]]
     """
-    for name, values in (("truth", truth), ("found", found)):
+    for name, values in (("truth", truth), ("predicted", predicted)):
         if values.numel() > 0 and int(values.max()) >= classes:
             raise InputError(f"{name} holds class {int(values.max())}, expected 0..{classes - 1}, or -1 for none")
     counts = truth >= 0
-    row, column = truth[counts].long(), found[counts].long()
+    row, column = truth[counts].long(), predicted[counts].long()
     column = torch.where(column < 0, classes, column)
     return torch.bincount(row * (classes + 1) + column, minlength=classes * (classes + 1)).view(classes, classes + 1)
 
 
 def class_scores(counts: Int64[Tensor, "c c_plus_1"]) -> ClassScores:
-    """IoU and accuracy from `confusion`; confusions of several scenes add up before, or their scores are averaged."""
+    """Return IoU and accuracy from the result of `confusion`.
+
+    To score several scenes, add up their confusions first, or average their scores.
+    """
     hits, of_truth = counts.diagonal().double(), counts.sum(1).double()
     union = of_truth + counts[:, : len(counts)].sum(0) - hits
     present = of_truth > 0
@@ -68,39 +75,39 @@ def class_scores(counts: Int64[Tensor, "c c_plus_1"]) -> ClassScores:
 def classify(
     scores: Float[Tensor, "n c"], valid: Bool[Tensor, " n"], *, without_direction: WithoutDirection = "none"
 ) -> Int64[Tensor, " n"]:
-    """The class with the largest score; ties go to the first of them.
+    """Return the class with the largest score; ties go to the first class.
 
     Args:
-        valid: Gaussians with a direction, `SemanticField.valid`.
-        without_direction: what the others are: "none": `NO_CLASS`, a miss in the recall of their class and in no union
-            but its own. "first": class 0, which is what the arg-max of a zero feature gives in published scripts; it
-            adds false finds to the first class, ScanNet's wall.
+        valid: mask of the Gaussians with a direction, from `SemanticField.valid`.
+        without_direction: class of the others. "none" is `NO_CLASS`, a miss in the recall of the true class that
+            enlarges no other union. "first" is class 0, the arg-max of a zero feature in published scripts; it adds
+            false positives to the first class, ScanNet's wall.
     """
     best = scores.argmax(dim=1)
     return torch.where(valid, best, NO_CLASS if without_direction == "none" else 0)
 
 
-def mask_iou(found: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, empty: float = math.nan) -> float:
-    """|found and truth| / |found or truth|, in 0..1.
+def mask_iou(predicted: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, empty: float = math.nan) -> float:
+    """Return |predicted and truth| / |predicted or truth|, in 0..1.
 
     Args:
-        empty: the result for two empty masks, of which the formula says nothing: NaN, or 0 in SFS's code.
+        empty: result for two empty masks, for which the formula is undefined; 0 in SFS's code.
     """
-    union = int((found | truth).sum())
-    return int((found & truth).sum()) / union if union > 0 else empty
+    union = int((predicted | truth).sum())
+    return int((predicted & truth).sum()) / union if union > 0 else empty
 
 
-def mask_recall(found: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"]) -> float:
-    """|found and truth| / |truth|, in 0..1; NaN where the truth is empty."""
+def mask_recall(predicted: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"]) -> float:
+    """Return |predicted and truth| / |truth|, in 0..1, or NaN if the truth is empty."""
     size = int(truth.sum())
-    return int((found & truth).sum()) / size if size > 0 else float("nan")
+    return int((predicted & truth).sum()) / size if size > 0 else float("nan")
 
 
 def localized(score: Float[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, any_peak: bool = False) -> bool:
-    """Whether the pixel with the largest score is in the mask.
+    """Return whether the pixel with the largest score is in the mask.
 
     Args:
-        any_peak: of several largest pixels any may be in the mask; otherwise the first one, row by row, must be.
+        any_peak: accept any of several pixels with the largest score; otherwise, only the first in row-major order.
     """
     peak = score == score.max()
     if any_peak:
@@ -112,48 +119,48 @@ class Correlation(NamedTuple):
     """A rank correlation."""
 
     value: float
-    """In -1..1; NaN where one side is constant."""
+    """Coefficient in -1..1; NaN if one side is constant."""
     p: float
-    """Probability of a correlation at least as strong among independent points, two-sided; NaN likewise."""
+    """Two-sided p-value: the probability of a correlation at least as strong among independent points; NaN likewise."""
 
 
 def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
-    """Spearman's rank correlation, ties at their mean rank."""
+    """Compute Spearman's rank correlation, with ties at their mean rank."""
     return _correlation(stats.spearmanr, a, b)
 
 
 def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
-    """Kendall's tau-b, in n log n steps."""
+    """Compute Kendall's tau-b in O(n log n) steps."""
     return _correlation(stats.kendalltau, a, b)
 
 
 def spearman(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
-    """The value of `spearman_test`."""
+    """Return the value of `spearman_test`."""
     return spearman_test(a, b).value
 
 
 def kendall(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
-    """The value of `kendall_test`."""
+    """Return the value of `kendall_test`."""
     return kendall_test(a, b).value
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:
-    """Jaccard index of the sets of the lowest `share` by either value; equal values go in by index.
+    """Return the Jaccard index of the two sets with the lowest `share` of values; equal values count by index.
 
-    Of two independent orders about share / (2 - share) is expected: 0.111 for 0.2.
+    Two independent orders give about share / (2 - share), for example 0.111 for 0.2.
     """
     count = round(share * len(a))
-    low = [set(x.argsort(stable=True)[:count].tolist()) for x in (a, b)]
-    return len(low[0] & low[1]) / max(1, len(low[0] | low[1]))
+    lowest = [set(x.argsort(stable=True)[:count].tolist()) for x in (a, b)]
+    return len(lowest[0] & lowest[1]) / max(1, len(lowest[0] | lowest[1]))
 
 
 def bin_means(
     key: Float[Tensor, " n"], values: Float[Tensor, " n"], bins: int = 10
 ) -> tuple[Float64[Tensor, " bins"], Float64[Tensor, " bins"]]:
-    """Means of key and value in bins of equal count, by ascending key; equal keys are cut by index.
+    """Return the means of keys and values in bins of equal count, by ascending key; equal keys are split by index.
 
     Raises:
-        ValueError: fewer points than bins.
+        ValueError: if there are fewer points than bins.
     """
     if len(key) < bins:
         raise InputError(f"{bins} bins need at least as many points, got {len(key)}")
@@ -164,5 +171,5 @@ def bin_means(
 def _correlation(correlate: Callable[..., Any], a: Tensor, b: Tensor) -> Correlation:
     if not all(len(x) > 1 and bool((x != x[0]).any()) for x in (a, b)):
         return Correlation(math.nan, math.nan)
-    found = correlate(*(x.detach().cpu().double().numpy() for x in (a, b)))
-    return Correlation(float(found.statistic), float(found.pvalue))
+    result = correlate(*(x.detach().cpu().double().numpy() for x in (a, b)))
+    return Correlation(float(result.statistic), float(result.pvalue))

@@ -1,6 +1,4 @@
-"""Which Gaussians are whose, where several processes lift one scene together; and what such processes can ask of each
-other.
-"""
+"""Partition of the Gaussians among processes that lift one scene, and the interface for their communication."""
 
 from __future__ import annotations
 
@@ -19,76 +17,80 @@ from torch import Tensor
 from normlift_ns.core.sparse import SparseRows
 
 Report = Callable[[str, int, int], None]
-"""Called with (stage, steps done, steps in all)."""
+"""Progress callback, called with (stage, steps done, total steps)."""
 PER_VIEW = ("features", "evidence")
-"""Stages of a lift whose steps are views."""
+"""Stages of a lift that count views."""
 GRAIN = 2**13
-"""Gaussians, neighbours on the curve, that are worked on together. Portions are whole numbers of them, so that every
-product has the same shape however many processes there are: its rounding may depend on that."""
+"""Number of consecutive Gaussians on the curve that form a block. Each process has whole blocks, so the shapes of
+products do not depend on the number of processes; their rounding may depend on shapes."""
 
 
 class Team:
-    """A process that lifts alone; `normlift_ns.team` has those of several. All of a team call the same methods in the
-    same order."""
+    """Communication between processes, implemented here for a single process.
+
+    All processes must call the same methods in the same order.
+    """
 
     rank: int = 0
-    """Number of this process, in 0..size-1."""
+    """Rank of this process, in 0..size-1."""
     size: int = 1
-    """How many there are."""
+    """Number of processes."""
 
     def join(self, rows: Tensor) -> Tensor:
-        """The rows of all processes, one behind the other, at every process."""
+        """Return the concatenated rows of all processes, in every process."""
         return rows
 
     def deliver(self, rows: Tensor) -> list[Tensor] | None:
-        """The rows of every process, at process 0 alone."""
+        """Return the rows of every process in process 0, and None in the others."""
         return [rows]
 
     def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        """Gives parts[r] to process r; what every process has given to this one."""
+        """Send parts[r] to process r, and return the parts that all processes sent to this one."""
         return list(parts)
 
     def add(self, values: Tensor) -> Tensor:
-        """The sum over all processes, at every process."""
+        """Return the sum over all processes, in every process."""
         return values
 
     def spread(self, values: Tensor) -> Tensor:
-        """The numbers that process 0 has, at every process; the others give arrays of that shape and type."""
+        """Return the values of process 0 in every process; the others pass arrays of the same shape and type."""
         return values
 
-    def tell(self, facts: Any) -> Any:
-        """What process 0 says, ready for JSON, at every process."""
-        return facts
+    def tell(self, value: Any) -> Any:
+        """Return the JSON-ready object of process 0 in every process."""
+        return value
 
-    def tell_all(self, facts: Any) -> list[Any]:
-        """What every process says, ready for JSON, at every process."""
-        return [facts]
+    def tell_all(self, value: Any) -> list[Any]:
+        """Return the JSON-ready objects of all processes in every process."""
+        return [value]
 
     def counted(self, report: Report) -> Report:
-        """What tells how far the whole team is in stages that count views, and process 0 in all others."""
+        """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
         return report
 
     @contextmanager
     def shares(self, folder: Path) -> Iterator[None]:
-        """While it lasts, `chunks` can be asked for.
+        """Provide a context in which `chunks` can be called.
 
         Args:
-            folder: which all processes share.
+            folder: directory that all processes share.
         """
         yield
 
     def chunks(self, count: int) -> Iterator[int]:
-        """The pieces of work, of so many, that are for this process: every one is for one process alone."""
+        """Yield indices in 0..count-1 of the work items of this process; each item belongs to one process only."""
         return iter(range(count))
 
 
 ALONE = Team()
+"""The communication of a single process."""
 
 
 @dataclass(frozen=True)
 class Portion:
-    """The Gaussians of one process: a piece of a curve through space, so that most neighbours are of the same process.
-    Arrays of a portion have one row for each of them, in the order of their numbers.
+    """Partition of the Gaussians by segments of a curve through space, so most neighbors are in the same process.
+
+    Arrays of a portion have one row for each Gaussian of this process, in index order.
 
     >>> import torch
     >>> means = torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])
@@ -99,11 +101,11 @@ class Portion:
 
     team: Team
     order: Int64[Tensor, " n"]
-    """All Gaussians along the curve."""
+    """Indices of all Gaussians in curve order."""
 
     @staticmethod
     def of(team: Team, means: Float[Tensor, "n 3"]) -> Portion:
-        """The portion of this process."""
+        """Partition the Gaussians with these means."""
         return Portion(team, spatial_order(means))
 
     def __len__(self) -> int:
@@ -111,22 +113,22 @@ class Portion:
 
     @cached_property
     def by_owner(self) -> list[Int64[Tensor, " m"]]:
-        """The Gaussians of every process, by their numbers: whole grains of the curve."""
+        """Indices of the Gaussians of every process, ascending; each process has whole blocks of the curve."""
         n, size = len(self.order), self.team.size
-        grains = -(-n // GRAIN)
-        bounds = [min(n, grains * rank // size * GRAIN) for rank in range(size + 1)]
+        blocks = -(-n // GRAIN)
+        bounds = [min(n, blocks * rank // size * GRAIN) for rank in range(size + 1)]
         if size == 1:
             return [torch.arange(n, device=self.order.device)]
         return [self.order[first:last].sort().values for first, last in pairwise(bounds)]
 
     @property
     def gaussians(self) -> Int64[Tensor, " m"]:
-        """Those of this process, by their numbers."""
+        """Indices of the Gaussians of this process, ascending."""
         return self.by_owner[self.team.rank]
 
     @cached_property
     def place(self) -> tuple[Int32[Tensor, " n"], Int32[Tensor, " n"]]:
-        """Of every Gaussian, whose it is and which row it is there."""
+        """Rank that owns each Gaussian, and row of the Gaussian in that process."""
         owner, row = (torch.empty_like(self.order, dtype=torch.int32) for _ in range(2))
         for rank, gaussians in enumerate(self.by_owner):
             owner[gaussians] = rank
@@ -135,25 +137,25 @@ class Portion:
 
     @cached_property
     def along(self) -> Int64[Tensor, " m"]:
-        """The rows of the portion along the curve."""
+        """Rows of the portion in curve order."""
         if self.team.size == 1:
             return self.order
         first = sum(map(len, self.by_owner[: self.team.rank]))
         return self.place[1][self.order[first : first + len(self)]].long()
 
     def blocks(self) -> Iterator[Int64[Tensor, " b"]]:
-        """Rows of the portion, a grain at a time along the curve."""
+        """Yield the rows of the portion in curve order, one block at a time."""
         return iter(self.along.split(GRAIN))
 
     def join(self, rows: Tensor) -> Tensor:
-        """Arrays of all portions as one, in the order of the Gaussians' numbers, at every process."""
+        """Combine the arrays of all portions into one, in index order, in every process."""
         if self.team.size == 1:
             return rows
         joined = self.team.join(rows)
         return torch.empty_like(joined).index_copy_(0, torch.cat(self.by_owner), joined)
 
     def deliver_sparse(self, rows: SparseRows) -> SparseRows | None:
-        """`join`, of a sparse matrix with one row per Gaussian, at process 0 alone."""
+        """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
         if self.team.size == 1:
             return rows
         parts = [self.team.deliver(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
@@ -166,16 +168,17 @@ class Portion:
 
 
 def join_sparse(team: Team, rows: SparseRows) -> SparseRows:
-    """The rows of all processes, one behind the other, at every process."""
+    """Return the concatenated rows of all processes, in every process."""
     lengths = team.join(rows.offsets.diff())
     offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
     return SparseRows(offsets, team.join(rows.column), team.join(rows.weight))
 
 
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
-    """All Gaussians along a Morton curve of 1,024 steps a side: neighbours in space come near each other.
+    """Return the indices of all Gaussians along a Morton curve, on which neighbors in space are near each other.
 
-    A scene's far outliers would leave the rest in one cell, so that sides end at the 1st and 99th percentile.
+    The curve has 1,024 steps per side. Its sides end at the 1st and 99th percentile, because far outliers would
+    otherwise put all other Gaussians into one cell.
     """
     sample = means[:: max(1, len(means) // 100_000)]
     sample = sample[sample.isfinite().all(dim=1)].double()

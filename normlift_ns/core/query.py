@@ -1,4 +1,4 @@
-"""Relevancy of Gaussians or pixels to text, by the three rules that people use."""
+"""Relevancy of Gaussians or pixels to text, by three common rules."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import CANONICAL_NEGATIVES, RULES, Rule
 
 
-def _lead(positive: Tensor, negative: Tensor) -> Tensor:
+def _margin(positive: Tensor, negative: Tensor) -> Tensor:
     return positive - negative.max(dim=-1, keepdim=True).values
 
 
 FORMULAS: dict[Rule, Callable[[Tensor, Tensor, float], Tensor]] = {
     "cosine": lambda positive, negative, temperature: positive,
-    # A softmax over two is a sigmoid of the difference; it falls as the negative rises, so the minimum is at the
-    # largest negative.
-    "lerf": lambda positive, negative, temperature: torch.sigmoid(temperature * _lead(positive, negative)),
-    "margin": lambda positive, negative, temperature: _lead(positive, negative),
+    # A softmax over two values is a sigmoid of their difference. It falls as the negative rises, so the minimum is at
+    # the largest negative.
+    "lerf": lambda positive, negative, temperature: torch.sigmoid(temperature * _margin(positive, negative)),
+    "margin": lambda positive, negative, temperature: _margin(positive, negative),
 }
-"""Relevancy from cosines to prompts [..., Q] and to negatives [..., B]; `quick` has the same for numpy."""
+"""Relevancy from cosines to prompts [..., Q] and to negatives [..., B]; `quick` has the same formulas for numpy."""
 
 
 def relevancy(
@@ -33,17 +33,17 @@ def relevancy(
     rule: Rule = "cosine",
     temperature: float = 10.0,
 ) -> Float[Tensor, "*n q"]:
-    """Relevancy of Q prompts from cosines.
+    """Compute the relevancy of Q prompts from cosines.
 
     Args:
         positive: cosine to each prompt.
         negative: cosine to each negative (rule "lerf") or background (rule "margin") prompt.
-        rule: "cosine": the cosine itself, in -1..1. "lerf": softmax of prompt against one negative, the least over
-            the negatives, in 0..1;
-            0.5 is a draw (LERF, section 3.4). "margin": cosine minus the largest background cosine, in -2..2.
+        rule: "cosine" is the cosine itself, in -1..1. "lerf" is the softmax of the prompt against one negative, in
+            0..1, at its minimum over the negatives; 0.5 is a draw (LERF, section 3.4). "margin" is the cosine minus
+            the largest background cosine, in -2..2.
         temperature: factor of the cosines inside the softmax.
     Raises:
-        ValueError: an unknown rule, or no negatives where the rule needs them.
+        ValueError: if the rule is unknown, or needs negatives and there are none.
 
     >>> import torch
     >>> from normlift_ns import relevancy
@@ -62,7 +62,9 @@ def relevancy(
 
 
 def strongest(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
-    """Index of the selected prompt of largest relevancy, the first of equals; -1 where none is selected.
+    """Return the index of the selected prompt with the largest relevancy, or -1 if none is selected.
+
+    Ties go to the first prompt.
 
     >>> strongest(torch.tensor([[0.3, 0.9], [0.1, 0.2]]), torch.tensor([[True, True], [False, False]]))
     tensor([ 1, -1], dtype=torch.int32)

@@ -18,13 +18,13 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
-"""Of a tensor in a vote by torch, on CPU, whose caches hold little, and GPU."""
+"""Elements of the largest tensor of a vote in torch, on the CPU (bounded by its caches) and on the GPU."""
 _BLOCK = (2 * GRAIN, 16 * GRAIN)
-"""Gaussians whose directions, with those of their neighbours, are held at a time on CPU and GPU."""
+"""Number of Gaussians whose directions and neighbors' directions are in memory at a time, on CPU and GPU."""
 MOST_VOTERS = 256
-"""Largest K of a vote, which compares every two of them: its time grows with the square."""
-_MOST_IN_KERNEL = 63
-"""Neighbours, of `kernels.vote`."""
+"""Largest K of a vote. Its time grows with the square of K, because it compares all pairs of neighbors."""
+_MAX_KERNEL_NEIGHBORS = 63
+"""Largest K that `kernels.vote` supports."""
 
 
 def refine(
@@ -37,35 +37,35 @@ def refine(
     neighbors: Neighbors | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Mode voting among neighbours: the refined direction of i is directions[source[i]].
+    """Vote for a direction among neighbors; the refined direction of i is directions[source[i]].
 
-    With N the K nearest neighbours of i, and N+ these and i itself::
+    Let N be the K nearest neighbors of i, and N+ these and i itself::
 
         d_ik = exp(-|mu_i - mu_k|^2 / (2 sigma_d^2)),   g_jk = sigmoid((<u_k, u_j> - tau) / gamma)
         paper:      S_ij = R_j sum_{k in N+} R_k d_ik g_jk                                    (equation 9)
         posterior:  S_ij = R_j (own_i g_ij + P sum_{k in N} R_k d_ik g_jk / sum_{k in N} R_k d_ik)
         source_i = argmax_{j in N} S_ij   if that S_ij > S_ii + Delta,   else i               (equation 10)
 
-    In the paper's vote i is one voter among up to K + 1, of weight R_i <= 1 however many views saw it. The posterior
-    vote counts views instead. With own_i = ||f_i|| N_eff_i, the number of views that agree on u_i, the first term is
-    what i has seen of a direction u_j. The second is what its neighbourhood says of it, a mean in 0..1, worth as much
-    as a prior of P views. The more views saw i, the less do its neighbours count.
+    In the paper's vote, i is one of up to K + 1 voters, with a weight R_i <= 1 for any number of views. The posterior
+    vote counts views instead. The first term is the support of i itself for a direction u_j, where own_i =
+    ||f_i|| N_eff_i is the number of views that agree on u_i. The second term is the support among its neighbors, a
+    mean in 0..1 that counts like a prior of P views. The more views see i, the less its neighbors count.
 
-    All votes read the unrefined directions. Ties go to the nearer neighbour. Where no neighbour is reliable nothing
-    changes; see `unsupported`. Where R_i = 0, S_ii = 0: whoever clears Delta wins.
+    All votes read the unrefined directions. Ties go to the nearer neighbor. If no neighbor is reliable, nothing
+    changes (see `unsupported`). If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
 
     Args:
-        config: by default the posterior vote where `own` is given, else the paper's.
-        directions: u, unit rows or 0, of any floating-point type, read in float32 (float64 if given); or a function
-            that gives those of some Gaussians, `Lifted.directions`: then only a block of them is held at a time.
+        config: options of the vote; by default, the posterior vote if `own` is given, else the paper's.
+        directions: u, unit rows or 0 of any floating-point type, used in float32 (or float64 if they are). A function
+            that returns the rows of some Gaussians, such as `Lifted.directions`, keeps one block in memory at a time.
         reliability: R in 0..1.
-        own: `Lifted.scalars.own_evidence`, which the posterior vote needs and the paper's does not read.
-        neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes; by default those of
-            `possible(config, n)`.
+        own: `Lifted.scalars.own_evidence`; the posterior vote needs it, the paper's ignores it.
+        neighbors: result of `nearest_neighbors(means, config.k)`, to search once for several votes; by default,
+            neighbors are searched with the K of `possible(config, n)`.
         progress: called after every block of Gaussians with (Gaussians done, Gaussians).
     Raises:
-        ValueError: shapes that disagree, directions that are neither unit vectors nor 0, R or `own` below 0
-            or not finite, neighbours of another K, a posterior vote without `own`.
+        ValueError: if shapes disagree, a direction is neither a unit vector nor 0, R or `own` is negative or not
+            finite, the neighbors are of another K, or a posterior vote lacks `own`.
 
     >>> import torch
     >>> from normlift_ns import RefineConfig, refine
@@ -74,17 +74,17 @@ def refine(
     >>> source = refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(vote="paper", k=2))
     >>> source.tolist(), directions[source.long()].tolist()
     ([0, 0, 2], [[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
-    >>> seen = torch.tensor([9.0, 1.0, 9.0])
-    >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2), own=seen).tolist()
+    >>> own = torch.tensor([9.0, 1.0, 9.0])
+    >>> refine(means, directions, torch.tensor([0.9, 0.1, 0.9]), RefineConfig(k=2), own=own).tolist()
     [0, 0, 2]
     """
-    named = {"means": means, "directions": directions, "reliability": reliability, "own": own}
-    optional = (None, directions) if callable(directions) else (None,)
-    check_tensors(**{name: value for name, value in named.items() if not any(value is one for one in optional)})
+    arguments = {"means": means, "directions": directions, "reliability": reliability, "own": own}
+    skipped = (None, directions) if callable(directions) else (None,)
+    check_tensors(**{name: value for name, value in arguments.items() if not any(value is x for x in skipped)})
     n, config = means.shape[0], config or RefineConfig(vote="paper" if own is None else "posterior")
     config = config if neighbors is not None else possible(config, n)
-    given = directions if isinstance(directions, Tensor) else None
-    shape = (n, 0) if given is None else tuple(given.shape)
+    table = directions if isinstance(directions, Tensor) else None
+    shape = (n, 0) if table is None else tuple(table.shape)
     if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
         raise InputError(
             f"means, directions and reliability must have the same rows, got {n}, {shape}, {tuple(reliability.shape)}"
@@ -97,16 +97,16 @@ def refine(
     check_not_negative("reliability", reliability)
     if own is not None:
         check_not_negative("own", own)
-    if given is not None:
+    if table is not None:
         check_unit_rows(
-            given, "rows of directions", "normalise them, or set those without a direction to 0", zeros=True
+            table, "rows of directions", "normalize them, or set those without a direction to 0", allow_zeros=True
         )
     neighbors = neighbors or nearest_neighbors(means, config.k)
     if tuple(neighbors.index.shape) != (n, config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
     neighbors = Neighbors(*(x.contiguous() for x in neighbors))
-    if given is not None and kernels_apply(means) and given.dtype == torch.float32:
-        given, directions = None, given.__getitem__  # the kernel needs as much memory again: a block at a time
+    if table is not None and kernels_apply(means) and table.dtype == torch.float32:
+        directions = table.__getitem__  # in blocks, because the kernel needs as much memory again
     order, width = spatial_order(means), decay_width(neighbors.spacing, config)
     return vote_of(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
 
@@ -122,19 +122,20 @@ def vote_of(
     width: Float64[Tensor, ""],
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """`refine` for some of the Gaussians, those with neighbours: the first m. The rest vote for others only.
+    """Run `refine` for some of the first m Gaussians, which have neighbors; the others only serve as neighbors.
 
     Args:
-        voters: in the order in which they are taken, block by block: neighbours in space near each other.
-        neighbors: of the first m Gaussians, all voters among them.
-        directions, reliability: as in `refine`, of all n.
+        voters: Gaussians to refine, block by block in this order; neighbors in space should be near each other.
+        neighbors: neighbors of the first m Gaussians, which include all voters.
+        directions, reliability: as in `refine`, for all n Gaussians.
         own: as in `refine`, read for voters only; None: the paper's vote.
         width: sigma_d, in the units of the distances.
+        progress: as in `refine`.
     """
     n, device, on_gpu = len(reliability), reliability.device, kernels_apply(reliability)
     decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
-    wins = _any_reliable(neighbors, reliability)  # where no neighbour is reliable, nobody can win
+    can_change = _any_reliable(neighbors, reliability)[voters]  # without a reliable neighbor, none can win
 
     def vote(voters: Tensor) -> None:
         if isinstance(directions, Tensor):
@@ -143,15 +144,14 @@ def vote_of(
             gaussians = _members(voters, neighbors, n)
             rows = directions(gaussians)
             row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
-        if on_gpu and rows.dtype != torch.float64 and config.k <= _MOST_IN_KERNEL:
+        if on_gpu and rows.dtype != torch.float64 and config.k <= _MAX_KERNEL_NEIGHBORS:
             _vote_on_gpu(voters, neighbors, rows, row_of, reliability, own, source, config, decay)
         else:
             _vote(voters, neighbors, rows, row_of, reliability, own, source, config, width)
 
     size, done = _BLOCK[on_gpu] if callable(directions) else max(1, n), 0
-    there = wins[voters]
-    ends = there.cumsum(0)[size - 1 : -1 : size].tolist()
-    for block in voters[there].tensor_split(ends):
+    ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
+    for block in voters[can_change].tensor_split(ends):
         if len(block) > 0:
             in_parts(vote, block, "refine on the CPU")
         done = min(done + size, len(voters))
@@ -161,28 +161,28 @@ def vote_of(
 
 
 def possible(config: RefineConfig, n: int) -> RefineConfig:
-    """The vote in numbers, with no more neighbours than there are, and than `MOST_VOTERS`; a warning says what changed.
+    """Resolve the options of a vote, and limit K to the number of other Gaussians and to `MOST_VOTERS`.
+
+    A warning reports a smaller K.
 
     >>> import warnings
-    >>> with warnings.catch_warnings(record=True) as told:
-    ...     possible(RefineConfig(k=100), 5).k, str(told[0].message)
-    (4, 'k is 100, but a Gaussian has only 4 others; the vote is among 4 neighbours')
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     possible(RefineConfig(k=100), 5).k, str(caught[0].message)
+    (4, 'k is 100, but a Gaussian has only 4 others; the vote uses 4 neighbors')
     """
     config = replace(config, **config.numbers._asdict())
     k = min(config.k, max(1, n - 1), MOST_VOTERS)
     if k == config.k:
         return config
     if n < 2:
-        warnings.warn(
-            f"with {n} Gaussian{'s' * (n != 1)} there are no neighbours, and nothing to vote on", stacklevel=2
-        )
+        warnings.warn(f"with {n} Gaussian{'s' * (n != 1)}, there are no neighbors and nothing to vote on", stacklevel=2)
         return replace(config, k=k)
     reason = (
         f"a Gaussian has only {n - 1:,} other{'s' * (n != 2)}"
         if k < MOST_VOTERS
         else f"at most {MOST_VOTERS:,} can vote"
     )
-    warnings.warn(f"k is {config.k:,}, but {reason}; the vote is among {k:,} neighbours", stacklevel=2)
+    warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbors", stacklevel=2)
     return replace(config, k=k)
 
 
@@ -197,7 +197,7 @@ def _vote(
     config: RefineConfig,
     width: Tensor,
 ) -> None:
-    """Writes source[voters]; row_of[j] is the row of u_j."""
+    """Write source[voters]; row_of[j] is the row of u_j in `directions`."""
     dtype, numbers = torch.promote_types(directions.dtype, torch.float32), config.numbers
     reliability = reliability.to(dtype)
     step = max(1, _CHUNK_ELEMENTS[reliability.is_cuda] // ((config.k + 1) * max(directions.shape[1], config.k + 1)))
@@ -249,12 +249,12 @@ def _vote_on_gpu(
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:
-    """sigma_d in the units of the means: times the median spacing (1 where all Gaussians are at one place)."""
+    """Return sigma_d times the median spacing, in the units of the means; sigma_d if all Gaussians share a position."""
     finite = spacing[spacing.isfinite()]
     sigma = config.numbers.sigma_d
     if finite.numel() == 0:
         return sigma * spacing.new_ones(())
-    # torch looks for a median with one block of a GPU
+    # torch.median uses a single block of a GPU
     median = finite.sort().values[(finite.numel() - 1) // 2] if finite.is_cuda else finite.median()
     return sigma * median
 
@@ -262,11 +262,11 @@ def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64
 def voting_weights(
     neighbors: Neighbors, width: Float64[Tensor, ""], rows: Int[Tensor, " m"], reliability: Float[Tensor, " n"]
 ) -> Float64[Tensor, "m k_plus_1"]:
-    """R_k d_ik of the given Gaussians, self first; 0 where a neighbour is missing.
+    """Return R_k d_ik of the given Gaussians, self first; 0 if a neighbor is missing.
 
-    Distances are counted from the nearest reliable member of N+, i itself unless R_i = 0. Such a factor per Gaussian
-    picks the same winner, and the weights of one far from everything do not underflow. A margin takes the same factor:
-    see `_margin`.
+    Distances are relative to the nearest reliable member of N+, which is i itself unless R_i = 0. This is a factor per
+    Gaussian, so the winner stays the same, and weights of an isolated Gaussian do not underflow. The margin takes the
+    same factor (see `_margin`).
     """
     r, square = _within(neighbors, width, rows, reliability)
     return r * _decay(r, square)
@@ -280,9 +280,9 @@ def posterior_weights(
     own: Float[Tensor, " n"],
     prior: float,
 ) -> Float64[Tensor, "m k_plus_1"]:
-    """own_i, then P R_k d_ik / sum_k R_k d_ik of the neighbours; 0 where one is missing, or none is reliable.
+    """Return own_i, then P R_k d_ik / sum_k R_k d_ik of the neighbors; 0 if one is missing or none is reliable.
 
-    Distances are counted from the nearest reliable neighbour: the factor cancels in the ratio, and nothing underflows.
+    Distances are relative to the nearest reliable neighbor. This factor cancels in the ratio and avoids underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])
@@ -294,33 +294,34 @@ def posterior_weights(
 def _within(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor
 ) -> tuple[Float[Tensor, "m k_plus_1"], Float64[Tensor, "m k_plus_1"]]:
-    """R and squared distances in units of sigma_d in N+, self first."""
+    """Return R and squared distances in units of sigma_d for N+, self first."""
     r = _gather(reliability, torch.cat([rows[:, None], neighbors.index[rows]], dim=1))
     return r, torch.nn.functional.pad(neighbors.distance[rows] / width, (1, 0)) ** 2
 
 
 def _nearest(r: Tensor, square: Tensor) -> Tensor:
-    """[M, 1] squared distance of the nearest reliable one, infinite where there is none."""
+    """Return the squared distance of the nearest reliable member, [M, 1]; infinite if there is none."""
     return torch.where(r > 0, square, torch.inf).amin(dim=1, keepdim=True)
 
 
 def _decay(r: Tensor, square: Tensor) -> Tensor:
-    """d, as if the nearest reliable one were at distance 0."""
+    """Return d with distances relative to the nearest reliable member."""
     return torch.exp(-0.5 * (square - _nearest(r, square)).nan_to_num(0).clamp(min=0))
 
 
 def _margin(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor, delta: float
 ) -> Float64[Tensor, " m"] | float:
-    """Delta in the units of `voting_weights`: larger by what these leave out; infinite where no support clears it."""
+    """Return Delta scaled by the factor that `voting_weights` omits; infinite if no support can exceed it."""
     if delta == 0:
         return 0.0
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))
 
 
 def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
-    """True where neither a Gaussian nor any neighbour has R > 0: the regions that voting cannot repair (limitation 4
-    of the paper). Of those that have a list of neighbours, the first m.
+    """Return a mask of the Gaussians that voting cannot repair, because neither they nor their neighbors have R > 0.
+
+    This is limitation 4 of the paper. The mask covers the first m Gaussians, those with a list of neighbors.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors, unsupported
@@ -332,7 +333,7 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
 
 
 def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
-    """Whether a neighbour of each Gaussian has R > 0."""
+    """Return a mask of the Gaussians with a neighbor that has R > 0."""
     if kernels_apply(neighbors.index):
         from normlift_ns.kernels.vote import any_reliable  # noqa: PLC0415 (needs triton)
 
@@ -341,17 +342,17 @@ def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Boo
 
 
 def _members(voters: Int[Tensor, " v"], neighbors: Neighbors, n: int) -> Int64[Tensor, " m"]:
-    """The voters and their neighbours, of n Gaussians, each once, ascending."""
+    """Return the distinct voters and neighbors among n Gaussians, ascending."""
     if kernels_apply(neighbors.index):
         from normlift_ns.kernels.vote import members  # noqa: PLC0415 (needs triton)
 
         return members(voters, neighbors.index, n)
     group = torch.cat([voters, neighbors.index[voters].flatten().long()])
-    read = torch.zeros(n, dtype=torch.bool, device=voters.device)
-    read[group[group >= 0]] = True
-    return read.nonzero().squeeze(1)
+    mask = torch.zeros(n, dtype=torch.bool, device=voters.device)
+    mask[group[group >= 0]] = True
+    return mask.nonzero().squeeze(1)
 
 
 def _gather(values: Tensor, index: Tensor) -> Tensor:
-    """values[index], 0 where the index is -1."""
+    """Return values[index], or 0 if the index is -1."""
     return torch.where(index >= 0, values[index.clamp(min=0)], 0.0)

@@ -1,4 +1,4 @@
-"""What the application knows of a trained splat and its photographs, wherever they come from."""
+"""Interface of a trained splat and its images, independent of their file formats."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
-_SAME = 1e-5
-"""Relative difference of numbers of cameras that are the same but for rounding: a tenth of it is taken absolutely, for
-numbers near zero."""
+_TOLERANCE = 1e-5
+"""Relative tolerance of camera parameters, with a tenth of it as absolute tolerance for values near zero."""
 
 
 class View(NamedTuple):
-    """One photograph.
+    """An image with its camera.
 
     >>> import torch
     >>> from normlift_ns import Camera, View
@@ -33,41 +32,41 @@ class View(NamedTuple):
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None
-    """True where the pixel counts; None: everywhere."""
+    """True at pixels that count; None: all pixels count."""
     name: str
-    """Image file relative to the dataset, with forward slashes."""
+    """Path of the image file relative to the dataset, with forward slashes."""
     original: tuple[int, int] | None = None
-    """Width and height of the photograph before it was undistorted; None: it was not."""
+    """Width and height of the image before it was undistorted; None: it was not undistorted."""
 
 
 @runtime_checkable
 class Views(Protocol):
-    """Photographs as the scene was trained on them, undistorted; each is read when it is asked for."""
+    """Undistorted images, as the scene was trained on them; each is read on access."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Of the images, relative to the dataset, with forward slashes."""
+        """Paths of the images relative to the dataset, with forward slashes."""
         ...
 
     @property
     def cameras(self) -> Sequence[Camera]:
-        """Of the images, in the same order; asking for them reads no image."""
+        """Cameras of the images, in the same order; no image is read."""
         ...
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> View:
-        """Reads one photograph.
+        """Read one image.
 
         Raises:
-            FileNotFoundError, ValueError: a file that is missing or cannot be read; the message names it.
+            FileNotFoundError, ValueError: if the file is missing or cannot be read; the message names it.
         """
         ...
 
 
 @runtime_checkable
 class Scene(Protocol):
-    """A trained splat and the photographs that it was trained with.
+    """A trained splat and the images that it was trained on.
 
     >>> from normlift_ns import Scene, open_scene
     >>> scene = open_scene(config)
@@ -79,78 +78,79 @@ class Scene(Protocol):
 
     @property
     def name(self) -> str:
-        """What runs of it are filed under."""
+        """Name of the scene, under which its runs are stored."""
         ...
 
     @property
     def checkpoint_path(self) -> Path:
-        """The file that the Gaussians come from."""
+        """File that the Gaussians were read from."""
         ...
 
     @property
     def runs_dir(self) -> Path:
-        """Where lifted runs of it go by default."""
+        """Default directory of its lifted runs."""
         ...
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """Where the scene comes from, ready for JSON; it stands in the manifest of a lifted run."""
+        """Source of the scene as JSON-ready metadata, for the manifest of a lifted run."""
         ...
 
     @property
     def gaussians(self) -> GaussianScene:
-        """The N Gaussians, activated; none left out."""
+        """All N Gaussians, with activated parameters."""
         ...
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """How the scene was rasterized in its training; lifts must do the same."""
+        """Rasterization mode of the training, which lifts must use too."""
         ...
 
     @property
     def train(self) -> Views:
-        """Photographs of the training, with the cameras that the Gaussians fit."""
+        """Training images, with the cameras that the Gaussians were optimized for."""
         ...
 
     @property
     def held_out(self) -> Views:
-        """Photographs kept for evaluation."""
+        """Images held out for evaluation."""
         ...
 
     @property
     def background(self) -> Float[Tensor, " 3"]:
-        """RGB in 0..1 behind the Gaussians."""
+        """Background color as RGB in 0..1."""
         ...
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a person should know of the files, in whole sentences."""
+        """Notes for the user about the files, in full sentences."""
         ...
 
     @property
     def renderer(self) -> Callable[[Camera], UInt8[Tensor, "h w 3"]] | None:
-        """A renderer of the scene's own; None: that of normlift_ns, with `colors` on `background`."""
+        """Renderer of the scene; None: normlift_ns renders `colors` on `background`."""
         ...
 
     def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
-        """RGB >= 0 of every Gaussian as the camera sees it."""
+        """Return the view-dependent RGB of every Gaussian, >= 0."""
         ...
 
     @property
     def parameters(self) -> Mapping[str, Tensor]:
-        """What was trained, as a checkpoint holds it: means [N, 3], quats [N, 4], scales [N, 3] (logarithms), opacities
+        """Trained parameters as in a checkpoint: means [N, 3], quats [N, 4], scales [N, 3] (logarithms), opacities
         [N, 1] (logits), features_dc [N, 3] and features_rest [N, K, 3]."""
         ...
 
     @property
     def has_harmonics(self) -> bool:
-        """Whether colours are spherical harmonics; False: features_dc are logits."""
+        """True if colors are spherical harmonics; False if `features_dc` holds logits."""
         ...
 
 
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
-    """A few numbers that change with every camera, and with their order: how many there are, and weighted means of
-    size, intrinsics and pose, of which later cameras have more. For manifests.
+    """Summarize cameras for a manifest, in a few numbers that depend on every camera and on their order.
+
+    These are their number and weighted means of size, intrinsics and pose, with weights that rise from 1 to 2.
 
     >>> import torch
     >>> left = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)
@@ -164,14 +164,14 @@ def camera_summary(cameras: Sequence[Camera]) -> list[float]:
                    c.world_to_camera[:3].double().flatten().cpu()])
         for c in cameras
     ]  # fmt: skip
-    share = torch.linspace(1, 2, len(rows), dtype=torch.float64)
-    return [float(len(rows)), *(share[:, None] * torch.stack(rows)).sum(0).div(share.sum()).tolist()]
+    weight = torch.linspace(1, 2, len(rows), dtype=torch.float64)
+    return [float(len(rows)), *(weight[:, None] * torch.stack(rows)).sum(0).div(weight.sum()).tolist()]
 
 
 def cameras_differ(first: Sequence[float], second: Sequence[float]) -> bool:
-    """Whether two summaries are of different cameras, for more than rounding.
+    """Return whether two camera summaries differ by more than rounding.
 
     >>> cameras_differ([2.0, 16.0], [2.0, 16.00001]), cameras_differ([2.0, 16.0], [2.0, 16.01])
     (False, True)
     """
-    return len(first) != len(second) or any(abs(a - b) > _SAME * (abs(a) + 0.1) for a, b in zip(first, second))
+    return len(first) != len(second) or any(abs(a - b) > _TOLERANCE * (abs(a) + 0.1) for a, b in zip(first, second))

@@ -1,1 +1,1 @@
-"""Several processes that lift one scene together."""
+"""Distributed lifting: several processes lift one scene together."""

@@ -1,6 +1,4 @@
-"""Evidence changes hands: from whoever rasterized a view to whoever lifts a Gaussian; and what Gaussians of others
-are needed for the vote.
-"""
+"""Exchange between processes: evidence from view owners to Gaussian owners, and neighbors for the vote."""
 
 from __future__ import annotations
 
@@ -19,12 +17,12 @@ from normlift_ns.core.neighbors import Neighbors
 from normlift_ns.core.portions import Portion
 from normlift_ns.core.sparse import SparseRows
 
-_BLOCK = 2**20
-"""Rows of neighbours that are renumbered at a time."""
+_RENUMBER_BLOCK = 2**20
+"""Number of rows of neighbors that are renumbered at a time."""
 
 
 class Coordinates(NamedTuple):
-    """Entries of a sparse matrix, sorted by row: 12 bytes each, and nothing for a row without any."""
+    """Entries of a sparse matrix as coordinates, sorted by row; each takes 12 bytes, and empty rows take none."""
 
     row: Int32[Tensor, " nnz"]
     column: Int32[Tensor, " nnz"]
@@ -33,135 +31,136 @@ class Coordinates(NamedTuple):
 
 @dataclass(frozen=True)
 class Piece:
-    """The evidence of a few views, sorted out by whose Gaussians it is of; rows are those of their portions."""
+    """Evidence of a few views, split by the process that owns the Gaussians; rows are those of the owner's portion."""
 
     rows: list[Coordinates]
-    """For every process."""
+    """Labeled entries for every process."""
     unlabeled: list[Coordinates]
+    """Unlabeled entries for every process."""
     facts: tuple[list[int], int, int, int]
-    """Number of regions of every view, `weight_power`, `num_excluded`, and bytes of a weight."""
+    """Number of regions of every view, `weight_power`, `num_excluded`, and bytes per weight."""
 
     @staticmethod
     def of(evidence: Evidence, portion: Portion) -> Piece:
-        """The evidence of all Gaussians."""
+        """Split the evidence of all Gaussians by owner."""
         regions = torch.bincount(evidence.region_view, minlength=evidence.num_views).tolist()
         facts = (regions, evidence.weight_power, evidence.num_excluded, evidence.rows.weight.element_size())
-        return Piece(_sorted_out(evidence.rows, portion), _sorted_out(evidence.unlabeled, portion), facts)
+        return Piece(_split_by_owner(evidence.rows, portion), _split_by_owner(evidence.unlabeled, portion), facts)
 
 
-def _sorted_out(rows: SparseRows, portion: Portion) -> list[Coordinates]:
+def _split_by_owner(rows: SparseRows, portion: Portion) -> list[Coordinates]:
     owner, row = portion.place
     gaussian = rows.row_index()
-    owner_of, row_of, found = owner[gaussian], row[gaussian], []
+    owner_of, row_of, parts = owner[gaussian], row[gaussian], []
     for rank in range(portion.team.size):
         entries = (owner_of == rank).nonzero().squeeze(1)
-        found.append(Coordinates(row_of[entries], rows.column[entries], rows.weight[entries]))
-    return found
+        parts.append(Coordinates(row_of[entries], rows.column[entries], rows.weight[entries]))
+    return parts
 
 
 def share_evidence(pieces: Mapping[int, Piece], portion: Portion, chunks: int) -> Evidence:
-    """The evidence of all views for the Gaussians of a portion.
+    """Redistribute evidence: return that of all views for the Gaussians of this process.
 
     Args:
-        pieces: those of this process, by the numbers of their chunks; the pieces of all processes are all chunks.
-        chunks: how many there are.
+        pieces: evidence collected by this process, by chunk index; together, the processes have all chunks.
+        chunks: number of chunks of all processes.
     """
-    device, mine = portion.order.device, sorted(pieces)
-    kinds = ([pieces[number].rows for number in mine], [pieces[number].unlabeled for number in mine])
-    counts = [[[len(entries[rank].row) for entries in kind] for kind in kinds] for rank in range(portion.team.size)]
-    said = portion.team.tell_all([mine, [pieces[number].facts for number in mine], counts])
-    facts = {number: fact for numbers, all_facts, _ in said for number, fact in zip(numbers, all_facts)}
-    regions = [count for number in range(chunks) for count in facts[number][0]]
-    width = [(sum(facts[number][0]), len(facts[number][0])) for number in range(chunks)]  # columns of both kinds
-    _, weight_power, num_excluded, weight_bytes = facts[0]
-    kind_of_weight = torch.float64 if weight_bytes == 8 else torch.float32
-    owners = [numbers for numbers, _, _ in said]
-    found = []
-    for i, kind in enumerate(kinds):
-        first = [0, *accumulate(columns[i] for columns in width)]
-        theirs = [counts[portion.team.rank][i] for _, _, counts in said]
-        found.append(_exchange(kind, owners, theirs, first, portion, kind_of_weight))
+    device, local_chunks = portion.order.device, sorted(pieces)
+    matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
+    counts = [[[len(parts[rank].row) for parts in matrix] for matrix in matrices] for rank in range(portion.team.size)]
+    gathered = portion.team.tell_all([local_chunks, [pieces[chunk].facts for chunk in local_chunks], counts])
+    metadata = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
+    regions = [count for chunk in range(chunks) for count in metadata[chunk][0]]
+    widths = [(sum(metadata[chunk][0]), len(metadata[chunk][0])) for chunk in range(chunks)]  # columns of both matrices
+    _, weight_power, num_excluded, weight_bytes = metadata[0]
+    dtype = torch.float64 if weight_bytes == 8 else torch.float32
+    chunks_by_rank = [rank_chunks for rank_chunks, _, _ in gathered]
+    result = []
+    for i, matrix in enumerate(matrices):
+        first_column = [0, *accumulate(width[i] for width in widths)]
+        received = [counts[portion.team.rank][i] for _, _, counts in gathered]
+        result.append(_exchange_rows(matrix, chunks_by_rank, received, first_column, portion, dtype))
     region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), torch.tensor(regions))
-    return Evidence(found[0], region_view.to(device), found[1], len(regions), weight_power, num_excluded)
+    return Evidence(result[0], region_view.to(device), result[1], len(regions), weight_power, num_excluded)
 
 
-def _exchange(
-    mine: Sequence[Sequence[Coordinates]],
-    owners: Sequence[Sequence[int]],
+def _exchange_rows(
+    entries: Sequence[Sequence[Coordinates]],
+    chunks_by_rank: Sequence[Sequence[int]],
     counts: Sequence[Sequence[int]],
     first_column: Sequence[int],
     portion: Portion,
-    kind_of_weight: torch.dtype,
+    dtype: torch.dtype,
 ) -> SparseRows:
-    """The rows of this process's Gaussians.
+    """Exchange the entries of a matrix, and return the rows of this process's Gaussians.
 
     Args:
-        mine: entries by chunk and process.
-        owners: the chunks of every process.
-        counts: of the entries that every process has for this one, by chunk.
-        first_column: of every chunk, among all.
+        entries: entries of this process, by chunk and receiving process.
+        chunks_by_rank: chunks of every process.
+        counts: number of entries that every process sends to this one, by chunk.
+        first_column: first column of every chunk in the whole matrix.
+        dtype: type of the weights.
     """
     team, device = portion.team, portion.order.device
-    empty = Coordinates(*(torch.zeros(0, dtype=x, device=device) for x in (torch.int32, torch.int32, kind_of_weight)))
+    empty = Coordinates(*(torch.zeros(0, dtype=x, device=device) for x in (torch.int32, torch.int32, dtype)))
     arrays = []
     for name in Coordinates._fields:
-        chosen = [[getattr(empty, name), *(getattr(chunk[rank], name) for chunk in mine)] for rank in range(team.size)]
-        arrays.append(team.exchange([torch.cat(parts) for parts in chosen]))
-    found: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
-    for rank, numbers in enumerate(owners):
-        pieces = [array[rank].split(list(counts[rank])) for array in arrays]
-        for number, row, column, weight in zip(numbers, *pieces):
-            found[number] = row.long(), column + first_column[number], weight
-    lists = [found[number] for number in sorted(found)]
-    return SparseRows.stack(lists, len(portion), device)
+        sent = [[getattr(empty, name), *(getattr(chunk[rank], name) for chunk in entries)] for rank in range(team.size)]
+        arrays.append(team.exchange([torch.cat(parts) for parts in sent]))
+    received: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    for rank, chunks in enumerate(chunks_by_rank):
+        parts = [array[rank].split(list(counts[rank])) for array in arrays]
+        for chunk, row, column, weight in zip(chunks, *parts):
+            received[chunk] = row.long(), column + first_column[chunk], weight
+    return SparseRows.stack([received[chunk] for chunk in sorted(received)], len(portion), device)
 
 
 class Around(NamedTuple):
-    """The Gaussians of a portion, and behind them those of others that are among their neighbours."""
+    """Gaussians of a portion, followed by their neighbors in other processes."""
 
     lifted: Lifted
-    """Directions of all of them; no other numbers than the norm hold."""
+    """Directions of all these Gaussians; of the scalars, only the norm is valid."""
     neighbors: Neighbors
-    """Of those of the portion, by their places here."""
+    """Neighbors of the portion's Gaussians, as rows of this object."""
     gaussians: Int64[Tensor, " all"]
-    """The number of each."""
+    """Index of each of these Gaussians in the scene."""
 
 
 def with_neighbors(lifted: Lifted, neighbors: Neighbors, portion: Portion) -> Around:
-    """What a vote of the portion's Gaussians reads.
+    """Gather the directions and neighbors that a vote of the portion's Gaussians reads.
 
     Args:
-        lifted: of the portion.
-        neighbors: of the portion's Gaussians, by their numbers.
+        lifted: lift of the portion.
+        neighbors: neighbors of the portion's Gaussians, as indices in the scene.
     """
-    team, mine, device = portion.team, portion.gaussians, portion.order.device
+    team, local, device = portion.team, portion.gaussians, portion.order.device
     _, row = portion.place
-    wanted = torch.zeros(len(portion.order) + 1, dtype=torch.bool, device=device)  # the last for -1
-    for index in neighbors.index.split(_BLOCK):
+    wanted = torch.zeros(len(portion.order) + 1, dtype=torch.bool, device=device)  # the last element is for -1
+    for index in neighbors.index.split(_RENUMBER_BLOCK):
         wanted[index.long()] = True
-    wanted[mine] = False
+    wanted[local] = False
     halo = [gaussians[wanted[gaussians]] for gaussians in portion.by_owner]
-    asked = team.exchange([row[gaussians] for gaussians in halo])
+    requested = team.exchange([row[gaussians] for gaussians in halo])
     evidence, norm = lifted.evidence, lifted.scalars.norm
-    given = [evidence.rows.select_rows(rows.long()) for rows in asked]
-    lengths, column, weight, length_of_f = (
+    sent = [evidence.rows.select_rows(rows.long()) for rows in requested]
+    lengths, column, weight, halo_norm = (
         torch.cat(team.exchange(parts))
         for parts in (
-            [x.offsets.diff() for x in given],
-            [x.column for x in given],
-            [x.weight for x in given],
-            [norm[rows.long()] for rows in asked],
+            [x.offsets.diff() for x in sent],
+            [x.column for x in sent],
+            [x.weight for x in sent],
+            [norm[rows.long()] for rows in requested],
         )
     )
     lengths = torch.cat([evidence.rows.offsets.diff(), lengths])
     offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
     rows = SparseRows(offsets, torch.cat([evidence.rows.column, column]), torch.cat([evidence.rows.weight, weight]))
     blank = SparseRows(torch.zeros_like(offsets), evidence.unlabeled.column[:0], evidence.unlabeled.weight[:0])
-    scalars = lifted.scalars.map(lambda x: torch.cat([x, x.new_zeros(len(length_of_f))]))
-    scalars = replace(scalars, norm=torch.cat([norm, length_of_f]))
-    around = Lifted(scalars, replace(evidence, rows=rows, unlabeled=blank), lifted.features)
-    gaussians = torch.cat([mine, *halo])
-    here = torch.full((len(portion.order) + 1,), -1, dtype=torch.int32, device=device)
-    here[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
-    index = torch.cat([here[some.long()] for some in neighbors.index.split(_BLOCK)])
-    return Around(around, neighbors._replace(index=index), gaussians)
+    scalars = lifted.scalars.map(lambda x: torch.cat([x, x.new_zeros(len(halo_norm))]))
+    scalars = replace(scalars, norm=torch.cat([norm, halo_norm]))
+    extended = Lifted(scalars, replace(evidence, rows=rows, unlabeled=blank), lifted.features)
+    gaussians = torch.cat([local, *halo])
+    row_of = torch.full((len(portion.order) + 1,), -1, dtype=torch.int32, device=device)
+    row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
+    index = torch.cat([row_of[block.long()] for block in neighbors.index.split(_RENUMBER_BLOCK)])
+    return Around(extended, neighbors._replace(index=index), gaussians)

@@ -1,7 +1,7 @@
-"""How the processes of a team notice that one of them is gone, while a slow one may take its time.
+"""Heartbeats that reveal a lost process and tolerate a slow one.
 
-Every process counts up a heartbeat in the store of the team, from a thread, so that hours in one photograph do not
-matter. One whose heartbeat stands still is gone: the others end, and say so. One that fails says that first.
+A thread of every process increments a counter in the shared store, even while an image takes hours. A process whose
+counter stops is lost, and the others report that and exit. A process that fails reports its own error first.
 """
 
 from __future__ import annotations
@@ -18,71 +18,73 @@ from threading import Event, Thread
 from typing import Any, NamedTuple
 
 BEAT = 2.0
-"""Seconds between two heartbeats."""
+"""Seconds between heartbeats."""
 PATIENCE = 30.0
-"""Seconds without one after which a process counts as gone."""
+"""Seconds without a heartbeat after which a process counts as lost."""
 _GRACE = 10.0
-"""Seconds that this process has to end by itself, before it is ended: it may be waiting for the one that is gone."""
+"""Seconds between SIGTERM and a forced exit of this process, which may be waiting for the lost one."""
 
 
 class Lost(NamedTuple):
-    """Why a process has to end."""
+    """Loss or failure of another process, after which this one has to exit."""
 
     rank: int
-    """Of the process that is gone or has failed."""
+    """Rank of the lost or failed process."""
     failed: bool
-    """It has told what went wrong itself."""
+    """True if the process failed and reported the error itself; False if its heartbeat stopped."""
     place: str
-    """Its machine and number there."""
+    """Host name and process id."""
 
 
 @dataclass
 class Heart:
-    """The heartbeat of this process, and an ear for those of the others."""
+    """Heartbeat of this process, and monitor of the others."""
 
     store: Any
-    """A client of the team's store that nobody else uses."""
+    """Client of the shared store, for this object only."""
     rank: int
     size: int
     last_words: Callable[[Lost], None]
-    """Told before the process is ended; has to be quick."""
+    """Callback invoked before a forced exit; it must return quickly."""
     lost: Lost | None = None
     _waiting: bool = False
     _stop: Event = field(default_factory=Event)
-    _found: Event = field(default_factory=Event)
+    _loss_detected: Event = field(default_factory=Event)
 
     def start(self) -> None:
-        """Begins to beat and to listen."""
+        """Start the thread that sends the heartbeat and monitors the others."""
         self.store.set(f"place/{self.rank}", f"{socket.gethostname()}, process {os.getpid()}")
-        Thread(target=self._run, name="heart", daemon=True).start()
+        Thread(target=self._run, name="heartbeat", daemon=True).start()
 
     def stop(self, well: bool) -> bool:
-        """Tells the others that this process has ended by itself. Whether it is the first of those that have failed.
+        """Stop the heartbeat, and announce to the others that this process exits.
 
-        If the store is gone, process 0 has ended, which holds it: it has reported its own error, unless it is the loss
-        that this process has noticed.
+        If the store is unreachable, process 0, which hosts it, has exited: it has reported its own error, unless this
+        process has detected the loss.
 
         Args:
-            well: it has done its work. Otherwise the others have to end too.
+            well: True if the process succeeded. Otherwise, the others have to exit too.
+        Returns:
+            Whether this process is the first to fail, and should report its error.
         """
         self._stop.set()
-        with suppress(Exception):  # whatever a store says that is gone: so is the team
+        with suppress(Exception):  # a lost store raises various errors, and the other processes are lost too
             first = not well and self.store.add("failures", 1) == 1
             self.store.set(f"end/{self.rank}", "well" if well else "failed")
-            if well and self.rank == 0:  # the store may be in this process
+            if well and self.rank == 0:  # the store may live in this process
                 self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * BEAT))
             return first
         return self.rank == 0 or self.lost is not None
 
     def wait_for_a_loss(self) -> Lost | None:
-        """Who is gone, once that is known; None where all are well. For a process that could not reach another one."""
+        """Wait for the cause of a communication error; return the lost process, or None if all processes are alive."""
         self._waiting = True
-        self._found.wait(PATIENCE + 5 * BEAT)
+        self._loss_detected.wait(PATIENCE + 5 * BEAT)
         return self.lost
 
     def _run(self) -> None:
         beats: dict[int, tuple[bytes, float]] = {}
-        places = {r: "its machine is not known" for r in range(self.size)}
+        places = {r: "host unknown" for r in range(self.size)}
         count = 0
         while self.lost is None and not self._stop.wait(BEAT):
             count += 1
@@ -90,13 +92,13 @@ class Heart:
                 self.store.set(f"beat/{self.rank}", str(count))
                 for r in range(self.size):
                     if r != self.rank:
-                        self._listen(r, beats, places)
-            except Exception:  # whatever a store says whose process is gone
+                        self._check(r, beats, places)
+            except Exception:  # a store whose process is lost raises various errors
                 self.lost = self.lost or Lost(0, False, places[0])
         if self.lost is not None and not self._stop.is_set():
-            self._end()
+            self._exit()
 
-    def _listen(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
+    def _check(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
         if self.store.check([f"place/{r}"]):
             places[r] = self.store.get(f"place/{r}").decode()
         if self.store.check([f"end/{r}"]):
@@ -110,11 +112,11 @@ class Heart:
         elif now - beats[r][1] > PATIENCE:
             self.lost = Lost(r, False, places[r])
 
-    def _end(self) -> None:
-        self._found.set()
+    def _exit(self) -> None:
+        self._loss_detected.set()
         if self._waiting:
             return
-        os.kill(os.getpid(), signal.SIGTERM)  # what is half-written is removed, as far as the process gets
+        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
         if not self._stop.wait(_GRACE):
             assert self.lost is not None
             self.last_words(self.lost)

@@ -1,4 +1,4 @@
-"""How a team comes together: processes that we start on this machine, or those of torchrun on any number of them."""
+"""Start of distributed lifts: launch processes on this machine, or join those of torchrun on any number of machines."""
 
 from __future__ import annotations
 
@@ -22,101 +22,105 @@ if TYPE_CHECKING:
     from normlift_ns.core.portions import Team
 
 TEAM = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
-"""Variables of the environment that describe a team, as torchrun sets them."""
+"""Environment variables that torchrun sets for distributed processes."""
 OURS = "NORMLIFT_TEAM"
-"""Set in the environment of processes that `start` has started: that process tells what becomes of them."""
-KEPT = "2D features and evidence of the views that were done are kept; start the command again to go on from there."
-_LONG = timedelta(days=7)
-"""What a process may have to wait for another: the heartbeats tell whether it is alive."""
-_JOIN = timedelta(minutes=10)
-"""What all processes have to come together."""
-_PATIENT = 15.0
-"""Seconds of waiting of which nothing is said."""
-_DIE_WITH_PARENT = 1
-"""PR_SET_PDEATHSIG of Linux."""
+"""Environment variable that marks processes launched by `start`, which reports if one is killed."""
+_RESUME_HINT = "2D features and evidence of finished views are saved; run the command again to continue."
+_COLLECTIVE_TIMEOUT = timedelta(days=7)
+"""Longest wait for another process in a collective; heartbeats show whether it is alive."""
+_JOIN_TIMEOUT = timedelta(minutes=10)
+"""Time limit for all processes to connect."""
+_QUIET_WAIT = 15.0
+"""Seconds of waiting before a message is printed."""
+_PR_SET_PDEATHSIG = 1
+"""Option of Linux's prctl."""
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 
 
 class LostError(RuntimeError):
-    """Another process of the team is gone, or has failed."""
+    """Loss or failure of another process."""
 
     def __init__(self, lost: Lost) -> None:
-        super().__init__(f"process {lost.rank} ({lost.place}) {'has failed' if lost.failed else 'is gone'}")
+        super().__init__(f"process {lost.rank} ({lost.place}) {'failed' if lost.failed else 'was lost'}")
         self.lost = lost
 
 
 def rank_of(environment: Mapping[str, str]) -> tuple[int, int] | None:
-    """Number and size of the team that an environment describes, as torchrun and `start` set it; None for no team.
+    """Return rank and world size from the variables that torchrun and `start` set, or None for a single process.
 
     Raises:
-        InputError: variables that are no numbers.
+        InputError: if the values are not valid numbers.
 
     >>> rank_of({"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}), rank_of({})
     ((1, 2), None)
     """
     if any(name not in environment for name in TEAM):
         return None
-    names = [name for name in TEAM if name != "MASTER_ADDR"]
-    numbers = [environment[name] for name in names]
-    if not all(number.isdecimal() for number in numbers) or int(numbers[0]) >= int(numbers[1]):
+    values = {name: environment[name] for name in TEAM if name != "MASTER_ADDR"}
+    if not all(value.isdecimal() for value in values.values()) or int(values["RANK"]) >= int(values["WORLD_SIZE"]):
         raise InputError(
-            "the environment describes a team of processes that cannot be: "
-            + ", ".join(f"{name}={value!r}" for name, value in zip(names, numbers))
-            + ". Start ns-normlift by torchrun or with --num-devices, or unset these variables"
+            "the environment variables of torchrun are invalid: "
+            + ", ".join(f"{name}={value!r}" for name, value in values.items())
+            + ". Start ns-normlift with torchrun or --num-devices, or unset these variables"
         )
-    return (int(numbers[0]), int(numbers[1])) if int(numbers[1]) > 1 else None
+    rank, size = int(values["RANK"]), int(values["WORLD_SIZE"])
+    return (rank, size) if size > 1 else None
 
 
-def start(words: Sequence[str], count: int, say: Callable[[str], None]) -> int:
-    """Runs a program in so many processes on this machine, a team; returns the exit code.
+def start(command: Sequence[str], count: int, log: Callable[[str], None]) -> int:
+    """Run a command in several processes on this machine, and return the exit code.
 
-    Where one ends before its time the others are ended.
+    If one process fails, the others are terminated.
 
     Args:
-        words: of the command line.
-        say: told who was ended by a signal. Whoever fails otherwise tells that itself.
+        command: command line.
+        count: number of processes.
+        log: callback for a message that names a process killed by a signal. Other failures are reported by the
+            process itself.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    there = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(count), OURS: "1"}
-    there.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
-    there.setdefault("NCCL_NVLS_ENABLE", "0")  # multicast buys nothing here, and is one more thing that can fail
-    if sys.platform in _LOOPBACK:  # nothing listens to the network
-        there |= {name: _LOOPBACK[sys.platform] for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")}
+    env = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(count), OURS: "1"}
+    env.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
+    env.setdefault("NCCL_NVLS_ENABLE", "0")  # multicast is not faster here, and can fail
+    if sys.platform in _LOOPBACK:  # do not listen on the network
+        env |= {name: _LOOPBACK[sys.platform] for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")}
     processes = [
         subprocess.Popen(
-            words if r == 0 else without_log(words),
-            env=there | {"RANK": str(r), "LOCAL_RANK": str(r)},
+            command if r == 0 else _without_log_file(command),
+            env=env | {"RANK": str(r), "LOCAL_RANK": str(r)},
             stdin=subprocess.DEVNULL,
-            preexec_fn=bound(),  # noqa: PLW1509 (whoever starts a team has no threads)
+            preexec_fn=bound(),  # noqa: PLW1509 (the launcher has no threads)
         )
         for r in range(count)
     ]
     try:
-        return _watch(processes, say)
+        return _watch(processes, log)
     except BaseException:  # Ctrl-C or SIGTERM
         _end(processes)
         raise
 
 
-def without_log(words: Sequence[str]) -> list[str]:
-    """A command line without its log file: of several processes the first one keeps it.
+def _without_log_file(command: Sequence[str]) -> list[str]:
+    """Remove --log-file from a command line, because only the first process writes that file.
 
-    >>> without_log(["ns-normlift", "--log-file", "a.txt", "--quiet"]), without_log(["ns-normlift", "--log_file=a.txt"])
-    (['ns-normlift', '--quiet'], ['ns-normlift'])
+    >>> _without_log_file(["ns-normlift", "--log-file", "a.txt", "--quiet"])
+    ['ns-normlift', '--quiet']
+    >>> _without_log_file(["ns-normlift", "--log_file=a.txt"])
+    ['ns-normlift']
     """
-    left, skip = [], False
-    for word in words:
+    result, skip = [], False
+    for word in command:
         flag, equals, _ = word.replace("_", "-").partition("=")
-        of_log = not skip and flag == "--log-file"
-        if not skip and not of_log:
-            left.append(word)
-        skip = of_log and not equals
-    return left
+        is_log_file = not skip and flag == "--log-file"
+        if not skip and not is_log_file:
+            result.append(word)
+        skip = is_log_file and not equals
+    return result
 
 
-def _watch(processes: Sequence[subprocess.Popen[bytes]], say: Callable[[str], None]) -> int:
+def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], None]) -> int:
     while True:
         codes = [process.poll() for process in processes]
         failed = [(r, code) for r, code in enumerate(codes) if code]
@@ -124,8 +128,8 @@ def _watch(processes: Sequence[subprocess.Popen[bytes]], say: Callable[[str], No
             rank, code = failed[0]
             if code < 0:
                 name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-                hint = ", perhaps by the system for want of memory" if name == "SIGKILL" else ""
-                say(f"Process {rank} of 0..{len(processes) - 1} was ended by {name}{hint}. {KEPT}")
+                hint = ", possibly because the machine ran out of memory" if name == "SIGKILL" else ""
+                log(f"Process {rank} of 0..{len(processes) - 1} was killed by {name}{hint}. {_RESUME_HINT}")
             _end(processes)
             return code if code > 0 else 1
         if all(code == 0 for code in codes):
@@ -136,82 +140,84 @@ def _watch(processes: Sequence[subprocess.Popen[bytes]], say: Callable[[str], No
 def _end(processes: Sequence[subprocess.Popen[bytes]], grace: float = 8.0) -> None:
     for process in processes:
         process.terminate()
-    until = time.monotonic() + grace
+    deadline = time.monotonic() + grace
     for process in processes:
         try:
-            process.wait(max(0.0, until - time.monotonic()))
+            process.wait(max(0.0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
 
 
 def bound() -> Callable[[], None] | None:
-    """What a new process does first, so that it ends with this one; only Linux can."""
+    """Return a `preexec_fn` that makes a new process exit with this one, or None on systems other than Linux."""
     if sys.platform != "linux":
         return None
-    return partial(_follow, ctypes.CDLL(None).prctl, os.getpid())
+    return partial(_die_with_parent, ctypes.CDLL(None).prctl, os.getpid())
 
 
-def _follow(prctl: Callable[..., int], parent: int) -> None:
-    prctl(_DIE_WITH_PARENT, signal.SIGTERM)
-    if os.getppid() != parent:  # it has ended already
+def _die_with_parent(prctl: Callable[..., int], parent: int) -> None:
+    prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:  # the parent has exited already
         os._exit(128 + signal.SIGTERM)
 
 
-def take_device(local_rank: int, device: str) -> None:
-    """Leaves a process the GPU of its number alone, before torch has looked for any.
+def _use_single_gpu(local_rank: int, device: str) -> None:
+    """Make only the GPU with the process's local rank visible, before torch initializes CUDA.
 
     Raises:
-        InputError: there are fewer.
+        InputError: if the machine has fewer GPUs.
     """
-    import torch  # noqa: PLC0415 (the process that only starts others does without)
+    import torch  # noqa: PLC0415 (not needed by the launcher)
 
     count = torch.cuda.device_count() if device != "cpu" else 0
     if count == 0 and device in ("cpu", "auto"):
         return
     if local_rank >= count:
-        raise InputError(f"process {local_rank} of this machine finds {count} GPUs, and needs one of its own")
-    listed = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
-    os.environ["CUDA_VISIBLE_DEVICES"] = listed[local_rank] if local_rank < len(listed) > 1 else str(local_rank)
+        raise InputError(
+            f"process {local_rank} on this machine needs its own GPU; start at most one per GPU ({count} found)"
+        )
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    os.environ["CUDA_VISIBLE_DEVICES"] = visible[local_rank] if local_rank < len(visible) > 1 else str(local_rank)
 
 
 @contextmanager
-def joined(device: str, say: Callable[[str], None]) -> Iterator[Team]:
-    """The team of this process while it lasts; `ALONE` where the environment describes none.
+def joined(device: str, log: Callable[[str], None]) -> Iterator[Team]:
+    """Provide a context with the team of this process, or `ALONE` if the environment describes none.
 
     Args:
         device: cpu, cuda or auto.
-        say: told who is gone, where nobody else tells it.
+        log: callback for a message that names a lost process, if no other process reports it.
     Raises:
-        InputError: the processes do not come together, or find too few GPUs.
-        LostError: another process is gone.
+        InputError: if the processes cannot connect, or there are too few GPUs.
+        LostError: if another process fails or is lost.
     """
-    found = rank_of(os.environ)
-    if found is not None:  # torch's warnings are for those who write such programs; it reads this when it is loaded
+    ranks = rank_of(os.environ)
+    if ranks is not None:  # hide torch's warnings for developers; torch reads the variable when it is imported
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     from normlift_ns.core.portions import ALONE  # noqa: PLC0415 (torch, as above)
 
-    if found is None:
+    if ranks is None:
         yield ALONE
         return
-    rank, size = found
-    take_device(int(os.environ.get("LOCAL_RANK", "0")), device)
+    rank, size = ranks
+    _use_single_gpu(int(os.environ.get("LOCAL_RANK", "0")), device)
     import torch  # noqa: PLC0415 (as above)
     import torch.distributed as dist  # noqa: PLC0415
 
     from normlift_ns.team.processes import Processes  # noqa: PLC0415
 
     on_gpu = device != "cpu" and torch.cuda.is_available()
-    store, heart = _come_together(rank, size, "nccl" if on_gpu else "gloo", say)
+    store, heart = _connect(rank, size, "nccl" if on_gpu else "gloo", log)
     team = Processes(rank=rank, size=size, device=torch.device("cuda" if on_gpu else "cpu"), store=store)
     try:
         yield team
-        team.add(torch.zeros(1))  # until process 0 has written what there is to write
+        team.add(torch.zeros(1))  # wait until process 0 has written its files
     except BaseException as error:
         lost = heart.lost
-        if lost is None and isinstance(error, RuntimeError) and _of_the_network(error):
+        if lost is None and isinstance(error, RuntimeError) and _is_network_error(error):
             lost = heart.wait_for_a_loss()
-        if not heart.stop(well=False):  # another one has told of it
+        if not heart.stop(well=False):  # another process has reported its error
             lost = Lost(rank, True, "this one") if lost is None else lost._replace(failed=True)
         if lost is None:
             raise
@@ -221,68 +227,66 @@ def joined(device: str, say: Callable[[str], None]) -> Iterator[Team]:
 
 
 def told(lost: Lost) -> str:
-    """What people are told of a process that is gone."""
-    return f"Process {lost.rank} ({lost.place}) is gone, so that the others end. {KEPT}"
+    """Return a message for the user about a lost process."""
+    return f"Process {lost.rank} ({lost.place}) was lost, so the others exit. {_RESUME_HINT}"
 
 
-def _of_the_network(error: Exception) -> bool:
-    words = ("gloo", "nccl", "connection", "peer", "socket", "timed out", "timeout")
-    return any(word in str(error).lower() for word in words)
+def _is_network_error(error: Exception) -> bool:
+    keywords = ("gloo", "nccl", "connection", "peer", "socket", "timed out", "timeout")
+    return any(word in str(error).lower() for word in keywords)
 
 
-def _come_together(rank: int, size: int, backend: str, say: Callable[[str], None]) -> tuple[Any, Heart]:
-    """A store for counting, and the heartbeat of this process, which has begun."""
+def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> tuple[Any, Heart]:
+    """Connect to the other processes; return a store for counters, and the running heartbeat of this process."""
     import torch.distributed as dist  # noqa: PLC0415 (as above)
     from torch.distributed import PrefixStore, TCPStore  # noqa: PLC0415 # pyright: ignore[reportPrivateImportUsage]
 
     host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-    hosts = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
-    tell = (lambda text: None) if OURS in os.environ else say
+    is_host = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+    report = (lambda text: None) if OURS in os.environ else log
     try:
         fd = None
-        if hosts and OURS in os.environ:  # on this machine only, not on every network
-            listening = socket.create_server((host, port))
-            fd = listening.detach()
-        if not hosts:
-            _wait(lambda: _answers(host, port), f"process 0 at {host}:{port}", tell)
-        how = {"timeout": _JOIN, "wait_for_workers": False}
-        store = TCPStore(host, port, size, hosts, master_listen_fd=fd, **how)
-        here = PrefixStore("here", store)
-        here.set(str(rank), "")
-        _wait(lambda: here.check([str(r) for r in range(size)]), f"all {size} processes at {host}:{port}", tell)
-        of_the_team = {"store": PrefixStore("team", store), "rank": rank, "world_size": size}
-        dist.init_process_group(backend, timeout=_LONG, **of_the_team)
-        heart = Heart(
-            PrefixStore("heart", TCPStore(host, port, size, False, **how)), rank, size, lambda lost: say(told(lost))
-        )
+        if is_host and OURS in os.environ:  # listen on this machine only, not on the network
+            fd = socket.create_server((host, port)).detach()
+        if not is_host:
+            _wait(lambda: _is_listening(host, port), f"process 0 at {host}:{port}", report)
+        options = {"timeout": _JOIN_TIMEOUT, "wait_for_workers": False}
+        store = TCPStore(host, port, size, is_host, master_listen_fd=fd, **options)
+        ready = PrefixStore("ready", store)
+        ready.set(str(rank), "")
+        _wait(lambda: ready.check([str(r) for r in range(size)]), f"all {size} processes at {host}:{port}", report)
+        group_store = PrefixStore("group", store)
+        dist.init_process_group(backend, timeout=_COLLECTIVE_TIMEOUT, store=group_store, rank=rank, world_size=size)
+        heart_store = PrefixStore("heartbeat", TCPStore(host, port, size, False, **options))
+        heart = Heart(heart_store, rank, size, lambda lost: log(told(lost)))
     except TimeoutError as error:
         raise InputError(
-            f"process {rank} of {size} has waited {_JOIN} for {error}; are all of them started?"
+            f"process {rank} of {size} waited {_JOIN_TIMEOUT} for {error}; check that all processes were started"
         ) from error
     except (RuntimeError, OSError) as error:
         raise InputError(
-            f"process {rank} of {size} does not find the others at {host}:{port} ({str(error).splitlines()[0]}); are "
-            "all of them started, and do firewalls let them through?"
+            f"process {rank} of {size} cannot connect to the others at {host}:{port} ({str(error).splitlines()[0]}); "
+            "check that all processes were started and that no firewall blocks them"
         ) from error
     heart.start()
     return PrefixStore("counts", store), heart
 
 
-def _wait(ready: Callable[[], bool], what: str, say: Callable[[str], None]) -> None:
-    """Waits in Python, which signals can end; raises TimeoutError in the end."""
-    begun, warned = time.monotonic(), False
+def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) -> None:
+    """Wait in Python, which signals can interrupt; raise TimeoutError at the time limit."""
+    start_time, warned = time.monotonic(), False
     while not ready():
-        waited = time.monotonic() - begun
-        if waited > _JOIN.total_seconds():
-            raise TimeoutError(what)
-        if waited > _PATIENT and not warned:
+        waited = time.monotonic() - start_time
+        if waited > _JOIN_TIMEOUT.total_seconds():
+            raise TimeoutError(target)
+        if waited > _QUIET_WAIT and not warned:
             warned = True
-            say(f"Waiting for {what}. If this is no part of a team, unset {', '.join(TEAM)}.")
+            log(f"Waiting for {target}. If this command should not wait for other processes, unset {', '.join(TEAM)}.")
         time.sleep(0.1)
 
 
-def _answers(host: str, port: int) -> bool:
-    """Whether anybody listens there."""
+def _is_listening(host: str, port: int) -> bool:
+    """Return whether a server accepts connections at this address."""
     try:
         socket.create_connection((host, port), timeout=5).close()
     except OSError:

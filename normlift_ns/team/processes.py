@@ -1,4 +1,4 @@
-"""A team of processes, over torch.distributed: NCCL between GPUs, gloo between CPUs."""
+"""Communication between processes with torch.distributed: NCCL for GPUs, gloo for CPUs."""
 
 from __future__ import annotations
 
@@ -21,127 +21,131 @@ from normlift_ns.core.disk.claims import claim
 from normlift_ns.core.portions import PER_VIEW, Report, Team
 from normlift_ns.errors import InputError
 
-_OLD = 7 * 86400
-"""Seconds after which nobody works in a folder any more."""
+_STALE_SECONDS = 7 * 86400
+"""Age at which a shared directory of killed processes is deleted."""
 
 
 @dataclass(kw_only=True)
 class Processes(Team):
-    """This process and the others of its team. Arrays may be of any type and on any device; they come back there."""
+    """Communication of this process with the others.
+
+    Arrays can have any type and device; results are on the same device.
+    """
 
     rank: int
     size: int
     device: torch.device
-    """Where arrays are exchanged."""
+    """Device on which arrays are exchanged."""
     store: Any
-    """In which the team counts."""
+    """Shared store for progress counters."""
     _folder: Path = field(default_factory=Path)
-    """Shared by all processes, where they divide the work."""
-    _divided: int = 0
-    """Counts the works that have been divided."""
+    """Directory shared by all processes, in which they claim work items."""
+    _num_divisions: int = 0
+    """Number of calls of `chunks` so far."""
 
     def join(self, rows: Tensor) -> Tensor:
-        """As in `Team`."""
+        """See the base class."""
         counts = self._counts(len(rows))
-        mine = self._bytes(rows)
-        width = mine.shape[1:]
-        parts = [mine if r == self.rank else mine.new_empty(count, *width) for r, count in enumerate(counts)]
+        data = self._bytes(rows)
+        width = data.shape[1:]
+        parts = [data if r == self.rank else data.new_empty(count, *width) for r, count in enumerate(counts)]
         for r, part in enumerate(parts):
             if part.numel() > 0:
                 dist.broadcast(part, r)
         return _like(torch.cat(parts), rows)
 
     def deliver(self, rows: Tensor) -> list[Tensor] | None:
-        """As in `Team`."""
-        counts, mine = self._counts(len(rows)), self._bytes(rows)
+        """See the base class."""
+        counts, data = self._counts(len(rows)), self._bytes(rows)
         if self.rank > 0:
-            if mine.numel() > 0:
-                dist.send(mine, 0)
+            if data.numel() > 0:
+                dist.send(data, 0)
             return None
         parts = [rows]
         for r in range(1, self.size):
-            part = mine.new_empty(counts[r], *mine.shape[1:])
+            part = data.new_empty(counts[r], *data.shape[1:])
             if part.numel() > 0:
                 dist.recv(part, r)
             parts.append(_like(part, rows))
         return parts
 
     def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        """As in `Team`."""
-        sent = torch.tensor([len(part) for part in parts], device=self.device)
-        received = torch.empty_like(sent)
-        dist.all_to_all_single(received, sent)
-        mine = self._bytes(torch.cat(list(parts)))
-        found = mine.new_empty(int(received.sum()), *mine.shape[1:])
-        dist.all_to_all_single(found, mine, received.tolist(), sent.tolist())
-        return list(_like(found, parts[0]).split(received.tolist()))
+        """See the base class."""
+        sent_counts = torch.tensor([len(part) for part in parts], device=self.device)
+        counts = torch.empty_like(sent_counts)
+        dist.all_to_all_single(counts, sent_counts)
+        sent = self._bytes(torch.cat(list(parts)))
+        received = sent.new_empty(int(counts.sum()), *sent.shape[1:])
+        dist.all_to_all_single(received, sent, counts.tolist(), sent_counts.tolist())
+        return list(_like(received, parts[0]).split(counts.tolist()))
 
     def add(self, values: Tensor) -> Tensor:
-        """As in `Team`."""
-        there = values.to(self.device, copy=True)
-        dist.all_reduce(there)
-        return there.to(values.device)
+        """See the base class."""
+        total = values.to(self.device, copy=True)
+        dist.all_reduce(total)
+        return total.to(values.device)
 
     def spread(self, values: Tensor) -> Tensor:
-        """As in `Team`."""
-        there = self._bytes(values)
-        if there.numel() > 0:
-            dist.broadcast(there, 0)
-        return _like(there, values).reshape(values.shape)
+        """See the base class."""
+        data = self._bytes(values)
+        if data.numel() > 0:
+            dist.broadcast(data, 0)
+        return _like(data, values).reshape(values.shape)
 
-    def tell(self, facts: Any) -> Any:
-        """As in `Team`."""
-        said = self.tell_all(facts if self.rank == 0 else None)
-        return said[0]
+    def tell(self, value: Any) -> Any:
+        """See the base class."""
+        return self.tell_all(value if self.rank == 0 else None)[0]
 
-    def tell_all(self, facts: Any) -> list[Any]:
-        """As in `Team`."""
-        words = torch.frombuffer(bytearray(json.dumps(facts).encode()), dtype=torch.uint8)
-        said = bytes(self.join(words).numpy())
-        found = []
-        for count in self._counts(len(words)):
-            found.append(json.loads(said[:count]))
-            said = said[count:]
-        return found
+    def tell_all(self, value: Any) -> list[Any]:
+        """See the base class."""
+        encoded = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+        text = bytes(self.join(encoded).numpy())
+        result = []
+        for count in self._counts(len(encoded)):
+            result.append(json.loads(text[:count]))
+            text = text[count:]
+        return result
 
     def chunks(self, count: int) -> Iterator[int]:
-        """As in `Team`: first those of its own part, then what others have not begun, which shows in the folder."""
-        key, self._divided = f"{self._divided}-", self._divided + 1
+        """Yield the items of this process's part, then those of others that nobody has claimed in the directory."""
+        key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
         first = count * self.rank // self.size
-        for number in [*range(first, count), *range(first)]:
-            if claim(self._folder, f"{key}{number}", after=0) is not None:
-                yield number
+        for index in [*range(first, count), *range(first)]:
+            if claim(self._folder, f"{key}{index}", after=0) is not None:
+                yield index
 
     def counted(self, report: Report) -> Report:
-        """As in `Team`."""
-        known: dict[str, int] = {}
+        """See the base class."""
+        previous: dict[str, int] = {}
 
-        def told(stage: str, done: int, total: int) -> None:
+        def report_total(stage: str, done: int, total: int) -> None:
             if stage in PER_VIEW:
-                more, known[stage] = done - known.get(stage, 0), done
-                done = min(total, self.store.add(stage, more))
+                new, previous[stage] = done - previous.get(stage, 0), done
+                done = min(total, self.store.add(stage, new))
             if self.rank == 0:
                 report(stage, done, total)
 
-        return told
+        return report_total
 
     @contextmanager
     def shares(self, folder: Path) -> Iterator[None]:
-        """As in `Team`.
+        """Provide a context in which `chunks` can be called.
 
+        Args:
+            folder: directory that all processes share.
         Raises:
-            InputError: they do not share it, or two processes can create the same file in it.
+            InputError: if the processes do not share it, or two of them can create the same file in it.
         """
         if self.rank == 0:
-            for left in folder.glob("team-*"):  # of processes that were killed
-                if time.time() - left.stat().st_mtime > _OLD:
-                    shutil.rmtree(left, ignore_errors=True)
+            for leftover in folder.glob("team-*"):  # from processes that were killed
+                if time.time() - leftover.stat().st_mtime > _STALE_SECONDS:
+                    shutil.rmtree(leftover, ignore_errors=True)
         self._folder = folder / f"team-{self.tell(uuid4().hex)}"
-        winners = sum(self.tell_all(claim(self._folder, "start", after=0) is not None))
-        if winners != 1:
+        creators = sum(self.tell_all(claim(self._folder, "start", after=0) is not None))
+        if creators != 1:
             raise InputError(
-                f"{winners} of {self.size} processes could create the same file in {folder}: they do not share that "
-                "folder, or its file system does not keep two processes from creating one file. Give all of them the "
+                f"{creators} of {self.size} processes created the same file in {folder}, expected 1. Either they do "
+                "not share that folder, or its file system does not support exclusive creation. Give all of them the "
                 "same --output-dir, on a disk that they share"
             )
         try:
@@ -156,10 +160,10 @@ class Processes(Team):
         return torch.cat(counts).tolist()
 
     def _bytes(self, rows: Tensor) -> Tensor:
-        there = rows.to(self.device)
-        return there.reshape(len(rows), prod(rows.shape[1:])).contiguous().view(torch.uint8)
+        flat = rows.to(self.device).reshape(len(rows), prod(rows.shape[1:]))
+        return flat.contiguous().view(torch.uint8)
 
 
-def _like(found: Tensor, rows: Tensor) -> Tensor:
-    """Bytes as rows of the type and on the device of others."""
-    return found.flatten().view(rows.dtype).reshape(-1, *rows.shape[1:]).to(rows.device)
+def _like(data: Tensor, rows: Tensor) -> Tensor:
+    """Convert bytes to rows with the shape, type and device of others."""
+    return data.flatten().view(rows.dtype).reshape(-1, *rows.shape[1:]).to(rows.device)

@@ -1,4 +1,7 @@
-"""What the views of a scene say, to one process or to several: chunk by chunk, so that an interrupted lift resumes."""
+"""Collection of 2D features and evidence from views, by one process or several.
+
+Views are processed in chunks whose results are cached, so an interrupted lift can resume.
+"""
 
 from __future__ import annotations
 
@@ -25,30 +28,30 @@ from normlift_ns.team.exchange import Piece, share_evidence
 
 
 class Export(NamedTuple):
-    """Where 2D features go besides the lift."""
+    """Export of 2D features to files, in addition to the lift."""
 
     folder: Path
     overwrite: bool
-    """Replace files of other content."""
+    """Replace files with other content."""
 
 
 class Drawing(NamedTuple):
-    """How the weights of a lift are rasterized."""
+    """Rasterization settings of a lift."""
 
     rules: str
-    """Version of gsplat that says what is drawn."""
+    """Version of gsplat whose rasterization rules apply."""
     backend: BackendName
-    """What computes it."""
+    """Backend that rasterizes."""
     dtype: torch.dtype
 
     @property
     def settings(self) -> RasterSettings:
-        """The constants of the rules."""
+        """Constants of the rasterization rules."""
         return RasterSettings.of_gsplat(self.rules)
 
 
 class Seen(NamedTuple):
-    """What the chosen views say, for the Gaussians of this process."""
+    """Evidence, features and levels from some views, for the Gaussians of this process."""
 
     evidence: Evidence
     features: Float[Tensor, "s d"]
@@ -68,32 +71,36 @@ def look(
     ready: Callable[[], None],
     portion: Portion,
 ) -> Seen:
-    """Evidence, feature table and levels of the regions of some training views.
+    """Collect evidence, feature table and region levels from some training views.
 
     Args:
-        used: numbers of the views.
-        ready: waits until kernels can be used.
-        portion: of this process, in whose team the chunks of views are divided.
+        used: indices of the views.
+        source: encoder or files that the features come from.
+        cache: directory of cached features and evidence.
+        export: destination of the 2D features; None: no export.
+        stages: progress of the lift.
+        ready: function that waits until kernels are compiled.
+        portion: Gaussians of this process; its team divides the chunks of views.
     """
     team, views = portion.team, len(used)
-    seen = cached(source, cache) if options.reuse_evidence else source
+    source = cached(source, cache) if options.reuse_evidence else source
     rendered = drawing.settings if options.image_source == "render" else None
     chunks = in_chunks(used, team.size)
     tables: dict[int, tuple[Tensor, Tensor]] = {}
-    whole: list[Evidence] = []
+    parts: list[Evidence] = []
     pieces: dict[int, Piece] = {}
-    for number in team.chunks(len(chunks)):
+    for index in team.chunks(len(chunks)):
         with stages("features", views) as step:
 
             def done(view: View, step: Callable[[], None] = step) -> None:
                 if export is not None:
-                    write_langsplat(seen, view.image, view.name, *export)
+                    write_langsplat(source, view.image, view.name, *export)
                 step()
 
             block = observe_views(
-                scene, chunks[number], seen, rendered=rendered, divisor=options.lift_downscale, done=done
+                scene, chunks[index], source, rendered=rendered, divisor=options.lift_downscale, done=done
             )
-            tables[number] = _table(block)
+            tables[index] = _table(block)
         with stages("evidence", views) as step:
             ready()
             evidence = block_evidence(
@@ -109,32 +116,32 @@ def look(
                 done=step,
             )
             if team.size > 1:
-                pieces[number] = Piece.of(evidence, portion)
+                pieces[index] = Piece.of(evidence, portion)
             else:
-                whole.append(evidence)
+                parts.append(evidence)
     with stages("exchange") if team.size > 1 else stages("evidence", views):
-        evidence = Evidence.merge(*whole) if team.size == 1 else share_evidence(pieces, portion, len(chunks))
+        evidence = Evidence.merge(*parts) if team.size == 1 else share_evidence(pieces, portion, len(chunks))
         features, level = _all_tables(tables, team)
     return Seen(evidence, features.to(gaussians.means.device, drawing.dtype), level)
 
 
 def _table(block: Block) -> tuple[Tensor, Tensor]:
-    """Feature rows and levels of the regions of a block."""
+    """Return features and levels of the regions of a block."""
     levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
     return torch.cat(block.features), torch.cat(levels)
 
 
 def _all_tables(tables: dict[int, tuple[Tensor, Tensor]], team: Team) -> tuple[Tensor, Tensor]:
-    """Rows and levels of the regions of all chunks, in their order."""
+    """Return features and levels of the regions of all chunks, in order."""
     if team.size == 1:
         features, levels = zip(*tables.values())
         return torch.cat(features), torch.cat(levels)
-    mine = sorted(tables)
-    said = team.tell_all([[(number, *tables[number][0].shape) for number in mine]])
-    widths = {width for (facts,) in said for _, _, width in facts}
-    counts = [(number, count) for (facts,) in said for number, count, _ in facts]
-    none = torch.zeros(0, max(widths)), torch.zeros(0, dtype=torch.int64)
-    parts = (torch.cat([none[i], *(tables[number][i] for number in mine)]) for i in range(2))
+    local_chunks = sorted(tables)
+    gathered = team.tell_all([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
+    widths = {width for (shapes,) in gathered for _, _, width in shapes}
+    counts = [(chunk, count) for (shapes,) in gathered for chunk, count, _ in shapes]
+    empty = torch.zeros(0, max(widths)), torch.zeros(0, dtype=torch.int64)
+    parts = (torch.cat([empty[i], *(tables[chunk][i] for chunk in local_chunks)]) for i in range(2))
     features, levels = (team.join(part).split([count for _, count in counts]) for part in parts)
     order = sorted(range(len(counts)), key=lambda i: counts[i][0])
     return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])

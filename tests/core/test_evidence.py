@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, lift, rasterize_evidence
-from normlift_ns.core.evidence import MASKED, Entries, _joined, _joined_by_sorting
+from normlift_ns.core.evidence import MASKED, Entries, _join, _join_by_sorting
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.encoders.source import joint_partition
 from tests.examples import examples
@@ -216,7 +216,7 @@ def parts_of_a_scene(draw):
 def test_both_ways_to_join_give_the_same_matrices(case):
     gaussians, parts = case
     device = torch.device("cpu")
-    for ours, theirs in zip(_joined_by_sorting(parts, gaussians, device), _joined(parts, gaussians, device)):
+    for ours, theirs in zip(_join_by_sorting(parts, gaussians, device), _join(parts, gaussians, device)):
         for name in ("offsets", "column", "weight"):
             assert torch.equal(getattr(ours, name), getattr(theirs, name))
             assert getattr(ours, name).dtype == getattr(theirs, name).dtype

@@ -199,7 +199,7 @@ def test_weights_too_small_for_float32_are_no_evidence_and_too_large_ones_refuse
             lift(evidence_of([[1.0, weight]], [0, 1], dtype), table)
         blank = SparseRows(torch.tensor([0, 1]), torch.tensor([0]).int(), torch.tensor([weight], dtype=dtype))
         evidence = replace(evidence_of([[1.0, 1.0]], [0, 1], dtype), unlabeled=blank)
-        with pytest.raises(ValueError, match="weights of unlabelled pixels"):
+        with pytest.raises(ValueError, match="weights of unlabeled pixels"):
             lift(evidence, table)
 
 

@@ -43,7 +43,7 @@ def test_consensus_by_kernels_equals_that_of_the_cpu(monkeypatch):
     monkeypatch.setattr(module, "kernels_apply", lambda tensor: True)
     evidence = given.to(DEVICE)
     for block in (2**26, 50):
-        monkeypatch.setattr(module, "_DENSE", block)
+        monkeypatch.setattr(module, "_MAX_DENSE", block)
         found = consensus(evidence, features.to(DEVICE), least=0.0)
         assert torch.allclose(found.features.cpu(), expected.features, atol=1e-6)
         assert found.agreement == pytest.approx(expected.agreement, abs=1e-6)

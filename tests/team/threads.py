@@ -45,11 +45,11 @@ class Threads(Team):
     def spread(self, values: Tensor) -> Tensor:
         return self._all(values)[0]
 
-    def tell(self, facts: Any) -> Any:
-        return self._all(facts)[0]
+    def tell(self, value: Any) -> Any:
+        return self._all(value)[0]
 
-    def tell_all(self, facts: Any) -> list[Any]:
-        return self._all(facts)
+    def tell_all(self, value: Any) -> list[Any]:
+        return self._all(value)
 
     @contextmanager
     def shares(self, folder: Any) -> Iterator[None]:
