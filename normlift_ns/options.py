@@ -51,7 +51,7 @@ class RuleSettings(NamedTuple):
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     compares: bool
-    """Whether the rule needs negative prompts."""
+    """True if the rule needs negative prompts."""
     least: float
     """Relevancy of a Gaussian without a direction, which no threshold selects."""
     faintest: float
@@ -138,8 +138,8 @@ class SourceOptions:
     """Resize label maps to the image size by nearest neighbor. False: raise an error if the sizes differ."""
     level: str | None = None
     """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. sam and langsplat: s, m or l
-    (subparts, parts, wholes), or default (all of SAM's masks in one map). langsplat also accepts sum (the sum of the
-    vectors of all levels). Default: l."""
+    (subparts, parts or wholes; l if not given), or default (all of SAM's masks in one map). langsplat also accepts sum
+    (the sum of the vectors of all levels)."""
     features: FeaturesName = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
     as written by LangSplat's preprocessing."""
@@ -148,7 +148,7 @@ class SourceOptions:
     features_missing: Missing = "error"
     """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
     text_vectors: Path | None = None
-    """NPZ file with one vector per prompt, used instead of encoding prompts; for precomputed features."""
+    """NPZ file with one vector per prompt, used instead of encoding prompts. For precomputed features."""
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -54,7 +54,7 @@ class NormLiftCheck(NormLift):
             raise SystemExit(1)
 
     def _rows(self, begun: float) -> tuple[list[Finding], Plan | None]:
-        """Return all findings up to the first error that prevents further checks, and the plan if there is no error."""
+        """Return all findings up to the first error that prevents further checks, and the plan if nothing failed."""
         rows: list[Finding] = []
         if _try(rows, "options", lambda: (self.check_early(),)) is None:
             return rows, None

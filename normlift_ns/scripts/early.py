@@ -133,7 +133,7 @@ def check_config(config: Path, data: Path | None, step: int | None = None, *, wr
     _check_access(config, "--load-config")
     if data is not None and not data.exists():
         raise FileNotFoundError(
-            f"There is no dataset at {data}, given with --data. Expected the folder or the transforms.json that "
+            f"No dataset at {data}, given with --data. Expected the folder or the transforms.json that "
             "ns-train was run with."
         )
     paths = glance(config)
@@ -148,7 +148,7 @@ def check_config(config: Path, data: Path | None, step: int | None = None, *, wr
     if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
         files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
         raise FileNotFoundError(
-            f"There is no checkpoint {pattern} in {checkpoints}, which contains {files}. Copy it there again."
+            f"No checkpoint {pattern} in {checkpoints}, which contains {files}. Copy it there again."
         )
 
 

@@ -96,22 +96,22 @@ class NormLiftQuery:
         if self.interactive:
             converse(run, self.ask.rules(), keep_history=self.history)
             return []
-        answer = run.ask(self.text, **self.ask.rules())
-        save_renders = self._prepare_renders(answer.question) if self.render_dir is not None else None
-        rows = answer.summarize()
-        show_why = self._explain(answer, rows) if self.why else None
-        segment_arrays = self._segment(answer, rows) if self.segment is not None else {}
-        show_objects = self._list_objects(answer.question) if self.objects else None
+        result = run.ask(self.text, **self.ask.rules())
+        save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
+        rows = result.summarize()
+        show_why = self._explain(result, rows) if self.why else None
+        sam3_arrays = self._segment(result, rows) if self.segment is not None else {}
+        show_objects = self._list_objects(result.question) if self.objects else None
         if self.json is not None:
-            _write_json(self.json, rows, answer.question, self.overwrite)
+            _write_json(self.json, rows, result.question, self.overwrite)
         if self.output_path is not None:
-            _write_arrays(self.output_path, answer, segment_arrays, self.overwrite)
+            _write_arrays(self.output_path, result, sam3_arrays, self.overwrite)
         if save_renders is not None:
             save_renders()
-        stored = save_question(run.folder / FIELD_FOLDER, answer.question) if self.save else None
+        stored = save_question(run.folder / FIELD_FOLDER, result.question) if self.save else None
         folders = (self.render_dir, self.why_dir, self.objects_dir)
         written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
-        show(rows, answer.question)
+        show(rows, result.question)
         if self.segment is not None:
             from normlift_ns.scripts.answers.segmenting import show_segments  # noqa: PLC0415 (already imported)
 
@@ -156,23 +156,23 @@ class NormLiftQuery:
         settings = RasterSettings.recorded(run.field.manifest)
         return lambda: save_overlays(run.scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
 
-    def _explain(self, answer: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
+    def _explain(self, result: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
         """Add an explanation to every row, write the images, and return a function that prints the explanations."""
         from normlift_ns.scripts.answers.reasons import find_reasons, save_pictures, show_reasons, to_json  # noqa: PLC0415
 
-        run, reasons = find_reasons(self.load_config, self.data, answer)
+        run, reasons = find_reasons(self.load_config, self.data, result)
         for row, reason in zip(rows, reasons):
             row["why"] = to_json(run, reason)
         if self.why_dir is not None:
             save_pictures(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
         return lambda: show_reasons(run, self.text, reasons)
 
-    def _segment(self, answer: QuickAnswer, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    def _segment(self, result: QuickAnswer, rows: list[dict[str, Any]]) -> dict[str, Any]:
         """Add SAM 3's answer to every row, and return its arrays."""
         from normlift_ns.scripts.answers.segmenting import ask_sam3, segment_arrays  # noqa: PLC0415 (as above)
 
         kwargs = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
-        segmented, summaries = ask_sam3(self.load_config, self.data, answer, **kwargs)
+        segmented, summaries = ask_sam3(self.load_config, self.data, result, **kwargs)
         for row, summary in zip(rows, summaries):
             row["segment"] = summary
         return segment_arrays(segmented)
@@ -182,10 +182,10 @@ class NormLiftQuery:
         from normlift_ns.objects.tables import write_catalogue  # noqa: PLC0415 (as above)
         from normlift_ns.scripts.answers.catalogue import facts, find_catalogue, show_catalogue  # noqa: PLC0415
 
-        catalogue = find_catalogue(self.load_config, self.data, question, self.metres_per_unit)
+        catalog = find_catalogue(self.load_config, self.data, question, self.metres_per_unit)
         if self.objects_dir is not None:
-            write_catalogue(catalogue, self.objects_dir, question=facts(question), overwrite=self.overwrite)
-        return lambda: show_catalogue(catalogue)
+            write_catalogue(catalog, self.objects_dir, question=facts(question), overwrite=self.overwrite)
+        return lambda: show_catalogue(catalog)
 
     def _check(self) -> None:
         """Raise errors that can be detected before anything is loaded."""
@@ -247,17 +247,17 @@ def _write_json(path: Path, rows: list[dict[str, Any]], question: Question, over
     write_text(path, json.dumps({"queries": rows, **rules}, indent=2) + "\n", overwrite=overwrite)
 
 
-def _write_arrays(path: Path, answer: QuickAnswer, extra: dict[str, Any], overwrite: bool) -> None:
+def _write_arrays(path: Path, result: QuickAnswer, extra: dict[str, Any], overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
     arrays: dict[str, Any] = {
-        "relevancy": answer.relevancy,
-        "reliability": answer.field.arrays["reliability"],
-        "valid": answer.valid,
+        "relevancy": result.relevancy,
+        "reliability": result.field.arrays["reliability"],
+        "valid": result.valid,
         **extra,
     }
     with new_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
-        np.savez(file, names=np.array(answer.question.texts), **arrays)
+        np.savez(file, names=np.array(result.question.texts), **arrays)
 
 
 def entrypoint() -> None:

@@ -103,11 +103,10 @@ def _exit_code(command: type[Command], words: list[str]) -> int:
     except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
     except (KeyboardInterrupt, Terminated) as stop:
-        interrupted = isinstance(stop, KeyboardInterrupt)
-        say_error(
-            f"{'Interrupted' if interrupted else 'Terminated'}. No partial files remain; rerun the command to resume."
-        )
-        return 128 + (signal.SIGINT if interrupted else signal.SIGTERM)
+        number = signal.SIGINT if isinstance(stop, KeyboardInterrupt) else signal.SIGTERM
+        word = "Interrupted" if number == signal.SIGINT else "Terminated"
+        say_error(f"{word}. No partial files remain; rerun the command to resume.")
+        return 128 + number
     except Exception as error:  # a traceback would not help the user
         return _report_error(error)
     return 0

@@ -38,9 +38,9 @@ def facts(question: Question) -> dict[str, Any]:
     }
 
 
-def show_catalogue(catalogue: Catalogue) -> None:
+def show_catalogue(catalog: Catalogue) -> None:
     """Print a table of the largest objects, in capture coordinates."""
-    table = Table(title=f"Objects, in {catalogue.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
+    table = Table(title=f"Objects, in {catalog.unit}s", padding=(0, 0 if CONSOLE.width < 100 else 1))
     table.add_column("id")
     table.add_column("text", overflow="fold")
     narrow = CONSOLE.width < 70
@@ -50,7 +50,7 @@ def show_catalogue(catalogue: Catalogue) -> None:
         table.add_column(name, justify="right", no_wrap=name not in vectors, overflow="fold", min_width=width)
     if not narrow:
         table.add_column("best views")
-    largest = sorted(catalogue.objects, key=lambda item: -item.gaussians)[:_MAX_ROWS]
+    largest = sorted(catalog.objects, key=lambda item: -item.gaussians)[:_MAX_ROWS]
     for item in sorted(largest, key=lambda item: item.id):
         geometry = item.capture
         rows = (geometry.centroid, geometry.box.size, geometry.extent)[: len(vectors)]
@@ -59,7 +59,7 @@ def show_catalogue(catalogue: Catalogue) -> None:
         best = () if narrow else (plain(" ".join(Path(name).stem for name in item.best_views)),)
         table.add_row(str(item.id), plain(item.text), *cells, *best)
     CONSOLE.print(table)
-    if len(catalogue.objects) > _MAX_ROWS:
-        say(f"{len(catalogue.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all.")
-    if catalogue.in_smaller_parts > 0:
-        say(f"{catalogue.in_smaller_parts:,} selected Gaussians are in groups too small to be listed.")
+    if len(catalog.objects) > _MAX_ROWS:
+        say(f"{len(catalog.objects) - _MAX_ROWS:,} smaller objects are not shown; --objects-dir FOLDER writes all.")
+    if catalog.in_smaller_parts > 0:
+        say(f"{catalog.in_smaller_parts:,} selected Gaussians are in groups too small to be listed.")

@@ -85,7 +85,7 @@ def show_reasons(run: LiftedRun, texts: Sequence[str], reasons: Sequence[Why | N
     if result.row_count > 0:
         CONSOLE.print(result)
     for text, why in zip(texts, reasons):
-        say(f"{text}: {'nothing is selected, so there are no votes.' if why is None else why.sentence}")
+        say(f"{text}: {'nothing is selected, so nothing voted for it.' if why is None else why.sentence}")
 
 
 def table(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], *, narrow: bool = False) -> Table:
