@@ -42,18 +42,18 @@ class NormLiftCheck(NormLift):
         Raises:
             SystemExit: There is an error; the exit code is 1.
         """
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         if self.json is not None:
             writable_file(self.json, "--json")
             refuse_existing(self.json, overwrite=self.overwrite, instead="--json")
-        rows, plan = self._rows(begun)
+        rows, plan = self._rows(start_time)
         _show(rows, plan)
         if self.json is not None:
             write_text(self.json, _to_json(rows, plan), overwrite=self.overwrite)
         if any(row.state == "error" for row in rows):
             raise SystemExit(1)
 
-    def _rows(self, begun: float) -> tuple[list[Finding], Plan | None]:
+    def _rows(self, start_time: float) -> tuple[list[Finding], Plan | None]:
         """Return all findings up to the first error that prevents further checks, and the plan if nothing failed."""
         rows: list[Finding] = []
         if _try(rows, "options", lambda: (self.check_early(),)) is None:
@@ -74,7 +74,7 @@ class NormLiftCheck(NormLift):
         source = _try(rows, "2D features", lambda: make_source(options, device))
         missing = [] if source is None else findings.missing_weights(options, device)
         rows += [] if source is None else [findings.of_weights(missing)]
-        opened = _try(rows, "capture", lambda: open_capture(self, begun))
+        opened = _try(rows, "capture", lambda: open_capture(self, start_time))
         if opened is None:
             return rows, None
         scene = opened.scene

@@ -105,22 +105,22 @@ class NormLift:
             return self._lift(team)
 
     def _plan(self) -> None:
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         say_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.scripts.planned import dry_run, needs, plan_table  # noqa: PLC0415 (loads torch)
 
-        plan = dry_run(self, begun)
+        plan = dry_run(self, start_time)
         CONSOLE.print(plan_table(plan))
         say(needs(plan))
 
     def _lift(self, team: Team) -> LiftedRun | None:
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         say_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.front_door import opener  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.team.seen import Export  # noqa: PLC0415
         from normlift_ns.together import lift_run_together  # noqa: PLC0415
 
-        imported = time.perf_counter()
+        import_time = time.perf_counter()
         message_times: list[float] = []
 
         def on_message(text: str) -> None:
@@ -149,9 +149,9 @@ class NormLift:
             )
         if run is None:
             return None
-        before = {"start": imported - begun, "open": (message_times or [imported])[0] - imported}
+        before = {"start": import_time - start_time, "open": (message_times or [import_time])[0] - import_time}
         if not terminal.now[-1].quiet:
-            CONSOLE.print(summary(run, before, time.perf_counter() - begun))
+            CONSOLE.print(summary(run, before, time.perf_counter() - start_time))
         say(next_command(run.config, self.queries))
         return run
 
@@ -223,11 +223,11 @@ def progress_bars() -> Iterator[Report]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    begun: set[str] = set()
+    started: set[str] = set()
 
     def print_stage(stage: str, done: int, total: int) -> None:
-        if stage not in begun:
-            begun.add(stage)
+        if stage not in started:
+            started.add(stage)
             say_progress(f"{names.get(stage, stage)} …")
 
     if not CONSOLE.is_terminal or terminal.now[-1] != terminal.Terminal():

@@ -52,22 +52,22 @@ class Opened(NamedTuple):
     seconds: dict[str, float]
 
 
-def open_capture(command: Command, begun: float) -> Opened:
+def open_capture(command: Command, start_time: float) -> Opened:
     """Open the capture that a command is about to lift.
 
     Args:
         command: Options of ns-normlift.
-        begun: Start of the command by `time.perf_counter`.
+        start_time: Start of the command by `time.perf_counter`.
     Raises:
         FileNotFoundError, ValueError: Same as in `open_scene` and `open_splat`.
     """
-    imported = time.perf_counter()
+    import_time = time.perf_counter()
     trained = command.trained()
     scene = (
         open_scene(trained, data=command.data, load_step=command.load_step) if isinstance(trained, Path) else trained
     )
     run_dir = run_directory(command.output_dir or scene.runs_dir, scene.name, command.timestamp)
-    return Opened(scene, run_dir, {"start": imported - begun, "open": time.perf_counter() - imported})
+    return Opened(scene, run_dir, {"start": import_time - start_time, "open": time.perf_counter() - import_time})
 
 
 def compared(command: Command, opened: Opened, device: str) -> str | None:
@@ -91,12 +91,12 @@ def planned(command: Command, opened: Opened, source: FeatureSource, device: str
     return make_plan(measurements, num_devices=command.num_devices)
 
 
-def dry_run(command: Command, begun: float) -> Plan:
+def dry_run(command: Command, start_time: float) -> Plan:
     """Return the plan of a command without lifting anything.
 
     Args:
         command: Options of ns-normlift.
-        begun: Start of the command by `time.perf_counter`.
+        start_time: Start of the command by `time.perf_counter`.
     Raises:
         FileNotFoundError: Network weights are not on this machine, so the speed cannot be measured.
         FileNotFoundError, ValueError: Same as in `open_capture`, `compared` and `measure`.
@@ -111,7 +111,7 @@ def dry_run(command: Command, begun: float) -> Plan:
             f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
             "Download them first, or give local files with --encoder-pretrained and --sam-model."
         )
-    opened = open_capture(command, begun)
+    opened = open_capture(command, start_time)
     warning = compared(command, opened, device) if command.check else None
     if warning is not None:
         say(f"Warning: {warning}")

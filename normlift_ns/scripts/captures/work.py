@@ -79,11 +79,11 @@ def _lift_capture(
     capture: Capture, claim: Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
 ) -> Outcome | None:
     """Lift a capture unless it is already lifted; return None if another worker has taken over."""
-    begun, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
+    start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
 
     def outcome(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
         run = None if capture.run is None or state == "failed" else str(capture.run)
-        seconds, now = time.monotonic() - begun, time.time()
+        seconds, now = time.monotonic() - start_time, time.time()
         return Outcome(capture.name, capture.key, claim.number, state, seconds, message, code, run, worker, now)
 
     try:
