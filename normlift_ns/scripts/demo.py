@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-TEXTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
-REGIONS = 700
+_PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
+_REGION_COUNT = 700
 """Superpixels per view: small enough to separate the green star of a tomato."""
-ASK = AskOptions(threshold="auto")
+_ASK_OPTIONS = AskOptions(threshold="auto")
 _COMPILE = "import torch; from normlift_ns.raster.numba import warm; warm(torch.float32).join()"
 
 
@@ -68,20 +68,20 @@ class Demo:
         compiling.wait()
 
         CONSOLE.rule("Lifting")
-        flags = ("--encoder", "colour", "--region-count", REGIONS)
-        _show("ns-normlift", "--load-config", config, *flags, "--queries", *TEXTS)
-        source = SourceOptions(encoder="colour", region_count=REGIONS)
-        run = NormLift(config, source=source, queries=TEXTS, timestamp="demo", overwrite=True).main()
+        flags = ("--encoder", "colour", "--region-count", _REGION_COUNT)
+        _show("ns-normlift", "--load-config", config, *flags, "--queries", *_PROMPTS)
+        source = SourceOptions(encoder="colour", region_count=_REGION_COUNT)
+        run = NormLift(config, source=source, queries=_PROMPTS, timestamp="demo", overwrite=True).main()
         assert run is not None  # this is the only process
 
         CONSOLE.rule("Searching")
         renders, answers = self.folder / "pictures", self.folder / "answers.json"
         flags = ("--threshold", "auto", "--render-dir", renders, "--json", answers)
-        _show("ns-normlift-query", "--load-config", run.config, "--text", *TEXTS, *flags)
-        NormLiftQuery(run.config, TEXTS, ask=ASK, render_dir=renders, json=answers, overwrite=True).main()
+        _show("ns-normlift-query", "--load-config", run.config, "--text", *_PROMPTS, *flags)
+        NormLiftQuery(run.config, _PROMPTS, ask=_ASK_OPTIONS, render_dir=renders, json=answers, overwrite=True).main()
         middle = f"{spread(self.views, 3)[1]:04d}"
-        side_by_side(
-            [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], renders
+        _join_images(
+            [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(_PROMPTS[:3])], renders
         )
 
         CONSOLE.rule("Comparing with the ground truth")
@@ -103,7 +103,7 @@ class Demo:
         return means
 
 
-def side_by_side(paths: list[Path], folder: Path) -> None:
+def _join_images(paths: list[Path], folder: Path) -> None:
     """Join images of the same height into overview.png."""
     from PIL import Image  # noqa: PLC0415
 

@@ -122,7 +122,7 @@ class NormLiftEval:
             CONSOLE.print(rows_table(evaluation.rows))
             if len(evaluation.scenes) > 1:
                 CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
-            CONSOLE.print(results_table(evaluation))
+            CONSOLE.print(_results_table(evaluation))
         for name, rows in studies.items():
             if name == "coverage":
                 for part in ("regions", "photographs", "poses"):
@@ -213,7 +213,7 @@ class NormLiftEval:
         return self.output_path.with_name(f"{self.output_path.stem}_{study}.svg")
 
 
-def results_table(evaluation: Evaluation) -> Table:
+def _results_table(evaluation: Evaluation) -> Table:
     """Return a table of the mean results."""
     table = Table("metric", "value", title=f"Protocol {evaluation.settings['protocol']}")
     for name, value in evaluation.results.items():

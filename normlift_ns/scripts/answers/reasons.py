@@ -20,9 +20,9 @@ from normlift_ns.viewer.pictures import picture_names
 if TYPE_CHECKING:
     from normlift_ns.quick import QuickAnswer
 
-SHOWN = 3
+_IMAGES_PER_GROUP = 3
 """Number of images per prompt in each group: those with the largest weight, and those that disagree most."""
-MOST = "weighs most"
+_LARGEST_WEIGHT = "weighs most"
 
 
 def find_reasons(config: Path, data: Path | None, answer: QuickAnswer) -> tuple[LiftedRun, list[Why | None]]:
@@ -47,9 +47,9 @@ def to_json(run: LiftedRun, why: Why | None) -> dict[str, Any] | None:
     return {**row, "views": views}
 
 
-def shown_votes(why: Why) -> dict[str, tuple[ViewVote, ...]]:
+def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
     """Return the images to show: those with the largest weight, and those that disagree most."""
-    return {MOST: why.views[:SHOWN], "disagrees most": why.most_different[:SHOWN]}
+    return {_LARGEST_WEIGHT: why.views[:_IMAGES_PER_GROUP], "disagrees most": why.most_different[:_IMAGES_PER_GROUP]}
 
 
 def save_pictures(
@@ -67,9 +67,9 @@ def save_pictures(
     names = picture_names(run.votes.names)
     votes: dict[Path, ViewVote] = {}
     for index, (text, why) in enumerate(zip(texts, reasons)):
-        for kind, group in ({} if why is None else shown_votes(why)).items():
+        for kind, group in ({} if why is None else _votes_to_show(why)).items():
             for rank, vote in enumerate(group, 1):
-                prefix = "" if kind == MOST else "disagrees_"
+                prefix = "" if kind == _LARGEST_WEIGHT else "disagrees_"
                 votes[folder / f"{index}_{file_name(text)}_{prefix}{rank}_{names[vote.view]}.png"] = vote
     if len(votes) == 0:
         return []
@@ -99,7 +99,7 @@ def table(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | No
         result.add_column("regions", justify="right", no_wrap=True)
     for text, why in zip(texts, reasons):
         label = text
-        for kind, votes in ({} if why is None else shown_votes(why)).items():
+        for kind, votes in ({} if why is None else _votes_to_show(why)).items():
             for vote in votes:
                 shares = (f"{vote.share:.1%}", f"{vote.agreement:.3f}", f"{vote.disagreement:.0%}")
                 numbers = shares if narrow else (f"{vote.weight:,.0f}", *shares, str(len(vote.regions)))

@@ -98,7 +98,7 @@ def is_lifted(run: Path) -> bool:
     return True
 
 
-def identity(command: NormLift) -> str:
+def _capture_key(command: NormLift) -> str:
     """Return a digest of the scene and the options of a lift, 16 hexadecimal digits.
 
     The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
@@ -137,7 +137,7 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
             command = replace(common, **{source: Path(first)})
     except InputError as error:
         raise InputError(f"{location}: {error}") from None
-    key = identity(command)
+    key = _capture_key(command)
     timestamp = f"{_PREFIX}{key}"
     return Capture(line, (*options, *own, "--timestamp", timestamp), key, _run_dir(command, timestamp))
 
