@@ -1,4 +1,4 @@
-"""What is said of an error: the user's mistakes and full disks as they are, ours with a log file to report."""
+"""User-facing messages and exit codes of exceptions; internal errors also get a log file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from pathlib import Path
 from normlift_ns.errors import InputError, visible
 
 USER, OURS = 1, 70
-"""Exit codes; 70 is EX_SOFTWARE of sysexits.h."""
-_LONGEST = 300
+"""Exit codes of user errors and internal errors; 70 is EX_SOFTWARE of sysexits.h."""
+_MAX_LINE = 300
+"""Largest number of characters of a foreign message."""
 
 
 def explain(error: BaseException) -> tuple[str, int]:
-    """What to tell the user of an error, and the exit code of a command that it ends.
+    """Return the message for the user and the exit code of a command that fails with this error.
 
-    The traceback of an error that nobody foresaw goes to a log file.
+    Unexpected errors also get a log file with their traceback.
 
     >>> explain(InputError("beta must be positive, got -1"))
     ('beta must be positive, got -1', 1)
@@ -34,55 +35,56 @@ def explain(error: BaseException) -> tuple[str, int]:
         return (f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)), USER
     if isinstance(error, MemoryError):
         return str(error) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale", USER
-    if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported for this
-        return f"the GPU's memory is full ({_first_line(error)}); work on the CPU: --device cpu", USER
+    if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
+        return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu", USER
     if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):
-        return "this torch was built for NumPy 1, and NumPy 2 is installed; type: pip install 'numpy<2'", USER
-    return _bug(error), OURS
+        return "this torch was built for NumPy 1, but NumPy 2 is installed; type: pip install 'numpy<2'", USER
+    return _report_bug(error), OURS
 
 
 def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).strip().splitlines()), "")[:_LONGEST]
+    return next(iter(str(error).strip().splitlines()), "")[:_MAX_LINE]
 
 
-def _bug(error: BaseException) -> str:
-    what = f"{type(error).__name__}: {_first_line(error)}".removesuffix(": ")
+def _report_bug(error: BaseException) -> str:
+    """Log the traceback, or print it if no log file can be written; return the message for the user."""
+    summary = f"{type(error).__name__}: {_first_line(error)}".removesuffix(": ")
     log = log_traceback(error)
     if log is None:
         traceback.print_exception(error)
-    where = "above" if log is None else f"in {log}"
+    location = "printed above" if log is None else f"in {log}"
     return (
-        f"This is a bug of normlift_ns: {what}. The details are {where}; please report it at the project's issue "
-        "tracker, with them."
+        f"This is a bug in normlift_ns: {summary}. The details are {location}; please include them in a report to the "
+        "project's issue tracker."
     )
 
 
 def log_traceback(error: BaseException) -> Path | None:
-    """Writes a traceback to a new file that only the user can read; None where no folder takes it."""
+    """Write a traceback to a new file that only the user can read; return None if no folder is writable."""
     text = "".join(traceback.format_exception(error))
-    facts = f"Python {platform.python_version()}, {platform.platform()}\n{visible(' '.join(sys.argv))}\n\n"
+    header = f"Python {platform.python_version()}, {platform.platform()}\n{visible(' '.join(sys.argv))}\n\n"
     name = f"{time.strftime('%Y-%m-%d_%H%M%S')}_{os.getpid()}_{secrets.token_hex(4)}.log"
-    for folder in _folders():
+    for folder in _log_folders():
         with suppress(OSError, ValueError):
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / name
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "w", encoding="utf8", errors="backslashreplace") as file:
-                file.write(facts + text)
+                file.write(header + text)
             return path
     return None
 
 
-def _folders() -> list[Path]:
-    """Where log files may go, the best first."""
-    found = [folder] if (folder := state_folder()) is not None else []
+def _log_folders() -> list[Path]:
+    """Return possible folders of log files in order of preference."""
+    folders = [folder] if (folder := state_folder()) is not None else []
     with suppress(OSError):  # no folder for temporary files
-        found.append(Path(tempfile.gettempdir()))
-    return found
+        folders.append(Path(tempfile.gettempdir()))
+    return folders
 
 
 def state_folder() -> Path | None:
-    """Where a user's programs keep what they remember; it may not be there yet. None: a user without a home."""
+    """Return the user's folder for program state, which may not exist yet; None for users without a home folder."""
     state = Path(os.environ.get("XDG_STATE_HOME", ""))
     with suppress(RuntimeError):
         return (state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns"

@@ -1,14 +1,13 @@
-"""The error that every loader and every check raises, so that a mistake of the user's can be told from ours; and how
-text from outside is shown."""
+"""InputError for the user's mistakes as opposed to internal errors, and safe display of foreign text."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """A file or an argument is not what it should be.
+    """Error for an invalid file or argument.
 
-    The message names it, and says what was found, what was expected and what to do. What is missing is a
-    `FileNotFoundError`, and what cannot be written an `OSError`; any other exception is a mistake of the program.
+    The message names the file or argument, what was found, what was expected and what to do. Missing files raise
+    `FileNotFoundError`, and files that cannot be written `OSError`; any other exception is an internal error.
 
     >>> from normlift_ns import InputError, LiftOptions
     >>> try:
@@ -20,15 +19,15 @@ class InputError(ValueError):
 
 
 class OutputError(Exception):
-    """Standard output takes no more. No OSError, which loaders take for one of the file that they read."""
+    """Failed write to standard output. Not an OSError, which loaders would attribute to the file that they read."""
 
 
 def visible(text: str, keep: str = "") -> str:
-    r"""The text with escapes in place of characters that are not printed themselves, so that nothing in it moves the
-    cursor, hides or turns around.
+    r"""Escape unprintable characters, which could move the cursor, hide text or reverse it.
 
     Args:
-        keep: such characters that stay, for example a line break.
+        text: Text from outside, such as a prompt or a path.
+        keep: Unprintable characters to keep, for example a line break.
 
     >>> print(visible("red\x1b[31m mug\n"))
     red\x1b[31m mug\n
@@ -39,7 +38,7 @@ def visible(text: str, keep: str = "") -> str:
 
 
 def shortened(text: str, most: int = 40) -> str:
-    """The text, cut where it is longer than `most` characters.
+    """Cut a text to at most `most` characters.
 
     >>> shortened("a red bowl", 8)
     'a red b…'

@@ -1,6 +1,6 @@
-"""Everything that a user can choose, as plain dataclasses. Imports nothing heavy, so that --help is quick.
+"""User options as plain dataclasses. Imports no heavy package, to keep --help fast.
 
-The docstring under a field is the help of its flag.
+The docstring under a field is the help text of its flag.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from typing import Any, Literal, NamedTuple
 from normlift_ns.ranges import check_options, check_texts
 
 RasterizeMode = Literal["classic", "antialiased"]
-"""How a scene was rasterized in its training; splatfacto's `rasterize_mode`."""
+"""Rasterization mode that a scene was trained with: splatfacto's `rasterize_mode`."""
 BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
-"""What rasterizes; see `normlift_ns.rasterize_evidence`."""
+"""Rasterization backend; see `normlift_ns.rasterize_evidence`."""
 KNOWN_RULES = ("1.4", "1.5", "1.6")
-"""Versions of gsplat that draw differently."""
+"""gsplat versions that rasterize differently."""
 GsplatRules = Literal["auto", "1.4", "1.5", "1.6", "installed"]
-"""By which of them a scene is drawn."""
+"""gsplat version whose rasterization a scene needs."""
 Background = Literal["black", "white"]
-"""What is behind a splat without a nerfstudio run."""
+"""Background color behind a splat without a nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
-"""How directions are stored: the evidence itself (exact), float16, or float16 coordinates in a basis."""
+"""Storage of directions: the evidence itself (exact), float16, or float16 coordinates in a basis."""
 Rule = Literal["cosine", "lerf", "margin"]
-"""How the relevancy of a text follows from cosines; see `normlift_ns.relevancy`."""
+"""Formula for the relevancy of a prompt from its cosines; see `normlift_ns.relevancy`."""
 Unlabeled = Literal["ignore", "dilute"]
-"""What a pixel without a region counts as: nothing at all, or an observation of the zero vector."""
+"""Meaning of a pixel without a region: ignored, or an observation of the zero vector."""
 
 RegionsName = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
 FeaturesName = Literal["none", "langsplat"]
@@ -37,59 +37,59 @@ Fill = Literal["black", "white"]
 Missing = Literal["error", "skip"]
 
 DEFAULT_MODEL, DEFAULT_PRETRAINED = "ViT-B-16", "laion2b_s34b_b88k"
-"""Of OpenCLIP."""
+"""OpenCLIP architecture and pretrained weights."""
 DEFAULT_SAM, DEFAULT_SAM3 = "facebook/sam-vit-huge", "facebook/sam3"
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
-"""Negative prompts of LERF."""
+"""LERF's negative prompts."""
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 
 
-class RuleFacts(NamedTuple):
-    """What belongs to a rule besides its formula, which is in `core.query` for torch and in `quick` for numpy."""
+class RuleSettings(NamedTuple):
+    """Constants of a relevancy rule; its formula is in `core.query` for torch and in `quick` for numpy."""
 
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     compares: bool
-    """Whether it needs negatives."""
+    """True if the rule needs negative prompts."""
     least: float
-    """Relevancy of a Gaussian without a direction: no threshold selects it."""
+    """Relevancy of a Gaussian without a direction, which no threshold selects."""
     faintest: float
-    """Relevancy below which pictures tell nothing apart."""
+    """Lower end of the color scale: renders do not distinguish smaller relevancies."""
     present: float | None
-    """Top relevancy below which a text is probably not in the scene; None: that depends on the encoder."""
+    """Largest relevancy below which a prompt is probably not in the scene; None: depends on the encoder."""
 
 
-RULES: dict[Rule, RuleFacts] = {
-    # the threshold suits the colour encoder, and questions of which nothing is known: see `question.make_question`
-    "cosine": RuleFacts(0.5, compares=False, least=0.0, faintest=0.0, present=None),
-    # the threshold is a draw
-    "lerf": RuleFacts(0.5, compares=True, least=0.0, faintest=0.0, present=0.62),
-    # the threshold is the paper's; a text is present by the same lead over the negatives as with lerf
-    "margin": RuleFacts(0.02, compares=True, least=-2.0, faintest=-0.1, present=math.log(0.62 / (1 - 0.62)) / 10),
+RULES: dict[Rule, RuleSettings] = {
+    # The threshold suits the color encoder, and queries without further information: see `question.make_question`.
+    "cosine": RuleSettings(0.5, compares=False, least=0.0, faintest=0.0, present=None),
+    # At the threshold, prompt and negative are equally similar.
+    "lerf": RuleSettings(0.5, compares=True, least=0.0, faintest=0.0, present=0.62),
+    # The threshold is the paper's; a prompt is present at the same lead over the negatives as with lerf.
+    "margin": RuleSettings(0.02, compares=True, least=-2.0, faintest=-0.1, present=math.log(0.62 / (1 - 0.62)) / 10),
 }
 VoteKind = Literal["paper", "posterior"]
-"""How a vote weighs what a Gaussian has seen itself against its neighbours; see `normlift_ns.refine`."""
+"""Weighting of a Gaussian's own evidence against its neighbors in a vote; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
-"""Class of a Gaussian without a direction, where one is scored: none, or the first."""
+"""Class of a Gaussian without a direction in a score: none, or the first."""
 REACH, MIN_SIZE = 4.0, 20
-"""How far apart Gaussians of one object may be, in units of the selection's median spacing, and how many it needs."""
+"""Largest gap between Gaussians of one object, in units of the selection's median spacing, and its smallest size."""
 ARRAY_FILES = ("coord.npy", "segment.npy", "instance.npy", "names.json")
-"""Of labels as arrays."""
+"""Files of exported label arrays."""
 TRANSFER_DISTANCE = 6.0
-"""How far a point may be from the Gaussian that labels it, in units of the scene's median spacing."""
+"""Largest distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
 OBJECT_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
-"""Of a catalogue: all of it, its table, and the boxes in the coordinates of the capture and in those of the scene."""
+"""Files of an object catalog: everything, its table, and its boxes in capture and in scene coordinates."""
 FLOATER_LIMIT = 1.9
 """Score above which a Gaussian is a likely floater, see `insight.floaters`."""
 
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What the images show: an encoder, and the regions that it looks at.
+    """2D features: the encoder, and the image regions that it encodes.
 
     Raises:
-        ValueError: a value of another type or out of its range.
+        ValueError: A value has the wrong type or is out of range.
 
     >>> from normlift_ns import LiftOptions, SourceOptions, lift_run
     >>> source = SourceOptions(encoder="colour", regions="grid", region_count=192)
@@ -99,70 +99,73 @@ class SourceOptions:
     """
 
     encoder: str = "open_clip"
-    """open_clip: CLIP features of masked crops, or of patches. siglip, siglip2, metaclip2: the same with networks of
-    the transformers library. colour: mean colours against colour names, without learned weights. Or the name of an
-    encoder of another package."""
+    """Encoder of regions and prompts. open_clip: CLIP, on masked crops or on patches. siglip, siglip2, metaclip2: the
+    same with networks of the transformers library. colour: mean colors compared with color names, without learned
+    weights. Any other name: an encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
-    """open_clip: architecture. siglip, siglip2, metaclip2: a name on the Hugging Face hub or a folder, by default
-    google/siglip-base-patch16-224, google/siglip2-base-patch16-224, facebook/metaclip-2-worldwide-huge-quickgelu."""
+    """open_clip: the architecture. siglip, siglip2, metaclip2: a Hugging Face model name or a local folder. Their
+    defaults are google/siglip-base-patch16-224, google/siglip2-base-patch16-224 and
+    facebook/metaclip-2-worldwide-huge-quickgelu."""
     encoder_pretrained: str = DEFAULT_PRETRAINED
-    """Weights of the open_clip encoder: a tag to download, or a local file of that architecture."""
+    """open_clip: pretrained weights, as a tag to download or a local file of the same architecture."""
     crop_fill: Fill = "black"
-    """Colour around a region in the crop that a network sees."""
+    """Color that replaces everything outside the region in a crop."""
     text_template: str = "{}"
-    """What a network reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
-    seven templates of OpenCLIP. By default the bare text."""
+    """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
+    mean over seven OpenCLIP templates. {} alone is the bare prompt."""
     regions: RegionsName = "auto"
-    """sam: SAM's masks. sam3: what SAM 3 finds for the texts of --queries. patches: the patches of a vision
-    transformer, each with a feature of its own. superpixel: SLIC superpixels. grid: squares. files: label maps from
-    --regions-dir. auto: files if --regions-dir is given, sam if --sam-model is. Otherwise, where a network sees the
-    images, sam on a GPU if its weights are on this machine, else patches if the network has them; else superpixel."""
+    """Image regions that get one feature each. sam: SAM's masks. sam3: SAM 3's masks for the prompts of --queries.
+    patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
+    --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
+    neural network uses sam on a GPU if SAM's weights are on this machine, else its patches if it has them. All other
+    cases use superpixel."""
     region_texts: tuple[str, ...] = ()
-    """What --regions sam3 looks for. By default the texts of --queries."""
+    """Prompts whose masks SAM 3 finds with --regions sam3. Default: the prompts of --queries."""
     region_count: int | None = None
-    """Approximate number of regions per image. By default 256 for superpixel and grid, 1024 for patches."""
+    """Approximate number of regions per image, for superpixel, grid and patches; larger values give smaller regions.
+    Default: 256 for superpixel and grid, 1024 for patches."""
     sam_model: str | None = None
-    """Weights of SAM, SAM 2 or HQ-SAM: a folder in the format of transformers, a file of the first SAM published by
-    Meta, or a name to download, such as facebook/sam2.1-hiera-large. By default facebook/sam-vit-huge, as LangSplat
-    uses. With --regions sam3 those of SAM 3, by default facebook/sam3."""
+    """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of Meta's first SAM, or a name to
+    download, such as facebook/sam2.1-hiera-large. Default: facebook/sam-vit-huge, as in LangSplat. With --regions
+    sam3: weights of SAM 3, default facebook/sam3."""
     sam_precision: SamPrecision = "auto"
-    """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
+    """Floating-point precision of the SAM network. auto: float16 on a GPU, float32 otherwise."""
     regions_dir: Path | None = None
-    """Folder with one label map per image, PNG or NPY with the same stem."""
+    """Folder with one label map per image: a PNG or NPY file with the same stem as the image."""
     regions_background: int = 0
-    """The value in label maps that means no region. Negative values never mean one."""
+    """Label map value of pixels without a region. Pixels with negative values never have a region."""
     regions_resample: bool = False
-    """Resize label maps of another size to the image's by nearest neighbour, instead of refusing them."""
+    """Resize label maps to the image size by nearest neighbor. False: raise an error if the sizes differ."""
     level: str | None = None
-    """Which level of regions counts. files: the number of a map in NPY files [levels, H, W]. sam and langsplat: s, m or
-    l (subparts, parts, wholes; l by default), or default (all of SAM's masks in one map). langsplat also knows sum (the
-    vectors of all levels added up)."""
+    """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. sam and langsplat: s, m or l
+    (subparts, parts or wholes; l if not given), or default (all of SAM's masks in one map). langsplat also accepts sum
+    (the sum of the vectors of all levels)."""
     features: FeaturesName = "none"
-    """Take regions and features from --features-dir instead of looking at images. langsplat: files of LangSplat's
-    preprocessing."""
+    """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
+    as written by LangSplat's preprocessing."""
     features_dir: Path | None = None
-    """Folder of the features."""
+    """Folder with the precomputed features of --features."""
     features_missing: Missing = "error"
-    """What to do about images without features: error, or skip to leave them out of the lift."""
+    """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
     text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look texts up in instead of encoding them. For imported features."""
+    """NPZ file with one vector per prompt, used instead of encoding prompts. For precomputed features."""
 
     def __post_init__(self) -> None:
         check_options(self)
         check_texts("region_texts", self.region_texts)
 
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
-        """The same options, with the texts that regions of sam3 are made of where none are given."""
-        asked = self.regions == "sam3" and len(self.region_texts) == 0
-        return replace(self, region_texts=tuple(queries)) if asked else self
+        """Return options whose sam3 prompts are filled in from `queries` if none are set."""
+        missing = self.regions == "sam3" and len(self.region_texts) == 0
+        return replace(self, region_texts=tuple(queries)) if missing else self
 
 
 @dataclass(frozen=True)
 class SplatOptions:
-    """Cameras and photographs of a splat that no nerfstudio run holds.
+    """Cameras and images of a splat without a nerfstudio run.
 
     Raises:
-        ValueError: a value of another type or out of its range.
+        ValueError: A value has the wrong type or is out of range.
 
     >>> from normlift_ns import SplatOptions
     >>> SplatOptions(transforms="capture/transforms.json").views
@@ -170,33 +173,32 @@ class SplatOptions:
     """
 
     colmap: Path | None = None
-    """Folder of a COLMAP project, with images/ and sparse/0/ in it."""
+    """Folder of a COLMAP project that contains images/ and sparse/0/."""
     transforms: Path | None = None
-    """transforms.json of nerfstudio, instant-ngp or Blender, instead of --colmap."""
+    """transforms.json file of nerfstudio, instant-ngp or Blender, instead of --colmap."""
     images: Path | None = None
-    """Folder of the photographs, or of smaller copies such as images_4. By default images/ of the COLMAP project, or
-    where transforms.json says."""
+    """Folder of the images, or of smaller copies such as images_4. Default: images/ of the COLMAP project, or the
+    paths in transforms.json."""
     masks: Path | None = None
-    """Folder with one mask per photograph, zero where a pixel does not count."""
+    """Folder with one mask per image; pixels whose mask value is zero are ignored."""
     world_transform: Path | None = None
-    """File of the similarity from the world of the cameras to that of the splat: 4 x 4 numbers, or the
-    dataparser_transforms.json of the run that a PLY file was exported from. By default the worlds are the same."""
+    """File with the similarity transform from camera world to splat world: a 4 x 4 matrix, or the
+    dataparser_transforms.json of the run that exported the PLY file. Default: both worlds are the same."""
     gsplat_normalize: bool = True
-    """gsplat's trainer normalized the world (its default); computed again from the COLMAP project. A PLY file is
-    taken for one of that trainer only where its photographs say so."""
+    """Assume that gsplat's trainer normalized the world, as it does by default; the transform is computed again from
+    the COLMAP project. A PLY file counts as normalized only if its images match the splat that way."""
     views: Literal["train", "all"] = "train"
-    """train: lift the photographs that were not held out. all: lift all of them."""
+    """Images to lift. train: those that were not held out of training. all: held-out images too."""
     test_every: int | None = None
-    """Every n-th photograph, from the first on, was held out of the training: 8 for gsplat's trainer, and for Inria's
-    with --eval. By default none, or those that transforms.json names."""
+    """Interval of held-out images: training left out every n-th image, starting with the first. 8 for gsplat's trainer,
+    and for Inria's with --eval. Default: no image, or those that transforms.json lists."""
     holdout: tuple[str, ...] = ()
-    """Photographs held out of the training, instead of --test-every: their names, a text file of names, or a share such
-    as 0.1, which ns-train holds out by default."""
+    """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
+    0.1 (the default of ns-train)."""
     rasterize_mode: RasterizeMode | None = None
-    """How the splat was rasterized in its training: classic or antialiased. By default as the PLY file says, else
-    classic."""
+    """Rasterization mode that the splat was trained with. Default: as recorded in the PLY file, else classic."""
     background: Background = "black"
-    """What is behind the splat, and behind photographs with an alpha channel."""
+    """Background color behind the splat, and behind images with an alpha channel."""
 
     def __post_init__(self) -> None:
         if isinstance(self.holdout, str | float):
@@ -205,7 +207,7 @@ class SplatOptions:
 
 
 class VoteNumbers(NamedTuple):
-    """The parameters whose defaults depend on the kind of vote."""
+    """Vote parameters whose defaults depend on the kind of vote."""
 
     sigma_d: float
     tau: float
@@ -217,18 +219,18 @@ VOTES: dict[VoteKind, VoteNumbers] = {
     "posterior": VoteNumbers(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
     "paper": VoteNumbers(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
 }
-"""The defaults of each kind of vote; the help of the fields of `RefineConfig` repeats them."""
+"""Defaults of each kind of vote; the help texts of `RefineConfig` repeat them."""
 
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """Parameters of the vote among neighbours.
+    """Parameters of the vote among neighboring Gaussians.
 
-    The paper publishes no values. The defaults were chosen where the truth is known: see docs/accuracy.md. What suits
-    one kind of vote does not suit the other, so that a parameter that is None takes the default of its kind.
+    The paper publishes no values. The defaults were tuned on scenes with ground truth: see docs/accuracy.md. The two
+    kinds of vote need different values, so a parameter that is None takes the default of its kind.
 
     Raises:
-        ValueError: a value outside its range.
+        ValueError: A value is out of range.
 
     >>> from normlift_ns import RefineConfig
     >>> RefineConfig(vote="paper", k=12).numbers.sigma_d, RefineConfig(vote="posterior").numbers.sigma_d
@@ -236,43 +238,47 @@ class RefineConfig:
     """
 
     vote: VoteKind = "posterior"
-    """How the vote weighs what a Gaussian has seen itself. posterior: by the views that saw it, against --prior views
-    of the neighbourhood. paper: as one voter among its neighbours (equations 9 and 10 of the paper)."""
+    """Weight of a Gaussian's own evidence in the vote. posterior: the number of views that saw it, against --prior
+    views for all neighbors together. paper: one voter among its neighbors (equations 9 and 10 of the paper)."""
     k: int = 36
-    """Number of neighbours K in the vote, at least 1."""
+    """Number of neighbors K in the vote, at least 1; larger values ask a wider neighborhood and take longer."""
     sigma_d: float | None = None
-    """Width of the vote's spatial decay, > 0. The unit is the scene's median distance from a Gaussian to the nearest
-    one at another place, because scenes are rescaled. By default 2 for posterior, 1 for paper."""
+    """Width of the spatial decay of votes, > 0; larger values give distant neighbors more weight. In units of the
+    scene's median distance from a Gaussian to the nearest one at another position, because scenes are rescaled.
+    Default: 2 for posterior, 1 for paper."""
     tau: float | None = None
-    """Cosine at which two directions half agree in the vote, in -1..1. By default 0.9 for posterior, 0.95 for
-    paper."""
+    """Cosine at which two directions count as half agreeing in the vote, in -1..1; larger values require more similar
+    directions. Default: 0.9 for posterior, 0.95 for paper."""
     gamma: float | None = None
-    """Softness of that agreement, > 0. By default 0.05 for posterior, 0.4 for paper."""
+    """Softness of the agreement around the cosine --tau, > 0; larger values blur the distinction between similar and
+    different directions. Default: 0.05 for posterior, 0.4 for paper."""
     delta: float | None = None
-    """Margin Delta by which the best neighbour must win the vote, >= 0. By default 0."""
+    """Margin Delta by which the best neighbor must win the vote, >= 0; larger values change fewer Gaussians.
+    Default: 0."""
     prior: float = 4.0
-    """What all neighbours together count in a posterior vote, in views, >= 0."""
+    """Weight of all neighbors together in a posterior vote, in views, >= 0; larger values overrule Gaussians that more
+    views saw."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Configs of version 0.1 know one kind of vote."""
+        """Read configs of version 0.1, which had only the paper's vote."""
         vars(self).update({"vote": "paper", **state})
 
     @property
     def numbers(self) -> VoteNumbers:
-        """The parameters, with the defaults of this kind of vote where none are given."""
-        given = {name: getattr(self, name) for name in VoteNumbers._fields}
-        return VOTES[self.vote]._replace(**{name: value for name, value in given.items() if value is not None})
+        """Vote parameters, with the defaults of this kind of vote in place of None."""
+        values = {name: getattr(self, name) for name in VoteNumbers._fields}
+        return VOTES[self.vote]._replace(**{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True)
 class LiftOptions:
-    """What to lift and how.
+    """Views, consensus, storage and rasterization of a lift.
 
     Raises:
-        ValueError: a value of another type or out of its range.
+        ValueError: A value has the wrong type or is out of range.
 
     >>> from normlift_ns import LiftOptions
     >>> LiftOptions(max_views=8).storage
@@ -280,88 +286,95 @@ class LiftOptions:
     """
 
     image_source: Literal["photos", "render"] = "photos"
-    """What the encoder sees: the photographs, or the trained scene rendered from their cameras."""
+    """Images that the encoder sees. photos: the training images. render: renders of the trained scene from the same
+    cameras."""
     max_views: int | None = None
-    """Use at most this many training views, evenly spread. By default all."""
+    """Number of training views to use at most, evenly spaced; more views are slower and more reliable. Default: all."""
     lift_downscale: int = 1
-    """Divide the size of images and cameras by this number."""
+    """Factor that divides the size of images and cameras, at least 1; larger values are faster and coarser."""
     beta: float = 1.0
-    """Strength of the prior in the reliability, in virtual views."""
+    """Strength of the prior in the reliability, in virtual views, >= 0; larger values lower the reliability of
+    Gaussians that few views see."""
     unlabeled: Unlabeled = "ignore"
-    """Pixels without a region: ignore them, or let them dilute as observations of nothing."""
+    """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
+    vector."""
     weight_power: Literal[1, 2] = 1
-    """1: weights A_ij as in the paper. 2: their squares."""
+    """Power of the rasterization weights A_ij: 1 as in the paper, or 2 for their squares."""
     consensus: bool = True
-    """Before the lift, give every region the feature that the regions of other views agree on which hold the same
-    Gaussians."""
+    """Before the lift, replace the feature of every region by the consensus of regions in other views that cover the
+    same Gaussians."""
     consensus_power: float = 1.0
-    """How little a region counts for another one of which it shows more: the power of the share of it that lies there,
-    >= 0. For --consensus True."""
+    """Exponent on the overlap fraction in the consensus, >= 0; larger values down-weight regions that cover more than
+    the target region. Needs --consensus True."""
     consensus_sample: int = 50
-    """Gaussians that the consensus looks at in every region, or all that it has. For --consensus True."""
+    """Number of Gaussians that the consensus samples in every region (all of them in smaller regions); larger values
+    are more exact and slower. Needs --consensus True."""
     consensus_least: float = 0.4
-    """Agreement of regions across views, in 0..1, up to which they count as overlapping by chance and keep their
-    features. Give 0 if your masks show things, however badly. For --consensus True."""
+    """Agreement of regions across views, in 0..1, up to which their overlaps count as chance and they keep their
+    features; larger values leave more scenes unchanged. Use 0 if your masks show objects, however badly. Needs
+    --consensus True."""
     refine: bool = True
-    """Let a vote among neighbours repair directions: a Gaussian copies the one that wins."""
+    """Let neighboring Gaussians vote to repair directions: a Gaussian copies the direction that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)
     tolerance: float = 1e-3
-    """Largest error that storage may add to any cosine."""
+    """Largest error that storage may add to any cosine, > 0; larger values give smaller files."""
     storage: Storage | Literal["auto"] = "auto"
-    """How directions are stored: evidence (exact), float16, or low_rank (coordinates in a basis). auto: the smallest
-    within the tolerance."""
+    """Storage format of directions. evidence: exact. float16: half-precision vectors. low_rank: coordinates in a basis.
+    auto: the smallest format within --tolerance."""
     precision: Literal["standard", "double"] = "standard"
-    """standard: float32, summed in float64 where digits cancel. double: float64 throughout, slow on a GPU."""
+    """Floating-point precision of the lift. standard: float32, with float64 sums where digits cancel. double: float64
+    throughout, slow on a GPU."""
     backend: BackendName = "auto"
-    """What rasterizes. triton: our own kernels, on a GPU. gsplat: its compiled kernels, on a GPU. numba: compiled for
-    the CPU. torch: any device, slow. auto: the fastest for the device and the precision."""
+    """Rasterization backend. triton: our own kernels, on a GPU. gsplat: gsplat's compiled kernels, on a GPU. numba:
+    compiled code for the CPU. torch: any device, slow. auto: the fastest for the device and the precision."""
     gsplat_rules: GsplatRules = "auto"
-    """Version of gsplat whose rules of drawing count, because they say which weights a scene was trained with.
-    installed: those of the gsplat on this machine. auto: those recorded with the scene, else 1.4. 1.6 is not released
-    yet; its rules may change."""
+    """gsplat version whose rasterization to reproduce, because it decides the weights that a scene was trained with.
+    installed: the gsplat version on this machine. auto: the version recorded with the scene, else 1.4. Version 1.6 is
+    not released yet and may still change."""
     reuse_evidence: bool = True
-    """Reuse cached 2D features and evidence of earlier lifts where they fit."""
+    """Reuse cached 2D features and evidence of earlier lifts if they match."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Configs of version 0.1 call `storage` `form`, and know no consensus."""
-        known = {"storage" if name == "form" else name: value for name, value in state.items()}
-        vars(self).update({"consensus": False, **known})
+        """Read configs of version 0.1, which call `storage` `form` and have no consensus."""
+        options = {"storage" if name == "form" else name: value for name, value in state.items()}
+        vars(self).update({"consensus": False, **options})
 
 
 @dataclass(frozen=True)
 class AskOptions:
-    """How texts are compared with the scene, and what counts as found.
+    """Comparison of prompts with the scene, and selection of Gaussians.
 
     Raises:
-        ValueError: a value of another type or out of its range, an empty text.
+        ValueError: A value has the wrong type or is out of range, or a prompt is empty.
     """
 
     negatives: tuple[str, ...] | None = None
-    """Texts to compare with. By default as the encoder says: LERF's (object, things, stuff, texture) for networks, none
-    for colour."""
+    """Negative prompts to compare with. Default: set by the encoder. Networks use LERF's (object, things, stuff,
+    texture), colour uses none."""
     rule: Rule | Literal["auto"] = "auto"
-    """How relevancy is computed. cosine: the cosine itself. lerf: against each negative. margin: above the best
-    negative. auto: as the encoder says, which is lerf with negatives, else cosine."""
+    """Relevancy formula. cosine: the cosine itself. lerf: the softmax against each negative, at its minimum. margin:
+    the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
-    """Relevancy above which a Gaussian is selected. auto: what the histogram of the relevancies suggests. By default
-    as the encoder says, else 0.5 for lerf, 0.02 for margin, and auto for cosines; of the colour encoder 0.5."""
+    """Relevancy above which a Gaussian is selected; larger values select fewer. auto: suggested by the histogram of
+    relevancies. Default: set by the encoder (0.5 for colour), else 0.5 for lerf, 0.02 for margin and auto for
+    cosine."""
     min_reliability: float = 0.0
-    """Minimum reliability of a selected Gaussian, in 0..1."""
+    """Minimum reliability of selected Gaussians, in 0..1; larger values drop Gaussians that few views support."""
     refined: bool = True
-    """Use refined features."""
+    """Use the directions after the vote. False: the directions of the lift alone."""
     text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with."""
+    """NPZ file with one vector per prompt, used instead of the encoder that lifted the run."""
     text_template: str | None = None
-    """What a network reads for a text, which takes the place of {}, such as "a photo of a {}". ensemble: the mean of
-    seven templates of OpenCLIP. By default as the run was lifted."""
+    """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
+    mean over seven OpenCLIP templates. Default: the template of the lift."""
 
     def __post_init__(self) -> None:
         check_options(self)
         check_texts("negatives", self.negatives or ())
 
     def rules(self) -> dict[str, Any]:
-        """As `LiftedRun.ask` takes them: all but what says who reads the texts."""
+        """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""
         return {name: value for name, value in vars(self).items() if not name.startswith("text_")}

@@ -129,9 +129,9 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
 
 def test_texts_and_devices_that_can_and_that_cannot_be():
     for texts, fact in (
-        (["a", ""], "text 2 of 2 of queries"),
+        (["a", ""], "prompt 2 of 2 in queries"),
         ([" \n\t"], "empty"),
-        (["a", "b", "a"], "text 3 of 3 of queries, 'a'"),
+        (["a", "b", "a"], "prompt 3 of 3 in queries, 'a'"),
         (["a\0"], "character"),
         (["\udc80"], "character"),
         (["x" * (LONGEST_TEXT + 1)], f"10,001 characters; give at most {LONGEST_TEXT:,}"),

@@ -1,4 +1,4 @@
-"""ns-normlift-batch: ns-normlift for many captures, by one worker or several."""
+"""ns-normlift-batch: run ns-normlift for many captures, with one or several workers."""
 
 from __future__ import annotations
 
@@ -20,41 +20,42 @@ from normlift_ns.scripts.shared import CONSOLE, run_command, run_process, say
 
 @dataclass
 class NormLiftBatch:
-    """Lift many captures, each in a process of its own; several workers may share the list. What is lifted already
-    with the same options is skipped, so that a rerun does only what is missing."""
+    """Lift many captures, each in its own process; several workers may share the list. A rerun skips captures that
+    were lifted with the same options."""
 
     captures: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURES")]
-    """Text file, one capture per line: the config.yml of a run, a PLY file or a checkpoint of gsplat, and perhaps
-    options of ns-normlift for that one."""
+    """Text file with one capture per line: the config.yml of a run, a PLY file or a gsplat checkpoint. Options of
+    ns-normlift for this capture may follow."""
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS]")] = ()
-    """After --: options of ns-normlift for all captures."""
+    """Options of ns-normlift for all captures, after --."""
     results: Path | None = None
-    """Folder of results, logs and claims, which the workers share. By default <name of the list>_batch beside it."""
+    """Folder of results, logs and claims, which all workers share. Default: <name of the list>_batch next to the
+    list."""
     shard: str = "auto"
-    """Which part of the list is this worker's. i/n: the i-th of n parts. auto: by SLURM_ARRAY_TASK_ID or by RANK and
-    WORLD_SIZE where they are set, else as none. none: every capture that no other worker has claimed."""
+    """Part of the list for this worker. i/n: the i-th of n parts. auto: from SLURM_ARRAY_TASK_ID or from RANK and
+    WORLD_SIZE if they are set, else none. none: every capture that no other worker has claimed."""
     patience: float = 120.0
-    """Seconds without a sign of life after which the capture of another worker is taken over; the same for all
-    workers."""
+    """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400; use the same value
+    for all workers. Larger values tolerate longer pauses but delay the takeover."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def main(self) -> None:
-        """Lifts, and shows what came of it.
+        """Lift the captures and print the results.
 
         Raises:
-            SystemExit: a capture failed; with the largest exit code.
+            SystemExit: A capture failed; the exit code is the largest of all captures.
         """
         readable_file(self.captures, "ns-normlift-batch")
-        part = make_shard(self.shard, os.environ)
-        listed = read_captures(self.captures, self.options)
-        captures = [capture for position, capture in enumerate(listed) if part.holds(position)]
+        shard = make_shard(self.shard, os.environ)
+        all_captures = read_captures(self.captures, self.options)
+        captures = [capture for index, capture in enumerate(all_captures) if shard.holds(index)]
         folder = self.results or self.captures.with_name(f"{self.captures.stem}_batch")
         writable_folder(folder, "--results")
-        number = f"{len(listed)} capture{'' if len(listed) == 1 else 's'}"
-        which = "" if part.count == 1 else f", {len(captures)} of them in part {part.index + 1} of {part.count}"
-        say(f"{number} in {self.captures}{which}; results, logs and claims in {folder}")
+        count = f"{len(all_captures)} capture{'' if len(all_captures) == 1 else 's'}"
+        part = "" if shard.count == 1 else f", {len(captures)} of them in part {shard.index + 1} of {shard.count}"
+        say(f"{count} in {self.captures}{part}; results, logs and claims in {folder}")
         outcomes = work(captures, folder, self.patience, say=say)
         if len(captures) > 0:
             CONSOLE.print(summary(captures, outcomes))
@@ -65,10 +66,10 @@ class NormLiftBatch:
 
 
 def entrypoint() -> None:
-    """ns-normlift-batch, in a process that goes on."""
+    """Run ns-normlift-batch in a process that continues afterwards."""
     run_command(NormLiftBatch)
 
 
 def main() -> None:
-    """Entry point of ns-normlift-batch."""
+    """Run ns-normlift-batch as a process."""
     run_process(NormLiftBatch)

@@ -1,4 +1,4 @@
-"""ns-normlift-check: whether a lift will work, and what it will take, before anything is paid for."""
+"""ns-normlift-check: check a capture and estimate the cost of a lift before running it."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ if TYPE_CHECKING:
     from normlift_ns.planning.findings import Finding
     from normlift_ns.planning.plan import Plan
 
-_Found = TypeVar("_Found")
+_Result = TypeVar("_Result")
 
 
 @dataclass
 class NormLiftCheck(NormLift):
-    """Check a capture and this machine before a lift: takes the options of ns-normlift, and lifts nothing. Looks at a
-    few photographs for real, and tells the seconds of every stage, memory and disk. Exit code 1: something is wrong."""
+    """Check a capture and this machine before a lift, with the options of ns-normlift, without lifting. Encodes a few
+    images to estimate the seconds of every stage, memory and disk. The exit code is 1 if there is an error."""
 
     json: Path | None = None
-    """Write what was found, and the plan, into this file too."""
+    """JSON file to which to also write the findings and the plan."""
     dry_run: tyro.conf.Suppress[bool] = True
 
     def main(self) -> None:
-        """Checks, and shows what was found.
+        """Check the capture and print the findings.
 
         Raises:
-            SystemExit: something is wrong; with exit code 1.
+            SystemExit: There is an error; the exit code is 1.
         """
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         if self.json is not None:
             writable_file(self.json, "--json")
             refuse_existing(self.json, overwrite=self.overwrite, instead="--json")
-        rows, plan = self._rows(begun)
+        rows, plan = self._rows(start_time)
         _show(rows, plan)
         if self.json is not None:
             write_text(self.json, _to_json(rows, plan), overwrite=self.overwrite)
         if any(row.state == "error" for row in rows):
             raise SystemExit(1)
 
-    def _rows(self, begun: float) -> tuple[list[Finding], Plan | None]:
-        """Everything that was found, up to what could not be looked at because of an error, and the plan."""
+    def _rows(self, start_time: float) -> tuple[list[Finding], Plan | None]:
+        """Return all findings up to the first error that prevents further checks, and the plan if nothing failed."""
         rows: list[Finding] = []
-        if _tried(rows, "options", lambda: (self.check_early(),)) is None:
+        if _try(rows, "options", lambda: (self.check_early(),)) is None:
             return rows, None
         from normlift_ns.core.gpu import choose_device, wake  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.encoders.build import make_source  # noqa: PLC0415
@@ -65,16 +65,16 @@ class NormLiftCheck(NormLift):
         from normlift_ns.scripts.planned import compared, open_capture, planned  # noqa: PLC0415
 
         rows.append(findings.of_versions())
-        device = _tried(rows, "device", lambda: choose_device(self.device))
+        device = _try(rows, "device", lambda: choose_device(self.device))
         if device is None:
             return rows, None
         wake(device)
         rows.append(findings.of_device(device))
-        asked = self.source.looking_for(self.queries)
-        source = _tried(rows, "2D features", lambda: make_source(asked, device))
-        missing = [] if source is None else findings.missing_weights(asked, device)
+        options = self.source.looking_for(self.queries)
+        source = _try(rows, "2D features", lambda: make_source(options, device))
+        missing = [] if source is None else findings.missing_weights(options, device)
         rows += [] if source is None else [findings.of_weights(missing)]
-        opened = _tried(rows, "capture", lambda: open_capture(self, begun))
+        opened = _try(rows, "capture", lambda: open_capture(self, start_time))
         if opened is None:
             return rows, None
         scene = opened.scene
@@ -83,41 +83,45 @@ class NormLiftCheck(NormLift):
         rows += [Finding("photographs", "warning", remark) for remark in scene.remarks]
         rows.append(findings.of_views(scene))
         if self.check:
-            warning = _tried(rows, "cameras", lambda: (compared(self, opened, device),))
+            warning = _try(rows, "cameras", lambda: (compared(self, opened, device),))
             if warning == (None,):
-                rows.append(Finding("cameras", "ok", "three photographs look like renders from their cameras"))
+                rows.append(Finding("cameras", "ok", "three images match renders from their cameras"))
             elif warning is not None:
                 rows.append(Finding("cameras", "warning", str(warning[0])))
         if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
             return rows, None
-        plan = _tried(rows, "plan", lambda: planned(self, opened, source, device))
+        plan = _try(rows, "plan", lambda: planned(self, opened, source, device))
         if plan is not None:
             rows += [*findings.of_memory(plan, device), findings.of_disk(plan, opened.run_dir)]
         return rows, plan
 
 
-def _tried(rows: list[Finding], what: str, look: Callable[[], _Found]) -> _Found | None:
-    """What was found; None, with a row that says why, where there is an error of the user's.
+def _try(rows: list[Finding], name: str, function: Callable[[], _Result]) -> _Result | None:
+    """Call a function; if it raises a user error, add an error row and return None.
 
+    Args:
+        rows: Findings so far.
+        name: Name of the row.
+        function: The check.
     Raises:
-        Exception: a mistake of ours.
+        Exception: Internal errors of the function.
     """
     from normlift_ns.planning.findings import Finding  # noqa: PLC0415
 
     try:
-        return look()
-    except Exception as error:  # each is told in its row
+        return function()
+    except Exception as error:
         if not isinstance(error, (ValueError, OSError, MemoryError)):
             raise
         message, code = explain(error)
         if code == OURS:
             raise
-        rows.append(Finding(what, "error", message))
+        rows.append(Finding(name, "error", message))
         return None
 
 
 def _show(rows: list[Finding], plan: Plan | None) -> None:
-    table = Table("", "", "found", "what to do")
+    table = Table("", "", "result", "what to do")
     colors = {"ok": "green", "warning": "yellow", "error": "red"}
     for row in rows:
         table.add_row(plain(row.what), Text(row.state, style=colors[row.state]), plain(row.found), plain(row.advice))
@@ -141,10 +145,10 @@ def _to_json(rows: list[Finding], plan: Plan | None) -> str:
 
 
 def entrypoint() -> None:
-    """ns-normlift-check, in a process that goes on."""
+    """Run ns-normlift-check in a process that continues afterwards."""
     run_command(NormLiftCheck)
 
 
 def main() -> None:
-    """Entry point of ns-normlift-check."""
+    """Run ns-normlift-check as a process."""
     run_process(NormLiftCheck)

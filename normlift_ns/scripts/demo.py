@@ -1,4 +1,4 @@
-"""make demo: a small room, made in code, lifted and asked, with its ground truth beside the answers."""
+"""make demo: generate a small room, lift it, query it, and compare the answers with the ground truth."""
 
 from __future__ import annotations
 
@@ -27,69 +27,69 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-TEXTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
-REGIONS = 700
-"""Superpixels of a view: small enough that the green star of a tomato has its own."""
-ASK = AskOptions(threshold="auto")
+_PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
+_REGION_COUNT = 700
+"""Superpixels per view: small enough to separate the green star of a tomato."""
+_ASK_OPTIONS = AskOptions(threshold="auto")
 _COMPILE = "import torch; from normlift_ns.raster.numba import warm; warm(torch.float32).join()"
 
 
 @dataclass
 class Demo:
-    """Make a room and a trained run of it, lift it with ns-normlift and search it for things by their names."""
+    """Generate a room with a trained run, lift it with ns-normlift, and search it for objects by name."""
 
     folder: Path = Path("demo")
-    """Where everything is written; files of the same names are replaced."""
+    """Output folder; existing files of the demo are replaced."""
     num_gaussians: int = 45_000
-    """Size of the room, at least 2,000."""
+    """Number of Gaussians in the room, at least 2,000; larger values give finer surfaces and take longer."""
     views: int = 24
-    """Number of training views, at least 3."""
+    """Number of training views, at least 3; more views take longer."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def main(self) -> dict[str, float]:
-        """Runs the demo; returns mIoU before and after refinement."""
+        """Run the demo and return the mIoU before and after refinement."""
         writable_folder(self.folder, "--folder")
-        CONSOLE.rule("A room made in code")
-        for category in (FutureWarning, SyntaxWarning):  # of packages that others must mend
+        CONSOLE.rule("Generating a room")
+        for category in (FutureWarning, SyntaxWarning):  # from dependencies
             warnings.simplefilter("ignore", category)
-        # Kernels that no cache holds are compiled on another core meanwhile.
+        # Meanwhile, another core compiles the kernels that are not cached.
         compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
         from normlift_ns.demo import demo_room, write_capture, write_splatfacto_run  # noqa: PLC0415
         from normlift_ns.observing import spread  # noqa: PLC0415
 
         room = demo_room(self.num_gaussians)
         with patch("nerfstudio.utils.misc.torch_compile", lambda: lambda function: function):
-            # Nothing is trained, so nothing needs torch's compiler, which takes 2 s to import. The rest takes 8.
+            # Without training, torch's compiler is not needed; it takes 2 of 10 s to import.
             import_module("normlift_ns.method_configs.normlift")
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
         compiling.wait()
 
-        CONSOLE.rule("Lifting it")
-        flags = ("--encoder", "colour", "--region-count", REGIONS)
-        _show("ns-normlift", "--load-config", config, *flags, "--queries", *TEXTS)
-        source = SourceOptions(encoder="colour", region_count=REGIONS)
-        run = NormLift(config, source=source, queries=TEXTS, timestamp="demo", overwrite=True).main()
-        assert run is not None  # there is one process
+        CONSOLE.rule("Lifting")
+        flags = ("--encoder", "colour", "--region-count", _REGION_COUNT)
+        _show("ns-normlift", "--load-config", config, *flags, "--queries", *_PROMPTS)
+        source = SourceOptions(encoder="colour", region_count=_REGION_COUNT)
+        run = NormLift(config, source=source, queries=_PROMPTS, timestamp="demo", overwrite=True).main()
+        assert run is not None  # this is the only process
 
-        CONSOLE.rule("Searching it")
-        pictures, answers = self.folder / "pictures", self.folder / "answers.json"
-        flags = ("--threshold", "auto", "--render-dir", pictures, "--json", answers)
-        _show("ns-normlift-query", "--load-config", run.config, "--text", *TEXTS, *flags)
-        NormLiftQuery(run.config, TEXTS, ask=ASK, render_dir=pictures, json=answers, overwrite=True).main()
+        CONSOLE.rule("Searching")
+        renders, answers = self.folder / "pictures", self.folder / "answers.json"
+        flags = ("--threshold", "auto", "--render-dir", renders, "--json", answers)
+        _show("ns-normlift-query", "--load-config", run.config, "--text", *_PROMPTS, *flags)
+        NormLiftQuery(run.config, _PROMPTS, ask=_ASK_OPTIONS, render_dir=renders, json=answers, overwrite=True).main()
         middle = f"{spread(self.views, 3)[1]:04d}"
-        side_by_side(
-            [pictures / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(TEXTS[:3])], pictures
+        _join_images(
+            [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(_PROMPTS[:3])], renders
         )
 
-        CONSOLE.rule("Comparing it with the truth")
+        CONSOLE.rule("Comparing with the ground truth")
         scores = {}
         for name, refined in (("before refinement", False), ("after refinement", True)):
             answer = run.ask(*room.names, refined=refined)
-            found = answer.relevancy.argmax(dim=1).where(answer.valid, -1)
-            scores[name] = iou_per_class(found, room.labels, len(room.names))
+            classes = answer.relevancy.argmax(dim=1).where(answer.valid, -1)
+            scores[name] = iou_per_class(classes, room.labels, len(room.names))
         table = Table("class", *scores, title="IoU over the Gaussians of each class")
         for i, name in enumerate(room.names):
             table.add_row(name, *(f"{values[i]:.3f}" for values in scores.values()))
@@ -98,13 +98,13 @@ class Demo:
         table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
         CONSOLE.print(table)
         write_text(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
-        say(f"Pictures are in {pictures}. Look around in the browser with:")
+        say(f"Renders are in {renders}. To explore the room in the browser, type:")
         say(shlex.join(("ns-normlift-view", "--load-config", str(run.config))))
         return means
 
 
-def side_by_side(paths: list[Path], folder: Path) -> None:
-    """Joins pictures of one height into overview.png."""
+def _join_images(paths: list[Path], folder: Path) -> None:
+    """Join images of the same height into overview.png."""
     from PIL import Image  # noqa: PLC0415
 
     images = [Image.open(path).convert("RGB") for path in paths]
@@ -117,13 +117,13 @@ def side_by_side(paths: list[Path], folder: Path) -> None:
         joined.save(draft, compress_level=1)
 
 
-def iou_per_class(found: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:
-    """Intersection over union of each class, over the Gaussians whose class is known (truth >= 0)."""
+def iou_per_class(predicted: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:
+    """Return the IoU of each class over the Gaussians whose class is known (truth >= 0)."""
     import torch  # noqa: PLC0415
 
     known = truth >= 0
-    found, truth = found[known], truth[known]
-    ious = [((found == c) & (truth == c)).sum() / ((found == c) | (truth == c)).sum() for c in range(classes)]
+    predicted, truth = predicted[known], truth[known]
+    ious = [((predicted == c) & (truth == c)).sum() / ((predicted == c) | (truth == c)).sum() for c in range(classes)]
     return torch.stack(ious)
 
 

@@ -1,6 +1,6 @@
-"""Mistakes that can be told before torch and nerfstudio are imported, so that they cost no more than a moment.
+"""Checks of options and files that run before the slow import of torch and nerfstudio.
 
-Every check here is made again by what uses the file; what it says is the same in other words.
+The code that uses a file checks it again.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ _LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "defa
 
 
 def readable_file(path: Path | None, flag: str) -> None:
-    """Raises FileNotFoundError, or InputError for anything but a regular file."""
+    """Raise FileNotFoundError if the path is missing, or InputError if it is not a regular file."""
     if path is None:
         return
     mode = _mode(path, flag)
     if not stat.S_ISREG(mode):
-        what = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
-        raise InputError(f"{path}, given with {flag}, is {what}; give a file")
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise InputError(f"{path}, given with {flag}, is {kind}; give a file")
     _check_access(path, flag)
 
 
 def readable_folder(path: Path | None, flag: str) -> None:
-    """Raises FileNotFoundError, or InputError for anything but a folder."""
+    """Raise FileNotFoundError if the path is missing, or InputError if it is not a folder."""
     if path is None:
         return
     if not stat.S_ISDIR(_mode(path, flag)):
-        raise InputError(f"{path}, given with {flag}, is no folder; give the folder of the files")
+        raise InputError(f"{path}, given with {flag}, is not a folder; give the folder that contains the files")
     _check_access(path, flag)
 
 
@@ -53,30 +53,30 @@ def _mode(path: Path, flag: str) -> int:
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
-        link = " (a link that leads nowhere)" if path.is_symlink() else ""
+        link = " (a broken link)" if path.is_symlink() else ""
         raise FileNotFoundError(f"{path}{link}, given with {flag}, does not exist; check the path") from None
-    except OSError as error:  # a link to itself, a name that is too long, a folder that may not be searched
+    except OSError as error:  # a link to itself, a name that is too long, a folder without search permission
         raise OSError(f"{shown(str(path))}, given with {flag}, cannot be opened: {error.strerror}") from None
 
 
 def _check_access(path: Path, flag: str) -> None:
     if not os.access(path, os.R_OK):
-        raise PermissionError(f"{path}, given with {flag}, may not be read; change its rights")
+        raise PermissionError(f"{path}, given with {flag}, is not readable; change its permissions")
 
 
 def writable_file(path: Path | None, flag: str) -> None:
-    """Raises InputError or OSError where a file cannot be written; the folders above need not exist."""
+    """Raise InputError or OSError if a file cannot be written; its parent folders need not exist."""
     if path is None:
         return
     if path.name == "":
-        raise InputError(f"{path}, given with {flag}, is the name of a folder; give that of a file")
+        raise InputError(f"{path}, given with {flag}, is the name of a folder; give a file name")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}, given with {flag}, is there and is no file; give another name")
+        raise InputError(f"{path}, given with {flag}, exists and is not a regular file; give another name")
     writable_folder(path.parent, flag)
 
 
 def writable_folder(path: Path | None, flag: str) -> None:
-    """Raises InputError or OSError where nothing can be written into a folder; it need not exist."""
+    """Raise InputError or OSError if a folder cannot be written; it need not exist."""
     if path is None:
         return
     for parent in (path, *path.absolute().parents):
@@ -85,38 +85,46 @@ def writable_folder(path: Path | None, flag: str) -> None:
         except FileNotFoundError:
             if not parent.is_symlink():
                 continue
-            raise InputError(
-                f"{parent}, named with {flag}, is a link that leads nowhere; give another folder"
-            ) from None
+            raise InputError(f"{parent}, named with {flag}, is a broken link; give another folder") from None
         except NotADirectoryError:
-            continue  # a file is further above
+            continue  # one of the parents is a file
         except OSError as error:
             raise OSError(f"{shown(str(path))}, named with {flag}, cannot be opened: {error.strerror}") from None
         if not stat.S_ISDIR(mode):
-            raise InputError(f"{parent}, named with {flag}, is no folder; give another place")
+            raise InputError(f"{parent}, named with {flag}, is not a folder; give another path")
         if not os.access(parent, os.W_OK | os.X_OK):
-            raise PermissionError(f"{parent}, named with {flag}, may not be written; choose another folder")
+            raise PermissionError(f"{parent}, named with {flag}, is not writable; give another folder")
         return
 
 
 def different(**paths: Path | None) -> None:
-    """Raises InputError where two flags name one file."""
-    seen: dict[str, str] = {}
+    """Raise InputError if two flags name the same file."""
+    names: dict[str, str] = {}
     for name, path in paths.items():
-        place = None if path is None else os.path.realpath(path)
-        if place is not None and place in seen:
-            raise InputError(f"--{seen[place]} and --{name.replace('_', '-')} name the same file, {path}")
-        if place is not None:
-            seen[place] = name.replace("_", "-")
+        target = None if path is None else os.path.realpath(path)
+        if target is not None and target in names:
+            raise InputError(f"--{names[target]} and --{name.replace('_', '-')} name the same file, {path}")
+        if target is not None:
+            names[target] = name.replace("_", "-")
 
 
 def check_config(config: Path, data: Path | None, step: int | None = None, *, wrote: str = "ns-train") -> None:
-    """A config.yml that can be opened, its dataset, and its checkpoint where a step is named."""
+    """Check a config.yml, its dataset and its checkpoint.
+
+    Args:
+        config: Path of the config.
+        data: Current path of the dataset, if it was moved.
+        step: Training step of the checkpoint; None: any.
+        wrote: Command that wrote the config, for messages.
+    Raises:
+        FileNotFoundError: The config, the dataset or the checkpoint is missing.
+        InputError: The file is not a nerfstudio config.
+    """
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
-        clean(run_dir.parent)  # a lift that was killed while it replaced the run
+        clean(run_dir.parent)  # finish a replacement of the run that was killed
     if not config.is_file():
-        hint = f"; {config / 'config.yml'} exists, give that" if (config / "config.yml").is_file() else ""
+        hint = f"; {config / 'config.yml'} exists, give that path" if (config / "config.yml").is_file() else ""
         method = "splatfacto" if wrote == "ns-train" else "normlift"
         raise FileNotFoundError(
             f"No config at {config}{hint}. Expected the config.yml that {wrote} wrote, for example "
@@ -125,25 +133,27 @@ def check_config(config: Path, data: Path | None, step: int | None = None, *, wr
     _check_access(config, "--load-config")
     if data is not None and not data.exists():
         raise FileNotFoundError(
-            f"There is no dataset at {data}, given with --data. Expected the folder or the transforms.json that "
-            "ns-train got."
+            f"No dataset at {data}, given with --data. Expected the folder or the transforms.json that "
+            "ns-train was run with."
         )
-    seen = glance(config)
-    own = data is not None or (run_dir / "splat.json").is_file()  # a lifted splat says itself where photographs are
-    if not own and len(seen.data) > 0 and not any(place.exists() for place in seen.data):
+    paths = glance(config)
+    located = data is not None or (run_dir / "splat.json").is_file()  # a lifted splat stores its image paths
+    if not located and len(paths.data) > 0 and not any(path.exists() for path in paths.data):
         raise FileNotFoundError(
-            f"The dataset of {config} is not at {' nor at '.join(map(str, seen.data[:2]))}. If it was moved, say "
-            "where it is with --data."
+            f"The dataset of {config} is not at {' nor at '.join(map(str, paths.data[:2]))}. If it was moved, give its "
+            "new path with --data."
         )
     checkpoints = run_dir / "nerfstudio_models"
-    wanted = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
-    if checkpoints.is_dir() and not any(checkpoints.glob(wanted)):
-        there = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
-        raise FileNotFoundError(f"No checkpoint {wanted} in {checkpoints}; there is {there}. Copy it there again.")
+    pattern = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
+    if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
+        files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
+        raise FileNotFoundError(
+            f"No checkpoint {pattern} in {checkpoints}, which contains {files}. Copy it there again."
+        )
 
 
 def check_lifted(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
-    """A lifted run, and what is needed to ask it texts."""
+    """Check a lifted run, and with `ask` also its text encoder."""
     check_config(config, data, wrote="ns-normlift")
     folder = field_folder(Path(os.path.abspath(config)).parent)
     if ask is None:
@@ -152,41 +162,41 @@ def check_lifted(config: Path, data: Path | None, ask: AskOptions | None = None)
     stored = _encoder_of(folder)
     if ask.text_vectors is None and stored.get("text_vectors") is None:
         names = texts_cache(folder.parent)
-        if not (names.is_dir() and any(names.iterdir())):  # perhaps the texts are there
-            _check_stored(stored)
+        if not (names.is_dir() and any(names.iterdir())):  # the cache may contain the prompts
+            _check_stored_encoder(stored)
 
 
-def _check_stored(stored: dict[str, Any]) -> None:
-    """The encoder of a manifest, where it is one that is known here."""
-    from normlift_ns.encoders.kinds import known_kind  # noqa: PLC0415 (--help does without)
+def _check_stored_encoder(stored: dict[str, Any]) -> None:
+    """Check the encoder options of a manifest if the encoder is installed."""
+    from normlift_ns.encoders.kinds import known_kind  # noqa: PLC0415 (not needed for --help)
 
     kind = known_kind(stored.get("encoder"))
     try:
         options = SourceOptions(**stored)
-    except (TypeError, ValueError):  # which shows when the run is opened
+    except (TypeError, ValueError):  # reported when the run is opened
         return
     if kind is not None:
         kind.check(options)
 
 
 def _encoder_of(folder: Path) -> dict[str, Any]:
-    """The encoder of the manifest; nothing where it is damaged, which shows when it is opened."""
+    """Return the encoder options of a manifest; empty if it is damaged, which is reported when the run is opened."""
     try:
-        found = json.loads((folder / "manifest.json").read_text("utf8")).get("encoder")
+        encoder = json.loads((folder / "manifest.json").read_text("utf8")).get("encoder")
     except (OSError, ValueError, RecursionError, AttributeError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return encoder if isinstance(encoder, dict) else {}
 
 
 def has_question(config: Path) -> bool:
-    """Whether a lifted run stores texts."""
+    """Return whether a lifted run stores queries."""
     return (Path(os.path.abspath(config)).parent / FIELD_FOLDER / "queries.safetensors").exists()
 
 
 def check_new_run(
     config: Path | None, splat: SplatOptions, output_dir: Path | None, timestamp: str | None, overwrite: bool
 ) -> None:
-    """The place of a new run: it can be written, and no other run is there."""
+    """Raise if the directory of a new run cannot be written, or if another run exists there."""
     writable_folder(output_dir, "--output-dir")
     name, outputs = new_run_place(config, splat, output_dir)
     run_dir = run_directory(outputs or Path(), name or "run", timestamp)
@@ -198,28 +208,27 @@ def check_new_run(
 
 
 def new_run_place(config: Path | None, splat: SplatOptions, output_dir: Path | None) -> tuple[str | None, Path | None]:
-    """Name of the capture and folder above its runs, as `run_directory` takes them; None where they show only when the
-    capture is opened.
+    """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
 
     Raises:
-        InputError, OSError: the config cannot be read, or is none.
+        InputError, OSError: The config is invalid or cannot be read.
     """
     if config is not None:
-        seen = glance(config)
-        return seen.experiment, output_dir or seen.output_dir
+        paths = glance(config)
+        return paths.experiment, output_dir or paths.output_dir
     cameras = (splat.colmap or splat.transforms or Path()).absolute()
     name = (cameras.parent if cameras.suffix == ".json" else cameras).name
     return name or "splat", output_dir or Path("outputs")
 
 
 def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:
-    """A splat without a run, and its cameras and photographs."""
+    """Check a splat without a nerfstudio run, its cameras and its images."""
     readable_file(ply, "--load-ply")
     readable_file(gsplat, "--load-gsplat")
     if (splat.colmap is None) == (splat.transforms is None):
         count = "none" if splat.colmap is None else "two"
         raise InputError(
-            f"A splat needs one file of cameras, got {count}: give the folder of a COLMAP project with --colmap, or a "
+            f"A splat needs one file of cameras, got {count}: give a COLMAP project folder with --colmap, or a "
             "transforms.json with --transforms."
         )
     readable_folder(splat.colmap, "--colmap")
@@ -231,24 +240,24 @@ def check_splat(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> N
 
 
 def check_effect(lift: LiftOptions) -> None:
-    """Raises ValueError for options of something that is switched off."""
-    usual = LiftOptions()
+    """Raise InputError for options that have no effect because their step is off."""
+    default = LiftOptions()
     for name in ("consensus_power", "consensus_sample", "consensus_least"):
-        if not lift.consensus and getattr(lift, name) != getattr(usual, name):
+        if not lift.consensus and getattr(lift, name) != getattr(default, name):
             raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Set that, or leave it out.")
-    if lift.vote.vote != "posterior" and lift.vote.prior != usual.vote.prior:
+    if lift.vote.vote != "posterior" and lift.vote.prior != default.vote.prior:
         raise InputError("--prior is for --vote posterior. Set that, or leave it out.")
 
 
-def check_source(source: SourceOptions, queries: Iterable[str], data: Path | None = None) -> None:
-    """What the 2D features are made of: folders, weights, levels, texts."""
-    from normlift_ns.encoders.kinds import encoder_kind  # noqa: PLC0415 (--help does without)
+def check_source(source: SourceOptions, queries: Iterable[str]) -> None:
+    """Check the folders, weights, levels and prompts of 2D features."""
+    from normlift_ns.encoders.kinds import encoder_kind  # noqa: PLC0415 (not needed for --help)
     from normlift_ns.encoders.weights import is_path  # noqa: PLC0415
 
     texts = tuple(queries)
     check_texts("queries", texts)
     if source.regions == "sam3" and len(source.looking_for(texts).region_texts) == 0:
-        raise InputError('regions "sam3" are what texts find: name them with --queries, such as --queries mug plate')
+        raise InputError('regions "sam3" need prompts: give them with --queries, such as --queries mug plate')
     readable_folder(source.regions_dir, "--regions-dir")
     readable_folder(source.features_dir, "--features-dir")
     readable_file(source.text_vectors, "--text-vectors")
@@ -266,11 +275,12 @@ def check_source(source: SourceOptions, queries: Iterable[str], data: Path | Non
         _mode(Path(source.sam_model), "--sam-model")
     if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
         raise InputError(
-            f"--text-template {shown(source.text_template)} has no {{}}, which the text takes the place of"
+            f"--text-template {shown(source.text_template)} has no {{}} for the prompt; give a template such as "
+            '"a photo of a {}"'
         )
-    asked = source.features == "none" or (len(texts) > 0 and source.text_vectors is None)
-    kind = encoder_kind(source.encoder)
-    if asked:
+    needed = source.features == "none" or (len(texts) > 0 and source.text_vectors is None)
+    kind = encoder_kind(source.encoder)  # raises for an unknown encoder
+    if needed:
         kind.check(source)
 
 
@@ -279,10 +289,10 @@ def _check_level(level: str | None, kind: str) -> None:
         return
     if kind == "files":
         if not (level.isascii() and level.isdigit()):
-            raise InputError(f"--level of --regions files is the number of a map, 0, 1, ...; got {shown(level)}")
+            raise InputError(f"--level must be the number of a map, 0, 1, ..., for --regions files; got {shown(level)}")
         return
-    known = _LEVELS.get(kind, ())
-    if len(known) == 0:
+    levels = _LEVELS.get(kind, ())
+    if len(levels) == 0:
         raise InputError(f'--level {shown(level)} is for --regions files or sam, not for "{kind}"; leave it out')
-    if level not in known:
-        raise InputError(f"--level must be one of {', '.join(known)} for {kind}, got {shown(level)}")
+    if level not in levels:
+        raise InputError(f"--level must be one of {', '.join(levels)} for {kind}, got {shown(level)}")

@@ -1,4 +1,4 @@
-"""ns-normlift-eval: score lifted runs by published protocols, or against instance masks of any capture."""
+"""ns-normlift-eval: score lifted runs by published protocols or against instance masks."""
 
 from __future__ import annotations
 
@@ -23,42 +23,42 @@ if TYPE_CHECKING:
     from normlift_ns.evaluation.studies import Evaluate, Row
 
 _WITH_FIGURE = ("sweeps", "signals")
-"""Studies that are drawn."""
+"""Studies with a figure."""
 _WITHOUT_TRUTH = ("coverage", "timing")
-"""Studies that need no truth."""
+"""Studies that need no ground truth."""
 
 
 @dataclass
 class NormLiftEval:
-    """Evaluate lifted runs: a table, and a JSON file in the shape of ns-eval's."""
+    """Evaluate lifted runs. Prints a table and writes a JSON file in the format of ns-eval."""
 
     load_config: tuple[Path, ...]
     """Paths to config YAML files of lifted runs, one per scene."""
     protocol: Literal["scannet", "lerf", "masks", "none"] = "none"
-    """scannet: 3D, one Gaussian per labelled vertex. lerf: 2D, polygons of LERF-OVS. masks: instance masks of any
-    capture, 3D and 2D. none: no truth and no score, for --study coverage and timing."""
+    """Evaluation protocol. scannet: 3D, one Gaussian per labeled vertex. lerf: 2D, polygons of LERF-OVS. masks:
+    instance masks of any capture, 3D and 2D. none: no ground truth and no scores, for --study coverage and timing."""
     labels: tuple[Path, ...] = ()
-    """Truth of every run, in the same order. scannet: *_vh_clean_2.labels.ply; lerf: folder of JSON files; masks:
-    folder of masks; none: nothing."""
+    """Ground truth of every run, in the order of --load-config. scannet: *_vh_clean_2.labels.ply file. lerf: folder of
+    JSON files. masks: folder of masks. none: leave out."""
     output_path: Path = Path("output.json")
-    """Name of the output file."""
+    """Path of the output file."""
     overwrite: bool = False
-    """Replace the output file and the figures beside it."""
+    """Replace an existing output file and the figures next to it."""
     refined: bool = True
-    """Evaluate the refined directions."""
+    """Evaluate the directions after the vote. False: the directions of the lift alone."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
-    """What to measure besides. ablation: the variants of the refinement, with and without consensus. sweeps: every
-    parameter of the vote around the run's own, with the default. signals: Gaussians without evidence, accuracy by R and
-    by norm, R against opacity. timing: what lifting took and, on a GPU, what SFS's way takes, 512 channels through
-    gsplat. baselines: the ideas of SFS, Occam's LGS, VALA and Dr.Splat on the features of the run, in our
-    implementation. coverage: regions without reliable evidence, photographs left out of the lift that would help, and
-    new poses, drawn and as a camera path. Holds all runs in memory."""
+    """Additional measurements, which hold all runs in memory. ablation: variants of the refinement, with and without
+    consensus. sweeps: every vote parameter around its value in the run, and its default. signals: Gaussians without
+    evidence, accuracy by R and by norm, R against opacity. timing: seconds of the lift and, on a GPU, of SFS's method
+    (512 channels through gsplat). baselines: the ideas of SFS, Occam's LGS, VALA and Dr.Splat, in our implementation
+    on the features of the run. coverage: regions without reliable evidence, unused images that would help, and new
+    poses, as renders and as a camera path."""
     text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look names up in instead of the encoder that the runs were lifted with."""
+    """NPZ file with one vector per class name, used instead of the encoder that lifted the runs."""
     data: Path | None = None
-    """Where the dataset is now, if it was moved; for one run."""
+    """Current path of the dataset, if it was moved; for a single run."""
     device: str = "auto"
-    """auto, cpu or cuda: where the text encoder and --study run."""
+    """Device for the text encoder and --study: auto, cpu or cuda."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
@@ -67,7 +67,7 @@ class NormLiftEval:
         check_options(self)
 
     def main(self) -> Evaluation:
-        """Evaluates, writes and prints."""
+        """Evaluate the runs, write the output file and print the tables."""
         self._check()
         say_opening(*self.load_config)
         from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
@@ -83,46 +83,46 @@ class NormLiftEval:
         device = choose_device(self.device)
         names: list[tuple[str, str]] = []
 
-        def evaluated(config: Path) -> EvaluatedRun:
+        def load(config: Path) -> EvaluatedRun:
             run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
             names.append((run.scene.name, str(run.scene.checkpoint_path)))
-            texts = cast(Any, None) if self.protocol == "none" else run.texts  # nothing is asked then
+            texts = cast(Any, None) if self.protocol == "none" else run.texts  # no encoder is needed without prompts
             return EvaluatedRun(run.scene, run.field, texts, self.refined, cache_folder(run.folder))
 
-        # Scenes are large: one is held at a time, unless they are studied.
-        runs: Iterable[EvaluatedRun] = (evaluated(config) for config in self.load_config)
+        # Scenes are large: only studies hold more than one in memory.
+        runs: Iterable[EvaluatedRun] = (load(config) for config in self.load_config)
         if self.study or self.protocol == "masks":
             runs = list(runs)
         evaluate, measure_signals = self._protocol(runs)
-        evaluation, studies, posed = evaluate(runs), {}, ((), ())
+        evaluation, studies, poses = evaluate(runs), {}, ((), ())
         for name in self.study:
-            held = list(runs)
+            loaded = list(runs)
             if name == "signals":
-                studies[name] = measure_signals(held)
+                studies[name] = measure_signals(loaded)
             elif name == "timing":
-                studies[name] = timing(held, device, say)
+                studies[name] = timing(loaded, device, say)
             elif name == "baselines":
-                studies[name] = baselines(held, evaluate, device)
+                studies[name] = baselines(loaded, evaluate, device)
             elif name == "coverage":
-                seen = coverage_of(held[0].scene, held[0].field, device=device)
-                studies[name] = [seen.to_json()]
-                posed = seen.poses, seen.pictures
+                coverage = coverage_of(loaded[0].scene, loaded[0].field, device=device)
+                studies[name] = [coverage.to_json()]
+                poses = coverage.poses, coverage.pictures
             elif name == "ablation":
-                studies[name] = study_ablation(held, evaluate, device, say)
+                studies[name] = study_ablation(loaded, evaluate, device, say)
             else:
-                studies[name] = study_votes(held, evaluate, sweeps, device)
+                studies[name] = study_votes(loaded, evaluate, sweeps, device)
         experiments, checkpoints = (", ".join(values) for values in zip(*names))
         write_evaluation(
             self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
             studies=studies, overwrite=self.overwrite,
         )  # fmt: skip
         written = [self.output_path, *self._plots(studies, evaluation.results)]
-        written += write_poses(self._coverage, *posed, overwrite=self.overwrite)
+        written += write_poses(self._coverage_stem, *poses, overwrite=self.overwrite)
         if len(evaluation.results) > 0:
             CONSOLE.print(rows_table(evaluation.rows))
             if len(evaluation.scenes) > 1:
                 CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
-            CONSOLE.print(results_table(evaluation))
+            CONSOLE.print(_results_table(evaluation))
         for name, rows in studies.items():
             if name == "coverage":
                 for part in ("regions", "photographs", "poses"):
@@ -135,14 +135,14 @@ class NormLiftEval:
         return evaluation
 
     def _check(self) -> None:
-        """Raises what can be told before anything is loaded."""
+        """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
         if self.protocol == "none":
             self._check_without_truth()
         elif len(self.load_config) == 0 or len(self.load_config) != len(self.labels):
             raise InputError(
-                f"{len(self.load_config)} runs and {len(self.labels)} --labels were given; give one for each run, in "
-                "the same order"
+                f"got {len(self.load_config)} runs and {len(self.labels)} --labels; give one --labels path for each "
+                "run, in the same order"
             )
         if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
             raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
@@ -155,42 +155,42 @@ class NormLiftEval:
             (readable_file if self.protocol == "scannet" else readable_folder)(labels, "--labels")
         readable_file(self.masks.names, "--names")
         figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
-        figures += pose_files(self._coverage) if "coverage" in self.study else []
+        figures += pose_files(self._coverage_stem) if "coverage" in self.study else []
         refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
         for path in (self.output_path, *figures):
             writable_file(path, "--output-path")
 
     def _check_without_truth(self) -> None:
-        """What only studies can tell."""
+        """Raise InputError unless the options fit a study without ground truth."""
         others = [name for name in self.study if name not in _WITHOUT_TRUTH]
         if len(self.load_config) == 0 or len(self.study) == 0 or len(others) > 0 or len(self.labels) > 0:
             raise InputError(
-                f"protocol none takes runs (--load-config), no --labels, and --study {' or '.join(_WITHOUT_TRUTH)}; "
-                "for all else, name the protocol that scores them"
+                f"protocol none needs --load-config and --study {' or '.join(_WITHOUT_TRUTH)}, without --labels; for "
+                "other studies and for scores, give another --protocol"
             )
 
     def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
-        """How to score runs, and how to measure the signals of R."""
+        """Return a function that scores runs, and one that measures the signals of R."""
         from normlift_ns.evaluation import protocols, studies  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.results import Evaluation  # noqa: PLC0415
 
         if self.protocol == "none":
-            return lambda some: Evaluation({}, [], {"protocol": "none"}), lambda some: []
+            return lambda runs: Evaluation({}, [], {"protocol": "none"}), lambda runs: []
         if self.protocol == "scannet":
-            given = {"labels": self.labels, "options": self.scannet}
-            return partial(protocols.run_scannet, **given), partial(studies.scannet_signals, **given)
+            kwargs = {"labels": self.labels, "options": self.scannet}
+            return partial(protocols.run_scannet, **kwargs), partial(studies.scannet_signals, **kwargs)
         if self.protocol == "lerf":
             evaluate = partial(protocols.run_lerf, labels=self.labels, options=self.lerf)
             return evaluate, partial(studies.plain_signals, labels=self.labels)
         run = next(iter(runs))
         truth = protocols.mask_truth(run.scene, self.labels[0], self.masks, settings=run.settings)
         return (
-            lambda some: protocols.run_masks(next(iter(some)), truth),
-            lambda some: studies.mask_signals(some[0], truth),
+            lambda runs: protocols.run_masks(next(iter(runs)), truth),
+            lambda runs: studies.mask_signals(runs[0], truth),
         )
 
     def _plots(self, studies: Mapping[str, list[Row]], results: Mapping[str, float]) -> Iterator[Path]:
-        """Figures beside the output file; sweeps are of the first result."""
+        """Draw the figures next to the output file and yield their paths; sweeps show the first result."""
         from normlift_ns.evaluation.plots import plot_signals, plot_sweeps  # noqa: PLC0415
 
         metric, result = next(iter(results.items()), ("", 0.0))
@@ -205,16 +205,16 @@ class NormLiftEval:
             yield path
 
     @property
-    def _coverage(self) -> Path:
-        """How names of files of the study of coverage begin."""
+    def _coverage_stem(self) -> Path:
+        """Common beginning of the paths of the coverage study."""
         return self.output_path.with_name(f"{self.output_path.stem}_coverage")
 
     def _figure(self, study: str) -> Path:
         return self.output_path.with_name(f"{self.output_path.stem}_{study}.svg")
 
 
-def results_table(evaluation: Evaluation) -> Table:
-    """The means."""
+def _results_table(evaluation: Evaluation) -> Table:
+    """Return a table of the mean results."""
     table = Table("metric", "value", title=f"Protocol {evaluation.settings['protocol']}")
     for name, value in evaluation.results.items():
         table.add_row(name, f"{value:.4f}")
@@ -222,7 +222,7 @@ def results_table(evaluation: Evaluation) -> Table:
 
 
 def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
-    """One row per class, with scene or frame where there are several; or per vote."""
+    """Return a table of rows, for example one per class, frame or vote variant."""
     table = Table(*(Column(plain(name), overflow="fold") for name in (rows[0] if len(rows) > 0 else ())), title=title)
     for row in rows:
         table.add_row(*(f"{x:.3f}" if isinstance(x, float) else plain(x) for x in row.values()))
@@ -230,17 +230,17 @@ def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
 
 
 def _short(number: int, row: Row) -> Row:
-    """A numbered row of the study of coverage, without what only programs need."""
-    found: dict[str, Any] = {"": number}
+    """Return a numbered row of the coverage study, without values that only programs need."""
+    shown: dict[str, Any] = {"": number}
     for name, value in row.items():
         if name not in ("box", "camera_to_world", "lifted_reliability"):
-            numbers = isinstance(value, list) and all(isinstance(x, float) for x in value)
-            found[name] = " ".join(f"{x:.2f}" for x in value) if numbers else value
-    return found
+            is_vector = isinstance(value, list) and all(isinstance(x, float) for x in value)
+            shown[name] = " ".join(f"{x:.2f}" for x in value) if is_vector else value
+    return shown
 
 
 def signals_table(rows: Sequence[Row]) -> Table:
-    """One column per scene."""
+    """Return a table of signals with one column per scene."""
     scenes = (Column(plain(row.get("scene", "value")), overflow="fold") for row in rows)
     table = Table("signal", *scenes, title="signals")
     for name in (key for key in rows[0] if key != "scene"):
@@ -250,12 +250,12 @@ def signals_table(rows: Sequence[Row]) -> Table:
 
 
 def entrypoint() -> None:
-    """ns-normlift-eval, in a process that goes on."""
+    """Run ns-normlift-eval in a process that continues afterwards."""
     run_command(NormLiftEval)
 
 
 def main() -> None:
-    """Entry point of ns-normlift-eval."""
+    """Run ns-normlift-eval as a process."""
     run_process(NormLiftEval)
 
 

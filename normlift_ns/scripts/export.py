@@ -1,4 +1,4 @@
-"""ns-normlift-export: a lifted run as a PLY file of Gaussians and a table of objects."""
+"""ns-normlift-export: write a lifted run as a PLY file of Gaussians and a table of objects."""
 
 from __future__ import annotations
 
@@ -19,69 +19,70 @@ from normlift_ns.scripts.shared import CONSOLE, plain, run_command, run_process,
 
 @dataclass
 class NormLiftExport:
-    """Write a lifted run, what a query selects in it, or the scene without that, for other splat tools."""
+    """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
     output_dir: Path
-    """Folder to write to; made if missing."""
+    """Output folder, created if missing."""
     text: tuple[str, ...] = ()
-    """What to look for. By default the queries stored in the run, with the options stored with them."""
+    """Prompts to search for. Default: the queries stored in the run, with their stored options."""
     part: Literal["scene", "selection", "rest", "clean"] = "scene"
-    """scene: all Gaussians. selection: what any of the texts selects. rest: the scene without that. clean: the scene
-    without likely floaters, Gaussians that hang free before the cameras."""
+    """Gaussians to export. scene: all. selection: those that any prompt selects. rest: all others. clean: all except
+    likely floaters, which are Gaussians floating in front of the cameras."""
     ask: AskOptions = field(default_factory=AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the PLY file. The number of each Gaussian in the run goes to <name>_rows.npy, what class_id and
-    instance_id mean to <name>_names.json, the objects to <name>_objects.json."""
+    """Name of the PLY file. <name>_rows.npy has the index of each Gaussian in the run, <name>_names.json the names of
+    class_id and instance_id values, and <name>_objects.json the objects."""
     masks_dir: Path | None = None
-    """Write masks of every training photograph into this folder, as PNG: 255 where it shows what the texts select,
-    else 0. With --part rest the other way round. Lens distortion is taken out, as the scene was trained."""
+    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --part rest,
+    the values are swapped. Masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
-    """Write the Gaussians of the PLY file as arrays into this folder: coord.npy, segment.npy and instance.npy, in which
-    -1 is ignored, and names.json."""
+    """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
+    Gaussians) and names.json."""
     transfer: Path | None = None
-    """Point cloud or mesh (PLY) to label: <name of the cloud>_labels.ply is the same with class_id, instance_id and
-    relevancies of the Gaussian whose centre is nearest, of those that are ever drawn; 0 where it is too far."""
+    """PLY point cloud or mesh to label. <name of the cloud>_labels.ply is a copy with the class_id, instance_id and
+    relevancies of the nearest visible Gaussian; 0 if none is near enough."""
     transfer_distance: float = TRANSFER_DISTANCE
-    """For --transfer: how far a point may be from the centre of its Gaussian, in units of the median distance from a
-    Gaussian to the nearest one at another place."""
+    """Largest distance from a point to the center of its Gaussian for --transfer, > 0; larger values label more points.
+    In units of the median distance from a Gaussian to the nearest one at another position."""
     transfer_coordinates: Literal["capture", "scene"] = "capture"
-    """For --transfer: those of the cloud. capture: of the cameras before nerfstudio turned and scaled them. scene: of
-    the Gaussians, as in exported files."""
+    """Coordinates of the cloud for --transfer. capture: the cameras' coordinates before nerfstudio rotated and scaled
+    them. scene: the Gaussians' coordinates, as in exported files."""
     reach: float = REACH
-    """Gaussians of one object are at most this far apart, in units of the selection's median spacing."""
+    """Largest gap between Gaussians of one object, in units of the selection's median spacing, > 0; larger values merge
+    more objects."""
     min_size: int = MIN_SIZE
-    """Least number of Gaussians of an object."""
+    """Smallest number of Gaussians in an object, at least 1; larger values list fewer objects."""
     floater_limit: float = FLOATER_LIMIT
-    """Score above which a Gaussian is a likely floater, for --part clean. Higher: fewer are left out."""
+    """Score above which a Gaussian counts as a floater for --part clean; larger values leave out fewer Gaussians."""
     overwrite: bool = False
-    """Replace files of these names."""
+    """Replace existing files of the same names."""
     data: Path | None = None
-    """Where the dataset is now, if it was moved."""
+    """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Where the text encoder runs: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu or cuda."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def main(self) -> Path:
-        """Writes the files; returns the path of the PLY file."""
+        """Write the files and return the path of the PLY file."""
         check_device(self.device)
         check_texts("text", self.text)
         check_lifted(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
         if self.part in ("selection", "rest") and len(self.text) == 0 and not has_question(self.load_config):
-            raise InputError(f"--part {self.part} needs something to look for: give --text, the run stores no queries.")
+            raise InputError(f"--part {self.part} needs prompts, and the run stores no queries; give --text")
         name = Path(self.output_filename).name
         if name == "":
             raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
         target = self.output_dir / name
-        ends = ("rows.npy", "names.json", "objects.json")
-        files = (target, *(target.with_name(f"{target.stem}_{name}") for name in ends))
+        suffixes = ("rows.npy", "names.json", "objects.json")
+        files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
         refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
         for file in files:
             writable_file(file, "--output-dir")
-        self._check_beside(files)
+        self._check_extras(files)
         say_opening(self.load_config)
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.objects.instances import tabulate  # noqa: PLC0415
@@ -101,11 +102,11 @@ class NormLiftExport:
         if self.masks_dir is not None:
             refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, instead="--masks-dir")
         answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
-        part = None if answer is None or self.part == "scene" else answer.mask
-        part = ~part if part is not None and self.part == "rest" else part
+        mask = None if answer is None or self.part == "scene" else answer.mask
+        mask = ~mask if mask is not None and self.part == "rest" else mask
         if self.part == "clean":
             floaters = run.floaters(self.floater_limit).mask
-            part = ~floaters
+            mask = ~floaters
             say(f"{int(floaters.sum()):,} likely floaters are left out")
         objects: dict[str, Any] | None = None
         instances = None
@@ -119,10 +120,10 @@ class NormLiftExport:
                 "min_reliability": question.min_reliability,
             }
             if cloud is not None:  # before anything is written
-                texts = range(len(objects["queries"]))
-                check_free(cloud, ("class_id", "instance_id", *(f"relevancy_{i}" for i in texts)))
+                count = len(objects["queries"])
+                check_free(cloud, ("class_id", "instance_id", *(f"relevancy_{i}" for i in range(count))))
         rows = run.export(
-            target, part, answer=answer, objects=objects, reach=self.reach, min_size=self.min_size,
+            target, mask, answer=answer, objects=objects, reach=self.reach, min_size=self.min_size,
             overwrite=self.overwrite,
         )  # fmt: skip
         say(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}")
@@ -132,51 +133,54 @@ class NormLiftExport:
             if self.arrays_dir is not None:
                 beside.arrays(run, instances, rows, self.arrays_dir, overwrite=self.overwrite)
             if cloud is not None:
-                reach, given = self.transfer_distance, self.transfer_coordinates
-                beside.transfer(run, answer, instances, cloud, self._labelled, reach, given, overwrite=self.overwrite)
+                limit, coordinates, path = self.transfer_distance, self.transfer_coordinates, self._labeled_cloud
+                beside.transfer(run, answer, instances, cloud, path, limit, coordinates, overwrite=self.overwrite)
         if objects is not None:
-            CONSOLE.print(_table(objects["queries"]))
+            CONSOLE.print(_objects_table(objects["queries"]))
         return target
 
     @property
-    def _labelled(self) -> Path:
-        """The cloud with its labels."""
+    def _labeled_cloud(self) -> Path:
+        """Path of the labeled point cloud."""
         return self.output_dir / f"{Path() if self.transfer is None else self.transfer.stem}_labels.ply"
 
-    def _check_beside(self, files: Sequence[Path]) -> None:
-        """Raises what can be told of masks, arrays and clouds before anything is loaded."""
+    def _check_extras(self, files: Sequence[Path]) -> None:
+        """Raise errors about masks, arrays and point clouds that can be detected before anything is loaded."""
         for name in ("masks_dir", "arrays_dir", "transfer"):
             if getattr(self, name) is None:
                 continue
             flag = f"--{name.replace('_', '-')}"
             if len(self.text) == 0 and not has_question(self.load_config):
-                raise InputError(f"{flag} needs something to look for: give --text, the run stores no queries.")
+                raise InputError(f"{flag} needs prompts, and the run stores no queries; give --text")
             if name != "transfer":
                 writable_folder(getattr(self, name), flag)
         if self.masks_dir is not None and self.part == "clean":
-            raise InputError("--masks-dir is of what the texts select, or with --part rest of all else; not of clean")
+            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
         if self.arrays_dir is not None:
-            found = [self.arrays_dir / name for name in ARRAY_FILES]
-            refuse_existing(*found, overwrite=self.overwrite, instead="--arrays-dir")
+            paths = [self.arrays_dir / name for name in ARRAY_FILES]
+            refuse_existing(*paths, overwrite=self.overwrite, instead="--arrays-dir")
         if self.transfer is not None:
             readable_file(self.transfer, "--transfer")
-            if self._labelled in files:
-                raise InputError(f"{self._labelled} would be the splat and the labelled cloud; --output-filename")
-            writable_file(self._labelled, "--output-dir")
-            refuse_existing(self._labelled, overwrite=self.overwrite, instead="--output-dir")
+            path = self._labeled_cloud
+            if path in files:
+                raise InputError(
+                    f"{path} would be both the splat and the labeled cloud; give another --output-filename"
+                )
+            writable_file(path, "--output-dir")
+            refuse_existing(path, overwrite=self.overwrite, instead="--output-dir")
 
 
-def _table(tables: list[dict[str, Any]]) -> Table:
+def _objects_table(queries: list[dict[str, Any]]) -> Table:
     table = Table("text", "object", title="Objects, in scene units")
-    for name in ("Gaussians", "centroid", "size of the box", "mean reliability"):
+    for name in ("Gaussians", "centroid", "box size", "mean reliability"):
         table.add_column(name, justify="right", overflow="fold")
-    for entry in tables:
-        for i, found in enumerate(entry["objects"]):
-            box = found["box"]
-            sides = (high - low for low, high in zip(box["min"], box["max"]))
-            vectors = (" ".join(f"{x:.2f}" for x in row) for row in (found["centroid"], sides))
-            numbers = (f"{found['size']:,}", *vectors, f"{found['mean_reliability']:.3f}")
-            table.add_row(plain(entry["text"] if i == 0 else ""), str(found["instance_id"]), *numbers)
+    for entry in queries:
+        for i, item in enumerate(entry["objects"]):
+            box = item["box"]
+            sizes = (high - low for low, high in zip(box["min"], box["max"]))
+            vectors = (" ".join(f"{x:.2f}" for x in vector) for vector in (item["centroid"], sizes))
+            numbers = (f"{item['size']:,}", *vectors, f"{item['mean_reliability']:.3f}")
+            table.add_row(plain(entry["text"] if i == 0 else ""), str(item["instance_id"]), *numbers)
         table.add_row(
             plain("" if entry["objects"] else entry["text"]), "smaller", f"{entry['in_smaller_parts']:,}", "", "", ""
         )
@@ -184,12 +188,12 @@ def _table(tables: list[dict[str, Any]]) -> Table:
 
 
 def entrypoint() -> None:
-    """ns-normlift-export, in a process that goes on."""
+    """Run ns-normlift-export in a process that continues afterwards."""
     run_command(NormLiftExport)
 
 
 def main() -> None:
-    """Entry point of ns-normlift-export."""
+    """Run ns-normlift-export as a process."""
     run_process(NormLiftExport)
 
 

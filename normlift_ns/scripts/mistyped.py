@@ -1,4 +1,4 @@
-"""Flags that tyro cannot read: its box on standard error becomes one line, like every other error."""
+"""One-line messages for command-line errors, in place of the boxes that tyro draws on standard error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from normlift_ns.errors import InputError
 
 _CORNERS = ("╭", "┏")
-_WORDS = (
+_REWRITES = (
     (r"Error parsing (--\S+): no type matching \S+ could be instantiated from \[(.*)\]\.", r"\1 cannot be \2."),
     (r"Error parsing (--\S+): (?:invalid literal|could not convert).*?: ('.*')$", r"\1 cannot be \2."),
     (r"Error parsing \S+: (?=--)", r""),
@@ -27,47 +27,47 @@ _WORDS = (
     (r"^ {3,}(--\S+ \S.*)\n +", r"\1: "),
     (r"For full helptext, (?:run|see):?\s+(\S.*?) --help", r"\n\nAll options: \1 --help"),
 )
-"""What it says, and how it is said here; a version that says it otherwise is quoted."""
+"""tyro's phrases and their replacements; the phrases of other tyro versions stay as they are."""
 
 
 @contextmanager
 def plain_errors(program: str) -> Iterator[None]:
-    """Raises InputError where tyro draws a box on standard error and ends the process. Warnings are printed afterwards.
+    """Raise InputError where tyro would draw a box on standard error and exit; print warnings afterwards.
 
     Args:
-        program: as tyro calls the command; it is named without its folder.
+        program: Program name that tyro prints; messages show it without its folder.
     """
-    told, columns = io.StringIO(), os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "1000"  # so that no line is broken
+    stderr, columns = io.StringIO(), os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "1000"  # keeps tyro from wrapping lines
     try:
-        with redirect_stderr(told):
+        with redirect_stderr(stderr):
             yield
-        sys.stderr.write(told.getvalue())
+        sys.stderr.write(stderr.getvalue())
     except SystemExit as stop:
         if stop.code in (None, 0):
             raise
-        raise InputError(_plain(told.getvalue(), program)) from None
+        raise InputError(_unboxed(stderr.getvalue(), program)) from None
     finally:
         os.environ.pop("COLUMNS")
         if columns is not None:
             os.environ["COLUMNS"] = columns
 
 
-def _plain(told: str, program: str) -> str:
-    r"""The text in the box; where the output knows no such lines, below a dashed one.
+def _unboxed(stderr: str, program: str) -> str:
+    r"""Return the text inside tyro's box, or below its dashed line if the terminal has no box characters.
 
-    >>> print(_plain("╭─ Missing ─╮\n│ Missing value for argument '--k'. Expected 1 values. │\n╰─────╯", "/bin/x"))
+    >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--k'. Expected 1 values. │\n╰─────╯", "/bin/x"))
     --k needs a value.
-    >>> print(_plain(" Missing\n -----\n  Missing value for argument '--k'. Expected 1 values.\n", "/bin/x"))
+    >>> print(_unboxed(" Missing\n -----\n  Missing value for argument '--k'. Expected 1 values.\n", "/bin/x"))
     --k needs a value.
     """
-    told = re.sub(r"\x1b\[[\d;]*m", "", told)  # colours of a terminal
-    lines = told.splitlines()
-    lines = lines[1:-1] if told.startswith(_CORNERS) else lines[2:]
+    stderr = re.sub(r"\x1b\[[\d;]*m", "", stderr)  # terminal colors
+    lines = stderr.splitlines()
+    lines = lines[1:-1] if stderr.startswith(_CORNERS) else lines[2:]
     lines = [line.strip("│┃").removeprefix(" ").rstrip(" ─━") for line in lines]
     text = "\n".join("" if set(line) <= set(" -") else line for line in lines)
     text = text.replace(program, Path(program).name)
-    for said, plain in _WORDS:
-        text = re.sub(said, plain, text, flags=re.MULTILINE)
+    for pattern, replacement in _REWRITES:
+        text = re.sub(pattern, replacement, text, flags=re.MULTILINE)
     parts = [" ".join(part.split()) for part in text.split("\n\n")]
     return " ".join(part if part.endswith((".", ":", "--help")) else f"{part}." for part in parts if part)

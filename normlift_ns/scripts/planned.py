@@ -1,4 +1,4 @@
-"""ns-normlift --dry-run: what a lift will take, from a short look at its capture."""
+"""ns-normlift --dry-run: time, memory and disk that a lift needs, estimated from a few images."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from normlift_ns.raster.settings import RasterSettings
 from normlift_ns.runs.files import cache_folder, run_directory
 from normlift_ns.scenes.match import judge, match_photographs
 from normlift_ns.scenes.opening import SplatScene
-from normlift_ns.scripts.shared import STAGES, say
+from normlift_ns.scripts.shared import say
 
 
 class Command(Protocol):
-    """ns-normlift, as far as a plan asks it."""
+    """Options of ns-normlift that a plan needs."""
 
     data: Path | None
     load_step: int | None
@@ -40,40 +40,41 @@ class Command(Protocol):
     lift: LiftOptions
 
     def trained(self) -> Path | Scene:
-        """The run, or the capture opened."""
+        """Return the config of the run, or the opened scene."""
         ...
 
 
 class Opened(NamedTuple):
-    """A capture that is ready to be looked at, and the seconds that it took to get so far."""
+    """An opened capture and the seconds that each stage has taken so far."""
 
     scene: Scene
     run_dir: Path
     seconds: dict[str, float]
 
 
-def open_capture(command: Command, begun: float) -> Opened:
-    """Opens what a command is about to lift.
+def open_capture(command: Command, start_time: float) -> Opened:
+    """Open the capture that a command is about to lift.
 
     Args:
-        begun: when the command began, by `time.perf_counter`.
+        command: Options of ns-normlift.
+        start_time: Start of the command by `time.perf_counter`.
     Raises:
-        FileNotFoundError, ValueError: as `open_scene` and `open_splat`.
+        FileNotFoundError, ValueError: Same as in `open_scene` and `open_splat`.
     """
-    imported = time.perf_counter()
+    import_time = time.perf_counter()
     trained = command.trained()
     scene = (
         open_scene(trained, data=command.data, load_step=command.load_step) if isinstance(trained, Path) else trained
     )
     run_dir = run_directory(command.output_dir or scene.runs_dir, scene.name, command.timestamp)
-    return Opened(scene, run_dir, {"start": imported - begun, "open": time.perf_counter() - imported})
+    return Opened(scene, run_dir, {"start": import_time - start_time, "open": time.perf_counter() - import_time})
 
 
 def compared(command: Command, opened: Opened, device: str) -> str | None:
-    """A warning where photographs and renders of three views differ; adds the seconds to those of the capture.
+    """Return a warning if images and renders of three views differ; add the time to `opened.seconds`.
 
     Raises:
-        ValueError: as `judge`.
+        ValueError: Same as in `judge`.
     """
     scene = opened.scene
     opened.seconds["kernels"] = load_kernels(scene, command.lift, device=device)
@@ -84,30 +85,33 @@ def compared(command: Command, opened: Opened, device: str) -> str | None:
 
 
 def planned(command: Command, opened: Opened, source: FeatureSource, device: str) -> Plan:
-    """The plan of a command; raises as `measure`."""
+    """Return the plan of a command; errors are those of `measure`."""
     cache = cache_folder(opened.run_dir)
-    facts = measure(opened.scene, source, command.lift, cache, device=device, before=opened.seconds)
-    return make_plan(facts, num_devices=command.num_devices)
+    measurements = measure(opened.scene, source, command.lift, cache, device=device, before=opened.seconds)
+    return make_plan(measurements, num_devices=command.num_devices)
 
 
-def dry_run(command: Command, begun: float) -> Plan:
-    """Plans what a command would do, and does nothing of it.
+def dry_run(command: Command, start_time: float) -> Plan:
+    """Return the plan of a command without lifting anything.
 
+    Args:
+        command: Options of ns-normlift.
+        start_time: Start of the command by `time.perf_counter`.
     Raises:
-        FileNotFoundError: weights of a network are not on this machine, so that its speed cannot be told.
-        FileNotFoundError, ValueError: as `open_capture`, `compared` and `measure`.
+        FileNotFoundError: Network weights are not on this machine, so the speed cannot be measured.
+        FileNotFoundError, ValueError: Same as in `open_capture`, `compared` and `measure`.
     """
     device = choose_device(command.device)
     wake(device)
-    asked = command.source.looking_for(command.queries)
-    source = make_source(asked, device)
-    missing = missing_weights(asked, device)
+    options = command.source.looking_for(command.queries)
+    source = make_source(options, device)
+    missing = missing_weights(options, device)
     if len(missing) > 0:
         raise FileNotFoundError(
-            f"A plan looks at a few photographs for real, but weights are not on this machine: {'; '.join(missing)}. "
+            f"A plan encodes a few images, but weights are not on this machine: {'; '.join(missing)}. "
             "Download them first, or give local files with --encoder-pretrained and --sam-model."
         )
-    opened = open_capture(command, begun)
+    opened = open_capture(command, start_time)
     warning = compared(command, opened, device) if command.check else None
     if warning is not None:
         say(f"Warning: {warning}")
@@ -115,15 +119,15 @@ def dry_run(command: Command, begun: float) -> Plan:
 
 
 def plan_table(plan: Plan) -> Table:
-    """The stages of a plan, their seconds and what of them is cached, and what it needs besides."""
+    """Return a table of the stages of a plan, their seconds, and what is cached."""
     title = f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}"
     table = Table("stage", title=title)
     table.add_column("seconds", justify="right")
     table.add_column("cached")
     for stage in plan.stages:
-        table.add_row(STAGES.get(stage.name, stage.name), f"{stage.seconds:.1f}", stage.remark)
+        table.add_row(stage.name, f"{stage.seconds:.1f}", stage.remark)
     table.add_section()
-    table.add_row("total", f"{plan.seconds:.1f}", f"from a look at {_views(plan.looked_at)}")
+    table.add_row("total", f"{plan.seconds:.1f}", f"estimated from {_views(plan.looked_at)}")
     return table
 
 
@@ -132,9 +136,9 @@ def _views(count: int) -> str:
 
 
 def needs(plan: Plan) -> str:
-    """Memory and disk of a plan, in one sentence."""
+    """Return the memory and disk needs of a plan as a sentence."""
     gpu = "" if plan.device_bytes is None else f"{plan.device_bytes / 2**30:.2f} GiB on each GPU, "
-    each = "Each" if plan.num_devices > 1 else "It"
-    share = f"{plan.num_devices} processes share the work. " if plan.num_devices > 1 else ""
-    room = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
-    return f"{share}{each} needs about {gpu}{room}."
+    subject = "Each" if plan.num_devices > 1 else "The lift"
+    processes = f"{plan.num_devices} processes share the work. " if plan.num_devices > 1 else ""
+    space = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
+    return f"{processes}{subject} needs about {gpu}{space}."

@@ -1,4 +1,4 @@
-"""ns-normlift-query: ask a lifted run."""
+"""ns-normlift-query: search a lifted run with text prompts."""
 
 from __future__ import annotations
 
@@ -26,65 +26,64 @@ if TYPE_CHECKING:
 
 @dataclass
 class NormLiftQuery:
-    """Search a lifted run with text: a table of what is found, and files on request."""
+    """Search a lifted run with text prompts. Prints a table of the results and writes files on request."""
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
     text: tuple[str, ...] = ()
-    """What to look for, one or several texts: --text mug 'red bowl'. A text may contain commas."""
+    """One or several prompts to search for: --text mug 'red bowl'. A prompt may contain commas."""
     ask: AskOptions = field(default_factory=AskOptions)
     interactive: bool = False
-    """Ask text after text at a prompt; the run stays open."""
+    """Read prompts from the terminal, one after another, while the run stays open."""
     stdin: bool = False
-    """Ask every line of the standard input, and print the answer to each as one line of JSON."""
+    """Read one prompt per line from standard input, and print each answer as one line of JSON."""
     history: bool = True
-    """Keep what is asked at the prompt, in a file that only you can read."""
+    """Keep a history of --interactive prompts in a file that only you can read."""
     save: bool = False
-    """Store the queries in the run, in place of earlier ones. ns-render and ns-viewer then draw the answer."""
+    """Store the queries in the run, replacing earlier ones. ns-render and ns-viewer then render their relevancy."""
     json: Path | None = None
-    """Write the table to this file."""
+    """JSON file to write the table to."""
     output_path: Path | None = None
-    """Write relevancy [N, Q], reliability [N], valid [N] and names to this .npz file."""
+    """NPZ file to write relevancy [N, Q], reliability [N], valid [N] and names to, for N Gaussians and Q prompts."""
     render_dir: Path | None = None
-    """Write pictures of the relevancy into this folder."""
+    """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
-    """Training images from whose cameras to render, such as 0001 0042. By default three of them, evenly spread."""
+    """Training images whose cameras to render from, such as 0001 0042. Default: three evenly spaced images."""
     why: bool = False
-    """Say which photographs and regions voted for what is selected, and how far they agree."""
+    """List the images and regions that voted for the selection, and how well they agree."""
     why_dir: Path | None = None
-    """With --why: write those photographs, with the outlines of the regions that voted, into this folder."""
+    """Folder for the images of --why, with outlines of the regions that voted."""
     segment: Literal["sam3"] | None = None
-    """Ask SAM 3 for the texts too, in some training views, and lift its masks: relevancy, agreement between views and
-    reliability beside the answer of the run."""
+    """Also segment some training views with SAM 3 and lift its masks. The table then has their relevancy, their
+    agreement between views and their reliability."""
     segment_model: str | None = None
-    """Weights of SAM 3: a folder in the format of transformers, or a name to download. By default facebook/sam3."""
+    """Weights of SAM 3: a folder in transformers format, or a name to download. Default: facebook/sam3."""
     segment_views: int = 8
-    """Training views to ask SAM 3 in, at most, evenly spread."""
+    """Largest number of evenly spaced training views for --segment, at least 1; more views are slower and more
+    reliable."""
     objects: bool = False
-    """List the objects of what is selected, connected parts of 20 Gaussians or more. id: number, the instance_id of
-    ns-normlift-export. text: the one of largest relevancy. Gaussians: how many. centroid: mean place, weighted by what
-    the views saw. box: lengths of the edges of the oriented box, the longest first. extent: size along x, y and z. Box
-    and extent reach from the 1st to the 99th percentile. R: mean reliability. views: training photographs that show at
-    least a tenth of what the best one does. best views: three that show it whole and large. In units of the
-    capture."""
+    """List the objects in the selection: connected groups of at least 20 Gaussians. id: instance_id in exports. text:
+    prompt with the largest relevancy. Gaussians: their number. centroid: mean position, weighted by evidence. box: edge
+    lengths of the oriented box, longest first. extent: size along x, y and z. Both span the 1st to 99th percentile. R:
+    mean reliability. views: training images that show at least a tenth as much of the object as the best one. best
+    views: three images that show it whole and large. Lengths are in capture units."""
     objects_dir: Path | None = None
-    """With --objects: write the list into this folder, with the axes of the boxes, in the coordinates of the capture
-    and in those of the Gaussians: objects.json, objects.csv, and boxes as meshes, objects.ply and objects_scene.ply.
-    docs/objects.md explains every column."""
+    """Folder for the list of --objects with box axes, in capture and scene coordinates: objects.json, objects.csv, and
+    boxes as meshes (objects.ply, objects_scene.ply). docs/objects.md explains every column."""
     metres_per_unit: float | None = None
-    """With --objects: length of one unit of the capture, so that places and sizes in it are in metres."""
+    """Length of one capture unit in meters for --objects, > 0; positions and sizes are then in meters."""
     overwrite: bool = False
-    """Replace files of these names."""
+    """Replace existing files of the same names."""
     data: Path | None = None
-    """Where the dataset is now, if it was moved."""
+    """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Where the text encoder runs: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu or cuda."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def main(self) -> list[dict[str, Any]]:
-        """Asks, writes and prints; returns the rows of the table."""
+        """Run the query, write files, print the table and return its rows."""
         self._check()
         say_opening(self.load_config)
         from normlift_ns.runs.question import save_question  # noqa: PLC0415 (--help should not wait for NumPy)
@@ -97,54 +96,55 @@ class NormLiftQuery:
         if self.interactive:
             converse(run, self.ask.rules(), keep_history=self.history)
             return []
-        found = run.ask(self.text, **self.ask.rules())
-        pictured = self._pictured(found.question) if self.render_dir is not None else None
-        rows = found.summarize()
-        tell = self._explain(found, rows) if self.why else None
-        segmented = self._segment(found, rows) if self.segment is not None else {}
-        tell_objects = self._list_objects(found.question) if self.objects else None
+        result = run.ask(self.text, **self.ask.rules())
+        save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
+        rows = result.summarize()
+        show_why = self._explain(result, rows) if self.why else None
+        sam3_arrays = self._segment(result, rows) if self.segment is not None else {}
+        show_objects = self._list_objects(result.question) if self.objects else None
         if self.json is not None:
-            _write_json(self.json, rows, found.question, self.overwrite)
+            _write_json(self.json, rows, result.question, self.overwrite)
         if self.output_path is not None:
-            _write_arrays(self.output_path, found, segmented, self.overwrite)
-        if pictured is not None:
-            pictured()
-        stored = save_question(run.folder / FIELD_FOLDER, found.question) if self.save else None
+            _write_arrays(self.output_path, result, sam3_arrays, self.overwrite)
+        if save_renders is not None:
+            save_renders()
+        stored = save_question(run.folder / FIELD_FOLDER, result.question) if self.save else None
         folders = (self.render_dir, self.why_dir, self.objects_dir)
         written = [path for path in (self.json, self.output_path, *folders, stored) if path is not None]
-        show(rows, found.question)
+        show(rows, result.question)
         if self.segment is not None:
-            from normlift_ns.scripts.answers.segmenting import show_segments  # noqa: PLC0415 (imported by now)
+            from normlift_ns.scripts.answers.segmenting import show_segments  # noqa: PLC0415 (already imported)
 
             show_segments(self.text, [row["segment"] for row in rows])
-        for also in (tell, tell_objects):
-            if also is not None:
-                also()
+        for print_table in (show_why, show_objects):
+            if print_table is not None:
+                print_table()
         if len(written) > 0:
             say("Written: " + ", ".join(map(str, written)))
         return rows
 
     def _open(self) -> QuickRun:
-        """The run, with its scene only where its own files do not tell which that is."""
+        """Open the run; load its scene only if the files of the run lack the Gaussian centers."""
         from normlift_ns.quick import open_quick  # noqa: PLC0415 (as above)
 
         if self.device.startswith("cuda"):
             from normlift_ns.core.gpu import choose_device  # noqa: PLC0415 (--help should not wait for torch)
 
             choose_device(self.device)
-        opened = partial(
+        open_with = partial(
             open_quick, self.load_config, device=self.device, text_vectors=self.ask.text_vectors,
             text_template=self.ask.text_template,
         )  # fmt: skip
-        run = opened()
+        run = open_with()
         if run is not None:
             return run
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (as above)
 
-        return cast("QuickRun", opened(means=open_run(self.load_config, data=self.data).scene.gaussians.means.numpy()))
+        means = open_run(self.load_config, data=self.data).scene.gaussians.means.numpy()
+        return cast("QuickRun", open_with(means=means))
 
-    def _pictured(self, question: Question) -> Callable[[], list[Path]]:
-        """What draws the pictures; everything that they need is there when it is returned."""
+    def _prepare_renders(self, question: Question) -> Callable[[], list[Path]]:
+        """Load everything that renders need, and return a function that renders and saves them."""
         from normlift_ns.asking import answer  # noqa: PLC0415 (as above)
         from normlift_ns.front_door import open_run  # noqa: PLC0415
         from normlift_ns.raster.settings import RasterSettings  # noqa: PLC0415
@@ -152,43 +152,43 @@ class NormLiftQuery:
 
         run, folder = open_run(self.load_config, data=self.data), cast(Path, self.render_dir)
         cameras = training_cameras(run.scene, self.render_views)
-        found = answer(run.field, run.scene.gaussians.means, question)
+        result = answer(run.field, run.scene.gaussians.means, question)
         settings = RasterSettings.recorded(run.field.manifest)
-        return lambda: save_overlays(run.scene, found, cameras, folder, settings=settings, overwrite=self.overwrite)
+        return lambda: save_overlays(run.scene, result, cameras, folder, settings=settings, overwrite=self.overwrite)
 
-    def _explain(self, found: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Adds to every row why it is selected, and writes the pictures; returns what prints it."""
+    def _explain(self, result: QuickAnswer, rows: list[dict[str, Any]]) -> Callable[[], None]:
+        """Add an explanation to every row, write the images, and return a function that prints the explanations."""
         from normlift_ns.scripts.answers.reasons import find_reasons, save_pictures, show_reasons, to_json  # noqa: PLC0415
 
-        run, reasons = find_reasons(self.load_config, self.data, found)
+        run, reasons = find_reasons(self.load_config, self.data, result)
         for row, reason in zip(rows, reasons):
             row["why"] = to_json(run, reason)
         if self.why_dir is not None:
             save_pictures(run, self.text, reasons, self.why_dir, overwrite=self.overwrite)
         return lambda: show_reasons(run, self.text, reasons)
 
-    def _segment(self, found: QuickAnswer, rows: list[dict[str, Any]]) -> dict[str, Any]:
-        """Adds to every row what SAM 3 answers; returns its arrays."""
+    def _segment(self, result: QuickAnswer, rows: list[dict[str, Any]]) -> dict[str, Any]:
+        """Add SAM 3's answer to every row, and return its arrays."""
         from normlift_ns.scripts.answers.segmenting import ask_sam3, segment_arrays  # noqa: PLC0415 (as above)
 
-        how = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
-        answered, numbers = ask_sam3(self.load_config, self.data, found, **how)
-        for row, of_text in zip(rows, numbers):
-            row["segment"] = of_text
-        return segment_arrays(answered)
+        kwargs = {"model": self.segment_model or DEFAULT_SAM3, "views": self.segment_views, "device": self.device}
+        segmented, summaries = ask_sam3(self.load_config, self.data, result, **kwargs)
+        for row, summary in zip(rows, summaries):
+            row["segment"] = summary
+        return segment_arrays(segmented)
 
     def _list_objects(self, question: Question) -> Callable[[], None]:
-        """Finds objects, and writes their files; returns what prints them."""
+        """Find objects, write their files, and return a function that prints them."""
         from normlift_ns.objects.tables import write_catalogue  # noqa: PLC0415 (as above)
         from normlift_ns.scripts.answers.catalogue import facts, find_catalogue, show_catalogue  # noqa: PLC0415
 
-        catalogue = find_catalogue(self.load_config, self.data, question, self.metres_per_unit)
+        catalog = find_catalogue(self.load_config, self.data, question, self.metres_per_unit)
         if self.objects_dir is not None:
-            write_catalogue(catalogue, self.objects_dir, question=facts(question), overwrite=self.overwrite)
-        return lambda: show_catalogue(catalogue)
+            write_catalogue(catalog, self.objects_dir, question=facts(question), overwrite=self.overwrite)
+        return lambda: show_catalogue(catalog)
 
     def _check(self) -> None:
-        """Raises what can be told before anything is loaded."""
+        """Raise errors that can be detected before anything is loaded."""
         check_device(self.device)
         self._check_texts()
         check_lifted(self.load_config, self.data, self.ask)
@@ -203,22 +203,22 @@ class NormLiftQuery:
             writable_folder(self.objects_dir, "--objects-dir")
             files = [self.objects_dir / name for name in OBJECT_FILES]
             refuse_existing(*files, overwrite=self.overwrite, instead="--objects-dir")
-        refuse_existing(*self._pictures(), overwrite=self.overwrite, instead="--render-dir")
+        refuse_existing(*self._existing_renders(), overwrite=self.overwrite, instead="--render-dir")
 
     def _check_texts(self) -> None:
-        ways = [f"--{name}" for name in ("text", "stdin", "interactive") if getattr(self, name)]
-        if len(ways) == 0:
+        flags = [f"--{name}" for name in ("text", "stdin", "interactive") if getattr(self, name)]
+        if len(flags) == 0:
             raise InputError(
-                'no text given; name at least one thing to look for, such as --text "orange", or ask one after the '
-                "other with --interactive"
+                'no prompts given; name at least one object to search for, such as --text "orange", or enter prompts '
+                "one after another with --interactive"
             )
-        if len(ways) > 1:
-            raise InputError(f"{ways[0]} and {ways[1]} are two ways to give texts; leave one of them out")
+        if len(flags) > 1:
+            raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
         for name in ("json", "output_path", "render_dir", "save", "why", "why_dir", "segment", "objects"):
-            if ways != ["--text"] and getattr(self, name):
-                raise InputError(f"--{name.replace('_', '-')} goes with --text only; leave it out with {ways[0]}")
+            if flags != ["--text"] and getattr(self, name):
+                raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
         if len(self.render_views) > 0 and self.render_dir is None:
-            raise InputError("--render-views has no effect without --render-dir; give the folder for the pictures")
+            raise InputError("--render-views has no effect without --render-dir; give the folder for the renders")
         if self.why_dir is not None and not self.why:
             raise InputError("--why-dir has no effect without --why True; add that flag")
         for name in ("segment_model", "segment_views"):
@@ -230,12 +230,12 @@ class NormLiftQuery:
                 raise InputError(f"{flag} has no effect without --objects True; add that flag")
         if self.interactive and not sys.stdin.isatty():
             raise InputError(
-                "--interactive needs a terminal to read from; to ask the lines of a file, use --stdin True"
+                "--interactive needs a terminal to read from; to read prompts from a file, use --stdin True"
             )
         check_texts("text", self.text)
 
-    def _pictures(self) -> list[Path]:
-        """Pictures that new ones would replace: of the same texts, and of the same views where some are named."""
+    def _existing_renders(self) -> list[Path]:
+        """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""
         views = [glob.escape(Path(name).stem) for name in self.render_views] or ["*"]
         views += ["contact_sheet"] if len(views) > 1 else []
         names = [f"{view}_{i}_{file_name(text)}.png" for view in views for i, text in enumerate(self.text)]
@@ -243,30 +243,30 @@ class NormLiftQuery:
 
 
 def _write_json(path: Path, rows: list[dict[str, Any]], question: Question, overwrite: bool) -> None:
-    facts = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
-    write_text(path, json.dumps({"queries": rows, **facts}, indent=2) + "\n", overwrite=overwrite)
+    rules = {"relevancy": question.rule, "threshold": question.threshold, "negatives": list(question.negatives)}
+    write_text(path, json.dumps({"queries": rows, **rules}, indent=2) + "\n", overwrite=overwrite)
 
 
-def _write_arrays(path: Path, found: QuickAnswer, more: dict[str, Any], overwrite: bool) -> None:
+def _write_arrays(path: Path, result: QuickAnswer, extra: dict[str, Any], overwrite: bool) -> None:
     import numpy as np  # noqa: PLC0415
 
     arrays: dict[str, Any] = {
-        "relevancy": found.relevancy,
-        "reliability": found.field.arrays["reliability"],
-        "valid": found.valid,
-        **more,
+        "relevancy": result.relevancy,
+        "reliability": result.field.arrays["reliability"],
+        "valid": result.valid,
+        **extra,
     }
     with new_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
-        np.savez(file, names=np.array(found.question.texts), **arrays)
+        np.savez(file, names=np.array(result.question.texts), **arrays)
 
 
 def entrypoint() -> None:
-    """ns-normlift-query, in a process that goes on."""
+    """Run ns-normlift-query in a process that continues afterwards."""
     run_command(NormLiftQuery)
 
 
 def main() -> None:
-    """Entry point of ns-normlift-query."""
+    """Run ns-normlift-query as a process."""
     run_process(NormLiftQuery)
 
 

@@ -1,4 +1,4 @@
-"""A command whose process is one of several."""
+"""Commands that run in several processes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ if TYPE_CHECKING:
 
 @contextmanager
 def in_team(device: str) -> Iterator[Team]:
-    """The team that this process was started for, or none; of several processes the first one speaks."""
-    started_by_us = OURS in os.environ  # and whoever started it tells what becomes of it
+    """Join the processes that this one was started with, if any; only the first process prints.
+
+    Args:
+        device: cpu, cuda or auto.
+    """
+    started_by_us = OURS in os.environ  # the process that started this one reports failures
     try:
         with joined(device, say_error) as team:
             if team.rank > 0:

@@ -1,4 +1,4 @@
-"""What the commands have in common: flags with their help, text that is shown as it is, and how they end."""
+"""Shared parts of the commands: flags and help, printing, warnings, exit codes."""
 
 from __future__ import annotations
 
@@ -32,14 +32,12 @@ from normlift_ns.scripts.mistyped import plain_errors
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
-"""Results, on standard output. Nothing in a text is markup."""
-if CONSOLE.is_terminal:  # tables fit into a narrower one; pipes and files get the full width
+"""Console for results, on standard output. Markup in texts is not interpreted."""
+if CONSOLE.is_terminal:  # tables fit the terminal; pipes and files get the full width
     CONSOLE.width = min(CONSOLE.width, shutil.get_terminal_size().columns)
 ERRORS = Console(**_PLAIN, stderr=True)
-STAGES = {"neighbors": "neighbours"}
-"""Stages whose names are spelled otherwise in what people read."""
-_TERMINATED = ("Terminated", signal.SIGTERM)
-_CANNOT = "The output of the command cannot be written: {}. Send it to another place."
+
+_OUTPUT_ERROR = "The output of the command cannot be written: {}. Redirect it elsewhere."
 _PACKAGE = str(Path(normlift_ns.__file__).parent)
 
 
@@ -47,7 +45,7 @@ class Command(Protocol):
     """A command: a dataclass of its flags."""
 
     def main(self) -> object:
-        """Does it."""
+        """Run the command."""
         ...
 
 
@@ -55,36 +53,36 @@ _Command = TypeVar("_Command", bound=Command)
 
 
 class Terminated(BaseException):
-    """The system wants the process to end: SIGTERM, as before a pre-emption."""
+    """SIGTERM from the system, for example before preemption."""
 
 
 def run_command(command: type[Command]) -> None:
-    """Reads the flags in the form of nerfstudio's commands (--flag True), runs the command and ends the process.
+    """Parse flags as nerfstudio's commands do (--flag True), run the command, and exit unless it succeeds.
 
-    Exit code 1: a mistake in flags or files, a full disk or memory. 70: a mistake of ours. 130 and 143: Ctrl-C and
-    SIGTERM, after everything half-written is removed.
+    Exit codes: 1 for wrong flags or files and for a full disk or memory, 70 for internal errors, 130 for Ctrl-C and 143
+    for SIGTERM. Partial files are removed first.
     """
     streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
     for stream in streams:
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")  # a code page without the character
+            stream.reconfigure(errors="replace")  # for code pages that lack a character
     try:
         words, flags = terminal.terminal_flags(sys.argv[1:])
         with terminal.talking(flags, shlex.join(sys.argv)):
-            code = _ended(command, words)
+            code = _exit_code(command, words)
     except InputError as error:
-        code = _explained(error)
+        code = _report_error(error)
     for stream in streams:
-        code = _flushed(stream, tell=code == 0) or code
+        code = _flush(stream, report=code == 0) or code
     if code != 0:
         sys.exit(code)
 
 
 def run_process(command: type[Command]) -> NoReturn:
-    """`run_command` for a process that does nothing else, and ends at once: taking torch down takes a second.
+    """Run a command as the only task of this process, and exit without the second that torch's teardown takes.
 
-    OpenMP's threads, of torch and of compiled kernels, sleep while they wait. By default they run on without work, on
-    cores that other threads and other lifts could use. A policy that the user has set stays.
+    Idle OpenMP threads of torch and of compiled kernels sleep instead of spinning on cores that other threads and
+    other lifts could use. A policy set by the user takes precedence.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is imported
     code: Any = 0
@@ -94,29 +92,30 @@ def run_process(command: type[Command]) -> NoReturn:
         code = stop.code
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        _flushed(stream, tell=False)  # what those functions have printed
+        _flush(stream, report=False)  # the output of those functions
     os._exit(code)
 
 
-def _ended(command: type[Command], words: list[str]) -> int:
-    """Runs the command; the exit code."""
+def _exit_code(command: type[Command], words: list[str]) -> int:
+    """Run the command and return the exit code."""
     try:
-        with _terminable(), _plain_warnings(), _named_output(), named_as_flags():
-            _run(command, words)
-    except SystemExit as stop:  # tyro's own, after a help; rich's, where nobody reads the output
+        with _sigterm_raises(), _plain_warnings(), _checked_output(), named_as_flags():
+            _parse_and_run(command, words)
+    except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else USER
     except (KeyboardInterrupt, Terminated) as stop:
-        word, number = ("Interrupted", signal.SIGINT) if isinstance(stop, KeyboardInterrupt) else _TERMINATED
+        number = signal.SIGINT if isinstance(stop, KeyboardInterrupt) else signal.SIGTERM
+        word = "Interrupted" if number == signal.SIGINT else "Terminated"
         say_error(f"{word}. No partial files remain; rerun the command to resume.")
         return 128 + number
-    except Exception as error:  # whatever it is: a traceback helps no user
-        return _explained(error)
+    except Exception as error:  # a traceback would not help the user
+        return _report_error(error)
     return 0
 
 
-def _explained(error: Exception) -> int:
-    """Tells of an error; the exit code."""
-    if isinstance(error, BrokenPipeError):  # nobody reads any more
+def _report_error(error: Exception) -> int:
+    """Print an error and return the exit code."""
+    if isinstance(error, BrokenPipeError):  # the reader of the pipe has gone
         return USER
     message, code = (str(error), USER) if isinstance(error, OutputError) else explain(error)
     with suppress(OSError):
@@ -125,7 +124,7 @@ def _explained(error: Exception) -> int:
     return code
 
 
-def _run(command: type[Command], words: list[str]) -> None:
+def _parse_and_run(command: type[Command], words: list[str]) -> None:
     if "--version" in words:
         say(f"normlift_ns {normlift_ns.__version__}")
         return
@@ -134,96 +133,103 @@ def _run(command: type[Command], words: list[str]) -> None:
 
 
 def read_flags(command: type[_Command], words: Sequence[str], name: str | None = None) -> _Command:
-    """A command from the words behind its name.
+    """Parse the words after the name of a command.
 
     Args:
-        name: of the command; None: as this process was started.
+        command: Dataclass of the command.
+        words: Words of the command line.
+        name: Name of the command; None: the name that this process was started with.
     Raises:
-        InputError: words that it does not know.
-        SystemExit: its help, with code 0.
+        InputError: The command does not know the words.
+        SystemExit: The help was printed; the exit code is 0.
     """
     name = name or _module_name()
     flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[with_help(command)]]
     words = with_values(words, switches(command))
-    helping = {"-h", "--help"} & set(words)
-    with nullcontext() if helping else plain_errors(name or sys.argv[0]):
+    prints_help = {"-h", "--help"} & set(words)
+    with nullcontext() if prints_help else plain_errors(name or sys.argv[0]):
         return tyro.cli(flags, prog=name, args=words, description=f"{summary(command)} {terminal.FLAGS}")
 
 
 def _module_name() -> str | None:
-    """What starts a command that has no name of its own; None: the name under which it was started."""
-    started = Path(sys.argv[0])
-    return f"python -m {__package__}.{started.stem}" if started.parent == Path(__file__).parent else None
+    """Return how to start a command that runs as a module; None for installed commands."""
+    program = Path(sys.argv[0])
+    return f"python -m {__package__}.{program.stem}" if program.parent == Path(__file__).parent else None
 
 
 def switches(options: Any) -> set[str]:
-    """The flags that are True or False."""
-    found = set()
+    """Return the boolean flags of an options dataclass."""
+    flags = set()
     for name, hint in get_type_hints(options).items():
-        found |= switches(hint) if is_dataclass(hint) else {f"--{name.replace('_', '-')}"} if hint is bool else set()
-    return found
+        flags |= switches(hint) if is_dataclass(hint) else {f"--{name.replace('_', '-')}"} if hint is bool else set()
+    return flags
 
 
 def with_values(words: Sequence[str], flags: Collection[str]) -> list[str]:
-    """The words of a command line, with True behind every one of the flags that stands alone.
+    """Insert True after every boolean flag that has no value.
 
     >>> with_values(["--save", "--text", "a", "--stdin"], {"--save", "--stdin"})
     ['--save', 'True', '--text', 'a', '--stdin', 'True']
     """
-    found = []
+    words_with_values = []
     for word, following in zip(words, [*words[1:], "--"]):
-        found.append(word)
+        words_with_values.append(word)
         if word.replace("_", "-") in flags and following.startswith("--"):
-            found.append("True")
-    return found
+            words_with_values.append("True")
+    return words_with_values
 
 
 def plain(value: object) -> Text:
-    """A text, a path or a name for a table, shown as it is."""
+    """Return a prompt, path or name as rich text without markup."""
     return Text(visible(str(value)))
 
 
 def say(text: str) -> None:
-    """One line on standard output, as long as it is."""
+    """Print a line on standard output without wrapping."""
     CONSOLE.print(plain(text), soft_wrap=True)
 
 
 def say_progress(text: str) -> None:
-    """A line on standard output that tells of work, not of its results; nothing with --quiet."""
+    """Print a progress message on standard output, unless --quiet is set."""
     if not terminal.now[-1].quiet:
         say(text)
 
 
 def say_opening(*paths: Path) -> None:
-    """The first sign of life, on standard error, which no program reads; nothing with --quiet."""
+    """Print which files are being opened, unless --quiet is set; on standard error, which programs do not parse."""
     if not terminal.now[-1].quiet:
         say_error("Opening " + ", ".join(map(str, paths)))
 
 
 def say_error(text: str) -> None:
-    """A message on standard error, as it is."""
-    with suppress(OSError):  # nobody can be told
+    """Print a message on standard error without wrapping."""
+    with suppress(OSError):  # standard error is closed or full
         ERRORS.print(Text(visible(text)), soft_wrap=True)
 
 
-def _flushed(stream: TextIO | None, tell: bool) -> int:
-    """Exit code 1 if what was printed cannot be written, with a message unless the reader has closed a pipe."""
+def _flush(stream: TextIO | None, report: bool) -> int:
+    """Flush a stream; return exit code 1 if that fails.
+
+    Args:
+        stream: The stream, or None.
+        report: Print a message on failure, unless the reader has closed the pipe.
+    """
     try:
         if stream is not None and not stream.closed:
             stream.flush()
         return 0
     except OSError as error:
-        with suppress(OSError):  # so that Python does not try again at its end
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, cast(TextIO, stream).fileno())
-            os.close(nowhere)
-        if tell and not isinstance(error, BrokenPipeError):
-            say_error(_CANNOT.format(error.strerror))
+        with suppress(OSError):  # keeps Python from flushing again at exit
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull, cast(TextIO, stream).fileno())
+            os.close(devnull)
+        if report and not isinstance(error, BrokenPipeError):
+            say_error(_OUTPUT_ERROR.format(error.strerror))
         return USER
 
 
-class _Output:
-    """Standard output, whose errors say that they are of it."""
+class _CheckedStream:
+    """Standard output that raises OutputError if it cannot be written."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -232,29 +238,29 @@ class _Output:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        with _of_the_output():
+        with _output_errors():
             return self._stream.write(text)
 
     def flush(self) -> None:
-        with _of_the_output():
+        with _output_errors():
             self._stream.flush()
 
 
 @contextmanager
-def _of_the_output() -> Iterator[None]:
+def _output_errors() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OutputError(_CANNOT.format(error.strerror)) from error
+        raise OutputError(_OUTPUT_ERROR.format(error.strerror)) from error
 
 
 @contextmanager
-def _named_output() -> Iterator[None]:
+def _checked_output() -> Iterator[None]:
     stream = sys.stdout
     if stream is not None:
-        sys.stdout = cast(TextIO, _Output(stream))
+        sys.stdout = cast(TextIO, _CheckedStream(stream))
     try:
         yield
     finally:
@@ -262,11 +268,11 @@ def _named_output() -> Iterator[None]:
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends what runs within as Ctrl-C does."""
+def _sigterm_raises() -> Iterator[None]:
+    """Let SIGTERM end this context with an exception, as Ctrl-C does."""
 
     def terminate(number: int, _frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_IGN)  # what is half-written is being removed
+        signal.signal(number, signal.SIG_IGN)  # partial files are being removed
         raise Terminated
 
     if threading.current_thread() is not threading.main_thread():
@@ -281,10 +287,12 @@ def _terminable() -> Iterator[None]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Warnings of ours are one line. Of those of other packages, what concerns their programmers is for the log file
-    alone; the rest stays as it is."""
+    """Print our warnings as one line, and write deprecation warnings of other packages to the log file only.
+
+    Other warnings of other packages stay unchanged.
+    """
     with warnings.catch_warnings():
-        others = warnings.showwarning
+        default = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], filename: str, *rest: Any, **more: Any) -> None:
             if filename.startswith(_PACKAGE):
@@ -292,7 +300,7 @@ def _plain_warnings() -> Iterator[None]:
             elif issubclass(category, DeprecationWarning | PendingDeprecationWarning | FutureWarning):
                 terminal.log_line(warnings.formatwarning(message, category, filename, rest[0]))
             else:
-                others(message, category, filename, *rest, **more)
+                default(message, category, filename, *rest, **more)
 
         warnings.showwarning = show
         yield
@@ -300,17 +308,17 @@ def _plain_warnings() -> Iterator[None]:
 
 @cache
 def with_help(options: Any, *, nested: bool = False) -> Any:
-    """The dataclass, with the docstring under each field as the help of its flag, and the first paragraph of its own as
-    the help of all of them.
+    """Return an options dataclass with help texts from its docstrings.
 
-    tyro reads docstrings itself, but keeps the line breaks that are there because lines of code are short. Options in
-    the options of a command join their group.
+    The docstring under each field becomes the help of its flag, and the first paragraph of the class docstring the help
+    of a group. tyro reads docstrings itself, but keeps the line breaks of the source. Options nested in a group join
+    that group.
     """
     hints = get_type_hints(options, include_extras=True)
     texts: dict[str, str] = {}
-    for part in filter(is_dataclass, reversed(options.__mro__)):  # a command may have the flags of another
-        found = docstring_parser.parse_from_object(part).params
-        texts |= {param.arg_name: param.description or "" for param in found}
+    for cls in filter(is_dataclass, reversed(options.__mro__)):  # a command may inherit flags
+        params = docstring_parser.parse_from_object(cls).params
+        texts |= {param.arg_name: param.description or "" for param in params}
     for field in fields(options):
         hint, text, name = hints[field.name], texts.get(field.name, ""), None
         if is_dataclass(hint):
@@ -321,5 +329,5 @@ def with_help(options: Any, *, nested: bool = False) -> Any:
 
 
 def summary(options: Any) -> str:
-    """The first paragraph of a docstring, in one line."""
+    """Return the first paragraph of a docstring as one line."""
     return " ".join((options.__doc__ or "").split("\n\n")[0].split())

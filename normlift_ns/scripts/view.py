@@ -1,4 +1,4 @@
-"""ns-normlift-view: a lifted run in the browser, which draws the Gaussians itself."""
+"""ns-normlift-view: view a lifted run in the browser, which renders the Gaussians itself."""
 
 from __future__ import annotations
 
@@ -19,36 +19,38 @@ if TYPE_CHECKING:
 
 @dataclass
 class NormLiftView:
-    """Look at a lifted run in the browser: ask, select, hide and export. The browser draws, so that no GPU is needed
-    here.
+    """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
+    GPU.
 
-    Colours are those of spherical harmonics of degree 0.
+    Colors are those of spherical harmonics of degree 0.
     """
 
     load_config: Path
     """Path to config YAML file of the lifted run."""
     host: str = "127.0.0.1"
-    """Address to listen at. By default only this machine can look; 0.0.0.0 lets everybody in who can reach it."""
+    """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
     port: int = 7008
-    """Port to listen at; the next one that is free, if it is taken."""
+    """Port to listen on, in 1..65535; if it is in use, the next free one."""
     share_readonly: bool = False
-    """Let nobody store prompts in the run or write files here; files go to the downloads of the browser."""
+    """Forbid visitors to store prompts in the run or to write files on this machine; their exports become browser
+    downloads."""
     most_drawn: int = 1_000_000
-    """Number of Gaussians to draw at most. Of larger scenes the most opaque and largest are shown."""
+    """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values
+    need more browser memory."""
     text_vectors: Path | None = None
-    """NPZ file, text -> vector, to look texts up in instead of encoding them."""
+    """NPZ file with one vector per prompt, used instead of encoding prompts."""
     text_template: str | None = None
-    """What open_clip reads for a text, which takes the place of {}. By default as the run was lifted."""
+    """Template of the text that the network encodes, with {} for the prompt. Default: the template of the lift."""
     data: Path | None = None
-    """Where the dataset is now, if it was moved."""
+    """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Where the text encoder runs: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu or cuda."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
     def main(self) -> None:
-        """Serves until it is interrupted."""
+        """Serve the viewer until the process is interrupted."""
         check_device(self.device)
         _check_host(self.host)
         check_lifted(self.load_config, self.data)
@@ -57,9 +59,9 @@ class NormLiftView:
 
         door = Door(self.host, self.port)
         if door.server.port != self.port:
-            say(f"Port {self.port} is taken.")
+            say(f"Port {self.port} is already in use.")
         host = "127.0.0.1" if self.host == "0.0.0.0" else self.host
-        say(f"The viewer is at http://{host}:{door.server.port} (Ctrl-C ends it)")
+        say(f"The viewer is at http://{host}:{door.server.port} (press Ctrl-C to stop it)")
         try:
             self.open(door)
             until_stopped()
@@ -67,7 +69,7 @@ class NormLiftView:
             say("Stopped.")
 
     def open(self, door: Door) -> None:
-        """Reads the run, and lets in who waits before the door; returns at once."""
+        """Load the run and start to serve pages, including those that are already waiting; return immediately."""
         from normlift_ns.front_door import open_run  # noqa: PLC0415 (pages load while torch is imported)
         from normlift_ns.session.space import Space  # noqa: PLC0415
         from normlift_ns.viewer.people import People  # noqa: PLC0415
@@ -89,8 +91,10 @@ class NormLiftView:
 
 
 def until_stopped() -> NoReturn:
-    """Waits for Ctrl-C or SIGTERM. It looks every second: a signal that reaches another thread of the process, or this
-    one just before it waits, would not wake a wait without end.
+    """Wait for Ctrl-C or SIGTERM.
+
+    The loop wakes up every second. An endless wait would miss a signal that reaches another thread, or this thread
+    just before it waits.
     """
     while True:
         time.sleep(1)
@@ -103,18 +107,18 @@ def _check_host(host: str) -> None:
             probe.bind(address)
     except (OSError, UnicodeError) as error:
         raise InputError(
-            f"--host {host} is no address that this machine can listen at ({error}). Leave it out to let only this "
-            "machine look, or give 0.0.0.0 to let everybody in who can reach it."
+            f"--host {host} is not an address that this machine can listen on ({error}). Leave it out to accept "
+            "connections from this machine only, or give 0.0.0.0 to accept them from other machines too."
         ) from None
 
 
 def entrypoint() -> None:
-    """ns-normlift-view, in a process that goes on."""
+    """Run ns-normlift-view in a process that continues afterwards."""
     run_command(NormLiftView)
 
 
 def main() -> None:
-    """Entry point of ns-normlift-view."""
+    """Run ns-normlift-view as a process."""
     run_process(NormLiftView)
 
 

@@ -68,7 +68,7 @@ def test_without_a_state_folder_the_temporary_one_is_taken(monkeypatch, tmp_path
 
 
 def test_without_any_folder_the_traceback_is_printed(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("normlift_ns.crash._folders", lambda: [Path(os.devnull)])
+    monkeypatch.setattr("normlift_ns.crash._log_folders", lambda: [Path(os.devnull)])
     message, code = explain(raised(ValueError("x")))
     assert code == 70 and "bug" in message
     assert "Traceback" in capsys.readouterr().err

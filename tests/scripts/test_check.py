@@ -45,7 +45,7 @@ def test_a_capture_is_checked_and_lifted_as_planned(checked, trained, tmp_path, 
     assert list(plan["seconds"]) == [*stages, "store", "write"]
     assert all(seconds >= 0 for seconds in plan["seconds"].values()) and plan["total_s"] > 0
     shown = said(capsys)
-    assert f"from a look at {looked_at} views" in shown and "GiB of memory" in shown
+    assert f"estimated from {looked_at} views" in shown and "GiB of memory" in shown
     assert not (tmp_path / "out").exists()
     given = ("--load-config", trained, *SMALL, "--output-dir", tmp_path / "out", "--max-views", 6, "--device", "cpu")
     assert run_entry(monkeypatch, lift.entrypoint, *given, "--timestamp", "run") == 0

@@ -76,14 +76,14 @@ LIFT = [
     ("--features langsplat --features-dir room --level x", "s, m, l, default, sum for langsplat, got 'x'"),
     ("--features langsplat --features-dir room --text-vectors fifo", "fifo, given with --text-vectors", "pipe"),
     ("--encoder open_clip --encoder-pretrained missing.pt", "missing.pt"),
-    (("--queries", "red", " "), "text 2 of 2 of --queries"),
+    (("--queries", "red", " "), "prompt 2 of 2 in --queries"),
 ]
 SPLATS = [
     ("--load-ply nowhere.ply", "nowhere.ply, given with --load-ply"),
     ("--load-gsplat fifo", "fifo, given with --load-gsplat", "pipe"),
     ("--load-ply file", "cameras", "none"),
     ("--load-ply file --colmap room --transforms x", "cameras", "two"),
-    ("--load-ply file --transforms dangling", "dangling (a link that leads nowhere), given with --transforms"),
+    ("--load-ply file --transforms dangling", "dangling (a broken link), given with --transforms"),
     ("--load-ply file --colmap room --masks none", "none, given with --masks"),
     ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
     ("--load-config room", "config at room"),
@@ -97,11 +97,11 @@ SPLATS = [
 ]
 QUERY = [
     ("--text", "--text", "--interactive"),
-    (("--text", ""), "text 1 of 1 of --text"),
-    (("--text", "a", "--negatives", "b", ""), "text 2 of 2 of --negatives"),
+    (("--text", ""), "prompt 1 of 1 in --text"),
+    (("--text", "a", "--negatives", "b", ""), "prompt 2 of 2 in --negatives"),
     ("--text a --min-reliability nan", "--min-reliability must be in 0..1, got nan"),
     ("--text a --json room", "room exists", "--json"),
-    ("--text a --json room --overwrite True", "room, given with --json", "no file"),
+    ("--text a --json room --overwrite True", "room, given with --json", "not a regular file"),
     ("--text a --json file/x", "file, named with --json"),
     ("--text a --json n --output-path n", "--json and --output-path", ", n"),
     ("--text a --render-dir file", "file, named with --render-dir"),
@@ -185,7 +185,7 @@ def test_a_dataset_that_is_gone_is_refused_early(config, tmp_path, monkeypatch, 
     monkeypatch.chdir("/")
     for entrypoint, flags in ((lift.entrypoint, COLOUR), (query.entrypoint, ("--text", "a"))):
         assert run_entry(monkeypatch, entrypoint, "--load-config", config, *flags) == 1
-        assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "give its path with --data" in shown
+        assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "with --data" in shown
 
 
 def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_early(
@@ -194,7 +194,7 @@ def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_e
     (tmp_path / "room" / "normlift").mkdir(parents=True)
     (tmp_path / "room" / "normlift" / ".cache").touch()
     (tmp_path / "locked").mkdir(mode=0o500)
-    folders = {tmp_path: ".cache, named with --output-dir", tmp_path / "locked" / "new": "may not be written"}
+    folders = {tmp_path: ".cache, named with --output-dir", tmp_path / "locked" / "new": "is not writable"}
     for folder, fact in list(folders.items())[: 1 if os.geteuid() == 0 else 2]:  # root may write everywhere
         assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, "--output-dir", folder) == 1
         assert fact in said(capsys)

@@ -43,7 +43,7 @@ def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
         (lambda _: fail(NO_SPACE), 1, "a.ply: No space left on device"),
         (lambda _: fail(MemoryError()), 1, "memory"),
         (lambda _: fail(KeyboardInterrupt()), 130, "Interrupted. "),
-        (lambda _: fail(ValueError("what")), 70, "bug of normlift_ns: ValueError: what"),
+        (lambda _: fail(ValueError("what")), 70, "bug in normlift_ns: ValueError: what"),
         (lambda _: {}["[/bold]"], 70, "KeyError: '[/bold]'"),
         (lambda _: fail(RecursionError()), 70, "RecursionError"),
         (lambda _: fail(SystemExit(7)), 7, ""),

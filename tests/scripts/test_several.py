@@ -144,7 +144,7 @@ def test_processes_that_nobody_has_started_for_us_name_the_one_that_is_gone(trai
     if processes[0].returncode != 0:  # else it had ended before
         assert [process.returncode for process in processes] == [1, -9, 1]
         assert any("Process 1 (" in text for text in (said[0], said[2])), said
-        assert not any("Traceback" in text or "bug of normlift_ns" in text for text in said), said
+        assert not any("Traceback" in text or "bug in normlift_ns" in text for text in said), said
 
 
 def test_one_process_tells_of_a_mistake(trained, tmp_path):

@@ -59,10 +59,10 @@ def test_a_log_file_gets_everything_without_colours_and_is_added_to(ended, tmp_p
 
 def test_mistakes_are_messages(ended) -> None:
     for flags, *facts in (
-        (("--log-file", "."), ".", "no file"),
+        (("--log-file", "."), ".", "not a regular file"),
         (("--log-file", "nowhere/a.log"), "nowhere/a.log, given with --log-file", "No such file"),
         (("--log-file",), "--log-file"),
-        (("--quiet", "yes"), "--quiet is True or False, got 'yes'"),
+        (("--quiet", "yes"), "--quiet must be True or False, got 'yes'"),
     ):
         code, out, err = ended(say, *flags)
         assert (code, out) == (1, "") and "Traceback" not in err
@@ -119,7 +119,7 @@ def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys
     assert shown.splitlines()[-1] == f"ns-normlift-query --load-config {config} --text 'red mug'"
     words = " ".join(shown.replace("│", " ").split())
     assert re.search(r"half of the Gaussians above 0\.\d", words) and re.search(r"% of Gaussians took over", words)
-    assert "show in no image" in words
+    assert "not visible in any image" in words
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", "True", "--quiet") == 0
     assert capsys.readouterr().out.splitlines() == [shown.splitlines()[-1]]
 

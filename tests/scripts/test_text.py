@@ -40,8 +40,8 @@ def summary(text: str) -> Any:
 
 TABLES: dict[str, Callable[[str], Any]] = {
     "query": lambda text: prompting.table([{"text": text, **NUMBERS}], "lerf > 0.5", 0.5),
-    "export": lambda text: export._table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
-    "export nothing": lambda text: export._table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
+    "export": lambda text: export._objects_table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
+    "export nothing": lambda text: export._objects_table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
     "eval rows": lambda text: evaluate.rows_table([{"class": text, "iou": 0.5}], "ablation"),
     "eval columns": lambda text: evaluate.rows_table([{text: 0.5}]),
     "eval signals": lambda text: evaluate.signals_table([{"scene": text, "zero.share": 0.5}]),

@@ -1,1 +1,1 @@
-"""What ns-normlift-query and ns-normlift-export show and write of an answer."""
+"""Tables and files of ns-normlift-query and ns-normlift-export."""

@@ -1,4 +1,4 @@
-"""ns-normlift-export: what it writes beside the splat, for tools that take masks, arrays or point clouds."""
+"""Additional outputs of ns-normlift-export: masks, arrays and labeled point clouds."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from normlift_ns.scripts.shared import say
 
 
 def masks(run: LiftedRun, selected: Bool[Tensor, " n"], folder: Path, *, rest: bool, overwrite: bool) -> None:
-    """Masks of every training photograph; raises as `LiftedRun.masks`."""
+    """Write a mask of every training image; errors are those of `LiftedRun.masks`."""
     say(f"{len(run.masks(folder, selected, rest=rest, overwrite=overwrite))} masks in {folder}")
-    with suppress(FileNotFoundError, InputError):  # a photograph that is gone says nothing
+    with suppress(FileNotFoundError, InputError):  # the first image may be missing
         if run.scene.train[0].original is not None:
             say(
-                "The masks fit the photographs without lens distortion, as the scene was trained on them, not those in "
-                "the folder of the capture."
+                "The masks fit the undistorted images that the scene was trained with, not the original images of the "
+                "capture."
             )
 
 
 def arrays(
     run: LiftedRun, instances: Instances, rows: Int64[np.ndarray, " m"], folder: Path, *, overwrite: bool
 ) -> None:
-    """Labels as arrays; raises as `write_arrays`."""
+    """Write labels as arrays; errors are those of `write_arrays`."""
     write_arrays(folder, run.scene.gaussians.means, instances, rows, overwrite=overwrite)
     say(f"Labels of {len(rows):,} Gaussians in {folder}")
 
@@ -44,12 +44,25 @@ def transfer(
     instances: Instances,
     cloud: PlyData,
     path: Path,
-    most: float,
+    distance: float,
     coordinates: Literal["capture", "scene"],
     *,
     overwrite: bool,
 ) -> None:
-    """A cloud with the labels of the nearest Gaussians; raises as `LiftedRun.transfer`."""
-    how: dict[str, Any] = {"distance": most, "coordinates": coordinates, "overwrite": overwrite}
-    found = run.transfer_to(cloud, path, answer, instances, **how)
-    say(f"{found.points:,} points in {path}, {found.share:.1%} of them within {found.limit:.3g} of a Gaussian")
+    """Write a point cloud with the labels of the nearest Gaussians.
+
+    Args:
+        run: The lifted run.
+        answer: Answer whose relevancies to write.
+        instances: Objects of the answer.
+        cloud: The point cloud to label.
+        path: Path of the labeled cloud.
+        distance: Largest distance to a Gaussian, in units of the scene's median spacing.
+        coordinates: Coordinates of the cloud.
+        overwrite: Replace an existing file.
+    Raises:
+        FileExistsError, ValueError: Same as in `LiftedRun.transfer`.
+    """
+    kwargs: dict[str, Any] = {"distance": distance, "coordinates": coordinates, "overwrite": overwrite}
+    labeled = run.transfer_to(cloud, path, answer, instances, **kwargs)
+    say(f"{labeled.points:,} points in {path}, {labeled.share:.1%} of them within {labeled.limit:.3g} of a Gaussian")

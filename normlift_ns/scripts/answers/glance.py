@@ -1,4 +1,4 @@
-"""What a config.yml says of names and places, read without nerfstudio and without building anything."""
+"""Names and paths in a config.yml, read without nerfstudio and without constructing any object."""
 
 from __future__ import annotations
 
@@ -10,77 +10,80 @@ import yaml
 
 from normlift_ns.errors import InputError
 
-_MOST_BYTES = 2**22
-"""Of a config; nerfstudio's have some thousands."""
+_MAX_CONFIG_BYTES = 2**22
+"""Largest size of a config; those of nerfstudio have a few thousand bytes."""
 
 
 @dataclass(frozen=True)
-class Glance:
-    """Names and places of a trained or lifted run; None where the config says them otherwise than nerfstudio does."""
+class ConfigPaths:
+    """Names and paths of a trained or lifted run; None if the config does not store them as nerfstudio does."""
 
     experiment: str | None
     output_dir: Path | None
-    """The folder above the runs of the experiment."""
+    """Folder that contains the experiment folder."""
     data: tuple[Path, ...]
-    """Where the dataset may be; empty where the config does not say it."""
+    """Possible paths of the dataset; empty if the config has none."""
 
 
-def glance(config: Path) -> Glance:
-    """Looks at a config.yml.
+def glance(config: Path) -> ConfigPaths:
+    """Read names and paths from a config.yml.
 
     Raises:
-        InputError: no YAML, or no config of nerfstudio.
+        InputError: The file is not valid YAML, or not a nerfstudio config.
     """
     expected = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
-    if config.stat().st_size > _MOST_BYTES:
-        raise InputError(f"{config} is not a nerfstudio config: it has more than {_MOST_BYTES:,} bytes. {expected}")
+    if config.stat().st_size > _MAX_CONFIG_BYTES:
+        raise InputError(
+            f"{config} is not a nerfstudio config: it has more than {_MAX_CONFIG_BYTES:,} bytes. {expected}"
+        )
     try:
         root = yaml.compose(config.read_text("utf8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except OSError as error:
         raise OSError(f"{config} cannot be read: {error.strerror}. {expected}") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         reason = error.problem if isinstance(error, yaml.MarkedYAMLError) else " ".join(str(error).split())
-        raise InputError(f"{config} is not a nerfstudio config: it is no valid YAML ({reason}). {expected}") from None
-    method = _text(_at(root, "method_name"))
+        raise InputError(f"{config} is not a nerfstudio config: it is not valid YAML ({reason}). {expected}") from None
+    method = _string(_value(root, "method_name"))
     if method is None:
         raise InputError(f"{config} is not a nerfstudio config: it has no method_name. {expected}")
-    experiment, stamp = _text(_at(root, "experiment_name")), _text(_at(root, "timestamp"))
+    experiment, timestamp = _string(_value(root, "experiment_name")), _string(_value(root, "timestamp"))
     run_dir = Path(os.path.abspath(config)).parent
-    names = (experiment, method, stamp)
-    above = run_dir.parents[2] if None not in names and run_dir.parts[-3:] == names else None
-    manager = _at(root, "pipeline", "datamanager")
-    data = _path(_at(manager, "data")) or _path(_at(manager, "dataparser", "data"))
-    outputs = _path(_at(root, "output_dir"))
-    runs = above
-    if above is None and outputs is not None:
+    names = (experiment, method, timestamp)
+    parent = run_dir.parents[2] if None not in names and run_dir.parts[-3:] == names else None
+    manager = _value(root, "pipeline", "datamanager")
+    data = _config_path(_value(manager, "data")) or _config_path(_value(manager, "dataparser", "data"))
+    configured = _config_path(_value(root, "output_dir"))
+    output_dir = parent
+    if parent is None and configured is not None:
         from normlift_ns.scenes.nerfstudio.config import outputs_of_moved  # noqa: PLC0415 (rarely needed)
 
-        runs = outputs_of_moved(outputs)
-    if data is None or outputs is None:
-        return Glance(experiment, runs, ())
-    tail = Path(os.path.normpath(outputs)).parts
-    if above is not None and above.parts[-len(tail) :] == tail:  # so the directory of the training is known
-        roots = [Path(*above.parts[: -len(tail)]), Path.cwd()]
+        output_dir = outputs_of_moved(configured)
+    if data is None or configured is None:
+        return ConfigPaths(experiment, output_dir, ())
+    tail = Path(os.path.normpath(configured)).parts
+    if parent is not None and parent.parts[-len(tail) :] == tail:  # this gives the working directory of the training
+        roots = [Path(*parent.parts[: -len(tail)]), Path.cwd()]
     else:
-        roots = [*(above or Path(os.path.abspath(outputs))).parents, Path.cwd()]
-    return Glance(experiment, runs, tuple(dict.fromkeys(Path(os.path.abspath(base / data)) for base in roots)))
+        roots = [*(parent or Path(os.path.abspath(configured))).parents, Path.cwd()]
+    data_paths = tuple(dict.fromkeys(Path(os.path.abspath(folder / data)) for folder in roots))
+    return ConfigPaths(experiment, output_dir, data_paths)
 
 
-def _at(node: yaml.Node | None, *keys: str) -> yaml.Node | None:
-    """The value under a key of a mapping, and so on."""
+def _value(node: yaml.Node | None, *keys: str) -> yaml.Node | None:
+    """Return the value at a path of keys in nested mappings."""
     for key in keys:
         entries = node.value if isinstance(node, yaml.MappingNode) else ()
         node = next((value for name, value in entries if isinstance(name, yaml.ScalarNode) and name.value == key), None)
     return node
 
 
-def _text(node: yaml.Node | None) -> str | None:
+def _string(node: yaml.Node | None) -> str | None:
     return node.value if isinstance(node, yaml.ScalarNode) else None
 
 
-def _path(node: yaml.Node | None) -> Path | None:
-    """A path as nerfstudio writes it, its parts in a list."""
+def _config_path(node: yaml.Node | None) -> Path | None:
+    """Return a path that nerfstudio wrote as a list of its parts."""
     if not isinstance(node, yaml.SequenceNode) or not node.tag.endswith("Path"):
         return None
-    parts = [_text(part) for part in node.value]
+    parts = [_string(part) for part in node.value]
     return Path(*(part for part in parts if part is not None)) if parts and None not in parts else None

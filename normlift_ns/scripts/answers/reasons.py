@@ -1,4 +1,4 @@
-"""ns-normlift-query --why: which photographs voted for what is selected."""
+"""ns-normlift-query --why: the images that voted for a selection."""
 
 from __future__ import annotations
 
@@ -20,54 +20,57 @@ from normlift_ns.viewer.pictures import picture_names
 if TYPE_CHECKING:
     from normlift_ns.quick import QuickAnswer
 
-SHOWN = 3
-"""Photographs of a text that are shown, and as many that disagree most."""
-MOST = "weighs most"
+_IMAGES_PER_GROUP = 3
+"""Number of images per prompt in each group: those with the largest weight, and those that disagree most."""
+_LARGEST_WEIGHT = "weighs most"
 
 
-def find_reasons(config: Path, data: Path | None, found: QuickAnswer) -> tuple[LiftedRun, list[Why | None]]:
-    """The run, opened whole, and what its photographs say of the selection of every text; None: nothing is selected.
+def find_reasons(config: Path, data: Path | None, answer: QuickAnswer) -> tuple[LiftedRun, list[Why | None]]:
+    """Open the whole run, and explain the selection of every prompt by the votes of its images.
 
+    Returns:
+        The run, and one explanation per prompt; None for a prompt that selects nothing.
     Raises:
-        FileNotFoundError, ValueError: as `open_run` and `LiftedRun.why`.
+        FileNotFoundError, ValueError: Same as in `open_run` and `LiftedRun.why`.
     """
-    run, refined = open_run(config, data=data), found.question.refined
-    masks = torch.from_numpy(found.selected).T
+    run, refined = open_run(config, data=data), answer.question.refined
+    masks = torch.from_numpy(answer.selected).T
     return run, [run.votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
 
 
 def to_json(run: LiftedRun, why: Why | None) -> dict[str, Any] | None:
-    """The same as plain types, with the names of the photographs."""
+    """Return an explanation as plain types, with image names."""
     if why is None:
         return None
-    plain = why.to_json()
-    views = [{"photograph": run.votes.names[view["view"]], **view} for view in plain["views"]]
-    return {**plain, "views": views}
+    row = why.to_json()
+    views = [{"photograph": run.votes.names[view["view"]], **view} for view in row["views"]]
+    return {**row, "views": views}
 
 
-def shown_votes(why: Why) -> dict[str, tuple[ViewVote, ...]]:
-    """The photographs to look at: those that weigh most, and those that disagree most."""
-    return {MOST: why.views[:SHOWN], "disagrees most": why.most_different[:SHOWN]}
+def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
+    """Return the images to show: those with the largest weight, and those that disagree most."""
+    return {_LARGEST_WEIGHT: why.views[:_IMAGES_PER_GROUP], "disagrees most": why.most_different[:_IMAGES_PER_GROUP]}
 
 
 def save_pictures(
     run: LiftedRun, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
 ) -> list[Path]:
-    """Writes <number>_<text>_1_<photograph>.png … of those that weigh most, <number>_<text>_disagrees_1_… of those that
-    disagree most, all or none; returns their paths.
+    """Write the images of the largest weights and disagreements, all or none; return their paths.
+
+    The files are <number>_<text>_1_<image>.png … and <number>_<text>_disagrees_1_<image>.png ….
 
     Raises:
-        FileExistsError: one is there, and `overwrite` is False.
-        OSError: it cannot be written.
-        FileNotFoundError, ValueError: as `Votes.pictures`.
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
+        FileNotFoundError, ValueError: Same as in `Votes.pictures`.
     """
-    called = picture_names(run.votes.names)
+    names = picture_names(run.votes.names)
     votes: dict[Path, ViewVote] = {}
     for index, (text, why) in enumerate(zip(texts, reasons)):
-        for word, some in ({} if why is None else shown_votes(why)).items():
-            for place, vote in enumerate(some, 1):
-                kind = "" if word == MOST else "disagrees_"
-                votes[folder / f"{index}_{file_name(text)}_{kind}{place}_{called[vote.view]}.png"] = vote
+        for kind, group in ({} if why is None else _votes_to_show(why)).items():
+            for rank, vote in enumerate(group, 1):
+                prefix = "" if kind == _LARGEST_WEIGHT else "disagrees_"
+                votes[folder / f"{index}_{file_name(text)}_{prefix}{rank}_{names[vote.view]}.png"] = vote
     if len(votes) == 0:
         return []
     with new_files(*votes, overwrite=overwrite) as drafts:
@@ -77,29 +80,29 @@ def save_pictures(
 
 
 def show_reasons(run: LiftedRun, texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
-    """Prints a table of photographs, and how far they agree in words."""
-    shown = table(run.votes.names, texts, reasons, narrow=CONSOLE.width < 120)
-    if shown.row_count > 0:
-        CONSOLE.print(shown)
+    """Print a table of images, and a sentence per prompt about their agreement."""
+    result = table(run.votes.names, texts, reasons, narrow=CONSOLE.width < 120)
+    if result.row_count > 0:
+        CONSOLE.print(result)
     for text, why in zip(texts, reasons):
-        say(f"{text}: {'nothing is selected, so that nothing has voted for it.' if why is None else why.sentence}")
+        say(f"{text}: {'nothing is selected, so nothing voted for it.' if why is None else why.sentence}")
 
 
 def table(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], *, narrow: bool = False) -> Table:
-    """The photographs of every text; a narrow table has no weights and no numbers of regions."""
-    made = Table(title="Why", padding=(0, 0 if narrow else 1))
-    for name in ("text", "", "photo" if narrow else "photograph"):
-        made.add_column(name, overflow="fold")
+    """Return a table of the images of every prompt; a narrow table leaves out weights and region counts."""
+    result = Table(title="Why", padding=(0, 0 if narrow else 1))
+    for name in ("text", "", "image"):
+        result.add_column(name, overflow="fold")
     for name in (*(() if narrow else ("weight in pixels",)), "share", "agreement", "disagreement"):
-        made.add_column(name, justify="right", no_wrap=True)
+        result.add_column(name, justify="right", no_wrap=True)
     if not narrow:
-        made.add_column("regions", justify="right", no_wrap=True)
+        result.add_column("regions", justify="right", no_wrap=True)
     for text, why in zip(texts, reasons):
-        first = text
-        for kind, votes in ({} if why is None else shown_votes(why)).items():
+        label = text
+        for kind, votes in ({} if why is None else _votes_to_show(why)).items():
             for vote in votes:
                 shares = (f"{vote.share:.1%}", f"{vote.agreement:.3f}", f"{vote.disagreement:.0%}")
                 numbers = shares if narrow else (f"{vote.weight:,.0f}", *shares, str(len(vote.regions)))
-                made.add_row(plain(first), kind, plain(names[vote.view]), *numbers)
-                first = ""
-    return made
+                result.add_row(plain(label), kind, plain(names[vote.view]), *numbers)
+                label = ""
+    return result

@@ -1,1 +1,1 @@
-"""Many captures: the list, who does which, a process for each, and what came of them."""
+"""Parts of ns-normlift-batch: capture list, shards, workers, processes and results."""

@@ -1,7 +1,7 @@
-"""The list of captures: its lines as calls of ns-normlift, and the run that each of them makes.
+"""Capture lists of ns-normlift-batch: the ns-normlift call and the run directory of each line.
 
-A run of a batch is named after a digest of its options and of what says which scene it is of, so that the name tells
-whether a capture was lifted with the same options, and no two processes can both write it.
+Runs of a batch are named after a digest of the scene and the options. The name therefore shows whether a capture was
+lifted with the same options, and no two processes can both write it.
 """
 
 from __future__ import annotations
@@ -23,71 +23,71 @@ from normlift_ns.scripts.shared import read_flags
 
 _PREFIX = "batch_"
 _SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
-"""Which option of ns-normlift takes a path of that suffix; all others are configs."""
-_ELSEWHERE = ("device", "timestamp", "output_dir")
-"""Options that say where something is computed or goes, and do not change what is lifted."""
+"""Options of ns-normlift by the suffix of the path that they take; all other paths are configs."""
+_NOT_IN_KEY = ("device", "timestamp", "output_dir")
+"""Options that do not change what is lifted, only where it is computed or stored."""
 _KEY_LENGTH = 16
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A line of the list."""
+    """One line of a capture list."""
 
     name: str
-    """The line."""
+    """The line itself."""
     words: tuple[str, ...]
-    """What ns-normlift is called with, the name of the new run included."""
+    """Arguments of ns-normlift, including the name of the new run."""
     key: str
     """Digest of scene and options, 16 hexadecimal digits."""
     run: Path | None
-    """Directory of the lifted run; None where it shows only when the capture is opened."""
+    """Directory of the lifted run; None if it is not known before the capture is opened."""
 
 
 def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
-    """The captures of a list, in its order.
+    """Read a capture list, in its order.
 
     Args:
-        path: a text file. A line holds a path of a config.yml, a PLY file or a checkpoint of gsplat, and perhaps
-            options of ns-normlift, quoted as in a shell; or options alone. Empty lines and those that begin with # do
-            not count.
-        options: of ns-normlift, for all captures; those of a line come after them.
+        path: Text file. A line has the path of a config.yml, a PLY file or a gsplat checkpoint, optionally followed by
+            options of ns-normlift quoted as in a shell; or options alone. Empty lines and lines that start with # are
+            ignored.
+        options: Options of ns-normlift for all captures; those of a line override them.
     Raises:
-        InputError: no text, an empty list, a line that ns-normlift would not understand, or that stands there twice.
+        InputError: The file is not UTF-8 text or lists no captures, or a line is invalid or a duplicate.
     """
     try:
-        common = _read(options)
+        common = _parse(options)
     except InputError as error:
         raise InputError(f"After --: {error}") from None
-    if (given := next((name for name in _source_names() if getattr(common, name) is not None), None)) is not None:
+    if (name := next((name for name in _source_names() if getattr(common, name) is not None), None)) is not None:
         raise InputError(
-            f"--{given.replace('_', '-')} stands after --, where it would hold for every capture. Write it into "
-            f"{path}, one line per capture."
+            f"--{name.replace('_', '-')} comes after --, where it applies to every capture. Write it into {path}, one "
+            "line per capture."
         )
     try:
         text = path.read_text("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path} is no text in UTF-8. Expected a list of captures, one path per line.") from None
-    found: dict[str, tuple[int, Capture]] = {}
+        raise InputError(f"{path} is not UTF-8 text. Expected a list of captures, one path per line.") from None
+    captures: dict[str, tuple[int, Capture]] = {}
     for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
         if line == "" or line.startswith("#"):
             continue
-        capture = _capture(line, options, common, f"{path}, line {number}")
-        if capture.key in found:
+        capture = _make_capture(line, options, common, f"{path}, line {number}")
+        if capture.key in captures:
             raise InputError(
-                f"{path}, line {number}, is the same capture with the same options as line {found[capture.key][0]}: "
+                f"{path}, line {number}, is the same capture with the same options as line {captures[capture.key][0]}: "
                 f"{visible(line)}. Remove one of the two."
             )
-        found[capture.key] = number, capture
-    if len(found) == 0:
-        raise InputError(f"{path} lists no capture. Expected one path per line, such as outputs/…/config.yml.")
-    return tuple(capture for _, capture in found.values())
+        captures[capture.key] = number, capture
+    if len(captures) == 0:
+        raise InputError(f"{path} lists no captures. Expected one path per line, such as outputs/…/config.yml.")
+    return tuple(capture for _, capture in captures.values())
 
 
 def is_lifted(run: Path) -> bool:
-    """Whether a lifted run is there, and whole as far as its manifest tells.
+    """Return whether a lifted run exists and has a valid manifest.
 
     Raises:
-        InputError: something else, or a damaged run.
+        InputError: The path is something else, or a damaged run.
     """
     if not os.path.lexists(run):
         return False
@@ -98,15 +98,15 @@ def is_lifted(run: Path) -> bool:
     return True
 
 
-def identity(command: NormLift) -> str:
-    """Digest of a scene and of the options that it is lifted with, 16 hexadecimal digits.
+def _capture_key(command: NormLift) -> str:
+    """Return a digest of the scene and the options of a lift, 16 hexadecimal digits.
 
-    Of the scene it knows the path, and names and sizes of the files that hold its Gaussians; of folders of features,
-    label maps and weights the paths.
+    The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
+    features, label maps and weights, it includes their paths only.
     """
-    facts = {name: value for name, value in asdict(command).items() if name not in _ELSEWHERE}
+    options = {name: value for name, value in asdict(command).items() if name not in _NOT_IN_KEY}
     sizes = [(file.name, file.stat().st_size) for file in _scene_files(command) if file.is_file()]
-    text = json.dumps([facts, sizes], sort_keys=True, default=os.path.abspath)  # paths are all that JSON has no form of
+    text = json.dumps([options, sizes], sort_keys=True, default=os.path.abspath)  # only paths need the default
     return text_digest(text).rpartition(":")[2][:_KEY_LENGTH]
 
 
@@ -121,49 +121,49 @@ def _scene_files(command: NormLift) -> list[Path]:
     return sorted((command.load_config.absolute().parent / "nerfstudio_models").glob(f"step-{step}.ckpt"))[-1:]
 
 
-def _capture(line: str, options: Sequence[str], common: NormLift, where: str) -> Capture:
+def _make_capture(line: str, options: Sequence[str], common: NormLift, location: str) -> Capture:
     try:
         first, *rest = shlex.split(line)
     except ValueError as error:
-        raise InputError(f"{where}: {visible(line)} is not quoted as in a shell ({error}). Close the quotes.") from None
+        raise InputError(
+            f"{location}: {visible(line)} is not quoted as in a shell ({error}). Close the quotes."
+        ) from None
     source = None if first.startswith("--") else _SOURCES.get(Path(first).suffix.lower(), "load_config")
     own = [first, *rest] if source is None else [f"--{source.replace('_', '-')}", first, *rest]
     try:
         if source is None or len(rest) > 0:
-            command = _read([*options, *own])
-        else:  # most lists have no options, and tyro takes its time
+            command = _parse([*options, *own])
+        else:  # a shortcut for lines without options, because tyro is slow
             command = replace(common, **{source: Path(first)})
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    key = identity(command)
-    stamp = f"{_PREFIX}{key}"
-    return Capture(line, (*options, *own, "--timestamp", stamp), key, _run(command, stamp))
+        raise InputError(f"{location}: {error}") from None
+    key = _capture_key(command)
+    timestamp = f"{_PREFIX}{key}"
+    return Capture(line, (*options, *own, "--timestamp", timestamp), key, _run_dir(command, timestamp))
 
 
-def _read(words: Sequence[str]) -> NormLift:
-    """The words of a call of ns-normlift.
+def _parse(words: Sequence[str]) -> NormLift:
+    """Parse the arguments of ns-normlift.
 
     Raises:
-        InputError: ns-normlift does not know them, or the batch has no use for one.
+        InputError: ns-normlift does not know an argument, or a batch does not support it.
     """
     try:
         command = read_flags(NormLift, words, name="ns-normlift")
     except InputError as error:
-        raise InputError(
-            f"ns-normlift does not know all of these options: {visible(shlex.join(words))}. {error}"
-        ) from None
+        raise InputError(f"invalid options of ns-normlift: {visible(shlex.join(words))}. {error}") from None
     if command.timestamp is not None or command.overwrite:
         flag = "--overwrite" if command.overwrite else "--timestamp"
         raise InputError(
-            f"{flag} is for ns-normlift alone: a batch names its runs by their options, so that a rerun does only what "
-            "is missing. Leave it out; to have a capture lifted again, delete its run."
+            f"{flag} is not supported in a batch, which names runs by their options and lifts only missing ones. Leave "
+            "it out; to lift a capture again, delete its run."
         )
     return command
 
 
-def _run(command: NormLift, stamp: str) -> Path | None:
+def _run_dir(command: NormLift, timestamp: str) -> Path | None:
     try:
         name, outputs = new_run_place(command.load_config, command.splat, command.output_dir)
-        return None if name is None or outputs is None else run_directory(outputs, name, stamp)
-    except (InputError, OSError):  # a capture that cannot be opened, which its own process says
+        return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
+    except (InputError, OSError):  # the process of this capture reports the error
         return None

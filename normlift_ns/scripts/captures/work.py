@@ -1,4 +1,4 @@
-"""What one worker does of a list of captures, beside others that may do the same."""
+"""Worker that lifts captures of a list, possibly alongside other workers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from normlift_ns.scripts.captures.listed import Capture, is_lifted
 from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest
 from normlift_ns.scripts.captures.process import LIFT, run_program, why
 
-CLAIMS, LOGS = "claims", "logs"
-"""Folders in that of the results."""
+_CLAIMS, _LOGS = "claims", "logs"
+"""Subfolders of the results folder."""
 
 
 def work(
@@ -30,72 +30,73 @@ def work(
     say: Callable[[str], None] = lambda text: None,
     program: Sequence[str] = LIFT,
 ) -> dict[str, Outcome]:
-    """Lifts the captures that are not lifted yet and that no other worker lifts; returns the outcomes by key.
+    """Lift the captures that are neither lifted nor claimed by another worker; return the outcomes by key.
 
     Args:
-        folder: of claims and results, which the workers share; made if missing.
-        patience: seconds without a heartbeat after which a worker counts as dead; the same for all of them.
-        say: called with a line for every capture.
-        program: ns-normlift.
+        captures: The captures of this worker.
+        folder: Folder of claims and results, which all workers share; created if missing.
+        patience: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+        say: Callback for messages about each capture.
+        program: Command of ns-normlift.
     Raises:
-        OSError: the folder cannot be written.
+        OSError: The folder cannot be written.
     """
     worker = f"{file_name(socket.gethostname())}_{os.getpid()}_{secrets.token_hex(4)}"
-    for inside in (CLAIMS, LOGS):
-        (folder / inside).mkdir(parents=True, exist_ok=True)
-    at_start, before = read_states(folder / CLAIMS), latest(read_lines(folder, Outcome))
-    missing = {capture.key: capture for capture in captures if not _is_complete(capture, before)}
-    for claim in claims(folder / CLAIMS, list(missing), at_start, patience):
+    for name in (_CLAIMS, _LOGS):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    at_start, previous = read_states(folder / _CLAIMS), latest(read_lines(folder, Outcome))
+    missing = {capture.key: capture for capture in captures if not _is_complete(capture, previous)}
+    for claim in claims(folder / _CLAIMS, list(missing), at_start, patience):
         capture = missing[claim.key]
         try:
             say(f"{capture.name} …")
-            outcome = _outcome(capture, claim, folder, patience, worker, program)
+            outcome = _lift_capture(capture, claim, folder, patience, worker, program)
         except BaseException:
             end(claim, LEFT)
             raise
         if outcome is None:
-            say(f"{capture.name}: left to another worker, which took this one for dead")
+            say(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
             continue
         append_line(folder / f"{worker}{SUFFIX}", outcome)
         end(claim, outcome.state)
-        told = {"done": "lifted", "skipped": "lifted already", "failed": f"failed: {outcome.message}"}
-        say(f"{capture.name}: {told[outcome.state]} ({outcome.seconds:.1f} s)")
+        results = {"done": "lifted", "skipped": "already lifted", "failed": f"failed: {outcome.message}"}
+        say(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
     return latest(read_lines(folder, Outcome))
 
 
-def _is_complete(capture: Capture, before: dict[str, Outcome]) -> bool:
-    """Whether nothing is left to do: the capture is lifted, and a line of JSON says so."""
-    known = before.get(capture.key)
-    if known is None or known.state == "failed":
+def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
+    """Return whether a capture is lifted and has a result that says so."""
+    outcome = outcomes.get(capture.key)
+    if outcome is None or outcome.state == "failed":
         return False
     try:
         return capture.run is None or is_lifted(capture.run)
-    except InputError:  # told when it is its turn
+    except InputError:  # reported when the capture is processed
         return False
 
 
-def _outcome(
+def _lift_capture(
     capture: Capture, claim: Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
 ) -> Outcome | None:
-    """Lifts a capture unless it is lifted; None where another worker has taken over."""
-    begun, log = time.monotonic(), folder / LOGS / f"{claim.path.name}.log"
+    """Lift a capture unless it is already lifted; return None if another worker has taken over."""
+    start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
 
-    def told(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
+    def outcome(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
         run = None if capture.run is None or state == "failed" else str(capture.run)
-        seconds, now = time.monotonic() - begun, time.time()
+        seconds, now = time.monotonic() - start_time, time.time()
         return Outcome(capture.name, capture.key, claim.number, state, seconds, message, code, run, worker, now)
 
     try:
         if capture.run is not None and is_lifted(capture.run):
-            return told("skipped")
+            return outcome("skipped")
         beats = count(1)
         code = run_program([*program, *capture.words], log, lambda: beat(claim, next(beats)), patience / BEATS)
         if code is None:
             return None
         if code == 0:
-            return told("done")
-        if capture.run is not None and is_lifted(capture.run):  # by a worker that was taken for dead
-            return told("skipped")
+            return outcome("done")
+        if capture.run is not None and is_lifted(capture.run):  # by a worker that was considered dead
+            return outcome("skipped")
     except InputError as error:
-        return told("failed", str(error), 1)
-    return told("failed", why(code, log), code if code > 0 else 128 - code)
+        return outcome("failed", str(error), 1)
+    return outcome("failed", why(code, log), code if code > 0 else 128 - code)
