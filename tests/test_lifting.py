@@ -121,7 +121,7 @@ def test_images_that_share_an_instance_mask_or_a_frame_are_refused(tmp_path: Pat
         run_lerf([run], [tmp_path], LerfOptions())
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))
     run = EvaluatedRun(scene("a/0000.png"), None, ColourEncoder(), True)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="name no object"):
+    with pytest.raises(InputError, match="have no objects"):
         run_lerf([run], [tmp_path], LerfOptions())
 
 
