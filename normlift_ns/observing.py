@@ -180,7 +180,7 @@ def block_evidence(
             progress=lambda *_: done(),
         )
         keep_views(evidence, folder, [keys[view] for view in missing])
-        cached.update((view, Place(evidence, place)) for place, view in enumerate(missing))
+        cached.update((view, Place(evidence, index)) for index, view in enumerate(missing))
     return of_regions(joined_views(cached).to(gaussians.means.device), block)
 
 

@@ -106,8 +106,8 @@ def gaussian_truth(
     by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.rows.weight))
     total = by_class.sum(1) + evidence.unlabeled.row_sums().to(by_class)
     best = by_class.max(dim=1)
-    known = (total >= min_weight) & (best.values >= purity * total)
-    return torch.where(known, best.indices, NO_CLASS)
+    valid = (total >= min_weight) & (best.values >= purity * total)
+    return torch.where(valid, best.indices, NO_CLASS)
 
 
 def evaluate_masks(
@@ -127,15 +127,15 @@ def evaluate_masks(
     of_gaussians = class_scores(confusion(truth, prediction, classes))
     counts = sum((confusion(t, f, classes) for t, f in pixels), torch.zeros(classes, classes + 1, dtype=torch.int64))
     of_pixels = class_scores(counts)
-    known = truth >= 0
-    correct = (prediction == truth)[known].double()
+    scored = truth >= 0
+    correct = (prediction == truth)[scored].double()
     results = {
         "miou_3d": of_gaussians.miou,
         "macc_3d": of_gaussians.macc,
         "accuracy_3d": float(correct.mean()) if len(correct) > 0 else float("nan"),
         "miou_2d": of_pixels.miou,
         "macc_2d": of_pixels.macc,
-        "gaussians_with_truth_share": float(known.double().mean()),
+        "gaussians_with_truth_share": float(scored.double().mean()),
         "zero_evidence_share": float((reliability == 0).double().mean()),
     }
     rows = [

@@ -51,14 +51,14 @@ def signals(*scenes: SceneSignals) -> dict[str, float]:
         torch.cat([getattr(scene.scalars, name) for scene in scenes]) for name in ("reliability", "norm", "view_count")
     )
     opacity, seen = torch.cat([scene.opacity for scene in scenes]), reliability > 0
-    known, correct = _correct_predictions(scenes)
+    labeled, correct = _correct_predictions(scenes)
     out: dict[str, float] = {}
     for name, group in (("all", torch.ones_like(seen)), ("zero", ~seen), ("seen", seen)):
         out[f"{name}.share"] = _mean(group, torch.ones_like(group))
         out[f"{name}.opacity"] = _mean(opacity, group)
         out[f"{name}.faint"] = _mean(opacity < _FAINT_OPACITY, group)
         out[f"{name}.views"] = _mean(views, group)
-        out |= {f"{name}.accuracy_{kind}": _mean(right, group & known) for kind, right in correct.items()}
+        out |= {f"{name}.accuracy_{kind}": _mean(right, group & labeled) for kind, right in correct.items()}
     r, o = reliability[seen], opacity[seen]
     for name, test in (("spearman", spearman_test(r, o)), ("kendall", kendall_test(r, o))):
         out |= {f"opacity.{name}": test.value, f"opacity.{name}_p": test.p}
@@ -66,7 +66,7 @@ def signals(*scenes: SceneSignals) -> dict[str, float]:
     out |= {f"opacity.quintile{i + 1}": x for i, x in enumerate(_bins(r, o, 5))}
     if "unrefined" in correct:
         for name, key in (("reliability", reliability), ("norm", norm)):
-            bins = accuracy_bins(key[known], correct["unrefined"][known])
+            bins = accuracy_bins(key[labeled], correct["unrefined"][labeled])
             out |= {f"{name}.bin{i + 1}": x for i, x in enumerate(bins)}
             order = torch.arange(len(bins), dtype=torch.float64)
             test = spearman_test(order, torch.tensor(bins, dtype=torch.float64))

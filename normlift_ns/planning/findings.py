@@ -52,12 +52,14 @@ def of_views(scene: Scene) -> Finding:
     for camera in scene.train.cameras:
         visible |= in_view(means, camera)
     share = float(visible.float().mean())
-    found = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
+    message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
     if share < _NONE_IN_VIEW:
-        return Finding("in view", "error", found, "give the cameras of this splat, or --world-transform")
+        return Finding("in view", "error", message, "give the cameras of this splat, or --world-transform")
     if share < _FEW_IN_VIEW:
-        return Finding("in view", "warning", found, "the others get no semantics; are these the cameras of the splat?")
-    return Finding("in view", "ok", found)
+        return Finding(
+            "in view", "warning", message, "the others get no semantics; are these the cameras of the splat?"
+        )
+    return Finding("in view", "ok", message)
 
 
 def of_device(device: str) -> Finding:
@@ -66,10 +68,10 @@ def of_device(device: str) -> Finding:
         free, total = torch.cuda.mem_get_info(device)
         name = torch.cuda.get_device_name(device)
         return Finding("device", "ok", f"{name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free")
-    found = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
+    message = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
     if torch.cuda.is_available():
-        return Finding("device", "warning", f"{found}, although one is available", "--device cuda")
-    return Finding("device", "ok", found)
+        return Finding("device", "warning", f"{message}, although one is available", "--device cuda")
+    return Finding("device", "ok", message)
 
 
 def of_versions() -> Finding:
@@ -78,16 +80,16 @@ def of_versions() -> Finding:
     specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
     names = ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
     missing = [name for name in names if _version(name) is None]
-    found = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
+    message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
     if missing == ["nerfstudio"]:
         return Finding(
-            "versions", "warning", f"{found}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
+            "versions", "warning", f"{message}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
         )
     if len(missing) > 0:
         return Finding(
-            "versions", "error", f"{found}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
+            "versions", "error", f"{message}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
         )
-    return Finding("versions", "ok", f"{found}, normlift_ns {_version('normlift-ns') or 'from source'}")
+    return Finding("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 
 def _version(name: str) -> str | None:
@@ -117,8 +119,8 @@ def of_weights(missing: Sequence[str]) -> Finding:
     """Check that all weights are on this machine."""
     if len(missing) == 0:
         return Finding("weights", "ok", "all required weights are on this machine")
-    found = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
-    return Finding("weights", "warning", found, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
+    message = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
+    return Finding("weights", "warning", message, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
 
 
 def of_memory(plan: Plan, device: str) -> list[Finding]:
@@ -141,11 +143,11 @@ def of_disk(plan: Plan, folder: Path) -> Finding:
     return _check_capacity("disk", plan.disk_bytes, shutil.disk_usage(existing).free, advice)
 
 
-def _check_capacity(what: str, needed: int, free: int, advice: str) -> Finding:
+def _check_capacity(name: str, needed: int, free: int, advice: str) -> Finding:
     """Compare needed bytes with free bytes."""
-    found = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
+    message = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
     state: State = "error" if needed > free else "warning" if needed > _HIGH_SHARE * free else "ok"
-    return Finding(what, state, found, "" if state == "ok" else advice)
+    return Finding(name, state, message, "" if state == "ok" else advice)
 
 
 def _free_memory() -> int | None:

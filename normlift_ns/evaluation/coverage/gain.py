@@ -145,19 +145,19 @@ def known_of_lift(scalars: Scalars, lifted: SparseRows, surface: Float64[Tensor,
     return Known(torch.where(valid, norm, mean), weight, squared, surface, beta)
 
 
-def gains(known: Known, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
+def gains(model: Known, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
     """Return gain(v) of every view, in addition to the lifted ones."""
-    before = known.expected(known.weight, known.squared)
+    before = model.expected(model.weight, model.squared)
     rise = torch.zeros(count, dtype=torch.float64, device=before.device)
     parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
     for row, column, weight in zip(*parts):
         added = weight.double()
-        after = known.expected(known.weight[row] + added, known.squared[row] + added**2, row)
-        rise.index_add_(0, column.long(), known.surface[row] * (after - before[row]).clamp(min=0))
-    return _ratio(rise, known.surface.sum())
+        after = model.expected(model.weight[row] + added, model.squared[row] + added**2, row)
+        rise.index_add_(0, column.long(), model.surface[row] * (after - before[row]).clamp(min=0))
+    return _ratio(rise, model.surface.sum())
 
 
-def choose_views(known: Known, views: SparseRows, count: int, most: int) -> list[tuple[int, float]]:
+def choose_views(model: Known, views: SparseRows, count: int, most: int) -> list[tuple[int, float]]:
     """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
 
     Views without any gain are not returned.
@@ -167,13 +167,13 @@ def choose_views(known: Known, views: SparseRows, count: int, most: int) -> list
     """
     chosen: list[tuple[int, float]] = []
     for _ in range(min(most, count)):
-        gain = gains(known, views, count)
+        gain = gains(model, views, count)
         gain[[view for view, _ in chosen]] = 0.0
         best = int(gain.argmax())
         if not float(gain[best]) > 0:
             break
         chosen.append((best, float(gain[best])))
-        known = known.seen_by(views, best)
+        model = model.seen_by(views, best)
     return chosen
 
 

@@ -168,7 +168,7 @@ def look_at(
 def suggest_poses(
     drawn: Drawn,
     cameras: Sequence[Camera],
-    known: Known,
+    model: Known,
     targets: Sequence[Sequence[float]],
     parts: Sequence[Tensor],
 ) -> list[Pose]:
@@ -193,11 +193,11 @@ def suggest_poses(
     if len(candidates) == 0:
         return []
     weights = view_weights(drawn, candidates)
-    shown = shown_shares(weights, len(candidates), known.surface, parts)
-    inside = torch.zeros_like(known.surface)
+    shown = shown_shares(weights, len(candidates), model.surface, parts)
+    inside = torch.zeros_like(model.surface)
     inside[torch.cat(list(parts))] = 1
-    share = float((inside * known.surface).sum() / known.surface.sum())
-    lacking = replace(known, surface=inside * known.surface)
+    share = float((inside * model.surface).sum() / model.surface.sum())
+    lacking = replace(model, surface=inside * model.surface)
     available = shown.amax(0) >= SEES
     poses: list[Pose] = []
     while len(poses) < POSES and bool(available.any()):

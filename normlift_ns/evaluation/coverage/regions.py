@@ -73,7 +73,7 @@ def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
 
 
 def weak_regions(
-    known: Evidenced, *, min_reliability: float, reach: float
+    evidence: Evidenced, *, min_reliability: float, reach: float
 ) -> tuple[list[Region], list[Int64[Tensor, " m"]]]:
     """Return regions of visible Gaussians with R_j(S) below a bound, and their Gaussians, sorted by their lack of
     evidence.
@@ -83,20 +83,20 @@ def weak_regions(
     Args:
         reach: as in `connected_components`.
     """
-    surface = known.surface
-    weak = visible(surface) & (known.reliability < min_reliability)
-    labels = connected_components(known.means, weak, reach=reach)
+    surface = evidence.surface
+    weak = visible(surface) & (evidence.reliability < min_reliability)
+    labels = connected_components(evidence.means, weak, reach=reach)
     chosen = (labels >= 0).nonzero().squeeze(1)
-    number, lacking = labels[chosen].long(), surface * (min_reliability - known.reliability)
+    number, lacking = labels[chosen].long(), surface * (min_reliability - evidence.reliability)
     share, lack = (torch.bincount(number, x[chosen]) for x in (surface / surface.sum(), lacking))
     listed = (share >= _MIN_SHARE).nonzero().squeeze(1)
     listed = listed[lack[listed].argsort(descending=True, stable=True)][:_MAX_REGIONS]
     parts = [chosen[number == i] for i in listed.tolist()]
-    return [_region(known, rows) for rows in parts], parts
+    return [_region(evidence, rows) for rows in parts], parts
 
 
-def _region(known: Evidenced, rows: Int64[Tensor, " m"]) -> Region:
-    surface, means, norm = known.surface[rows], known.means[rows].double(), known.scalars.norm[rows]
+def _region(evidence: Evidenced, rows: Int64[Tensor, " m"]) -> Region:
+    surface, means, norm = evidence.surface[rows], evidence.means[rows].double(), evidence.scalars.norm[rows]
     weight = surface / surface.sum()
 
     def mean(values: Tensor, weight: Tensor = weight) -> float:
@@ -107,10 +107,10 @@ def _region(known: Evidenced, rows: Int64[Tensor, " m"]) -> Region:
         size=len(rows),
         centre=(weight[:, None] * means).sum(0).tolist(),
         box={"min": means.amin(0).tolist(), "max": means.amax(0).tolist()},
-        share=float(surface.sum() / known.surface.sum()),
-        reliability=mean(known.reliability[rows]),
-        lifted_reliability=mean(known.scalars.reliability[rows]),
+        share=float(surface.sum() / evidence.surface.sum()),
+        reliability=mean(evidence.reliability[rows]),
+        lifted_reliability=mean(evidence.scalars.reliability[rows]),
         norm=mean(norm, evidenced / evidenced.sum()) if bool((evidenced > 0).any()) else 0.0,
-        views=mean(known.views[rows]),
-        unsupported=mean(known.unsupported[rows]),
+        views=mean(evidence.views[rows]),
+        unsupported=mean(evidence.unsupported[rows]),
     )

@@ -152,17 +152,17 @@ def coverage_of(
         raise InputError("no image shows a Gaussian; check that cameras and Gaussians belong to the same scene")
     split = images.lifted
     lifted, unused = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
-    known = known_of_lift(scalars, lifted, surface, beta=vote.beta)
-    reliability = known.expected(known.weight, known.squared)
+    model = known_of_lift(scalars, lifted, surface, beta=vote.beta)
+    reliability = model.expected(model.weight, model.squared)
     lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
     evidenced = Evidenced(gaussians.means, scalars, surface, reliability, views_that_see(lifted, surface), lost)
     regions, parts = weak_regions(evidenced, min_reliability=min_reliability, reach=REACH)
     targets = [region.centre for region in regions]
-    poses = suggest_poses(drawn, images.cameras, known, targets, parts)
+    poses = suggest_poses(drawn, images.cameras, model, targets, parts)
     return Coverage(
         reliability=float((surface * reliability).sum() / surface.sum()),
         regions=regions,
-        photographs=_suggest_images(images, known, unused, parts),
+        photographs=_suggest_images(images, model, unused, parts),
         poses=poses,
         pictures=[draw_pose(drawn, scene, reliability, pose) for pose in poses],
         left_out=images.left_out,
@@ -170,9 +170,9 @@ def coverage_of(
     )
 
 
-def _suggest_images(images: Photographs, known: Known, unused: SparseRows, parts: Sequence[Tensor]) -> list[Photograph]:
+def _suggest_images(images: Photographs, model: Known, unused: SparseRows, parts: Sequence[Tensor]) -> list[Photograph]:
     names, count = images.names[images.lifted :], len(images.why)
-    shown = shown_shares(unused, count, known.surface, parts)
+    shown = shown_shares(unused, count, model.surface, parts)
     return [
         Photograph(
             names[view],
@@ -180,7 +180,7 @@ def _suggest_images(images: Photographs, known: Known, unused: SparseRows, parts
             gain,
             [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= SEES],
         )
-        for view, gain in choose_views(known, unused, count, _MAX_IMAGES)
+        for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
     ]
 
 
