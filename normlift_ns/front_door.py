@@ -47,8 +47,8 @@ def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_
         load_step: step of the checkpoint, the last one if None.
     Raises:
         FileNotFoundError: the config, the checkpoint, the dataset or an image is missing.
-        ValueError: the config is of another method or program, the checkpoint is damaged, or the dataset is not the
-            run's.
+        ValueError: the config is from another method or program, the checkpoint is damaged, or the dataset is not that
+            of the run.
 
     >>> scene = open_scene(config)
     >>> len(scene.train), scene.train[1].image.shape

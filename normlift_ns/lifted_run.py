@@ -92,6 +92,7 @@ class LiftedRun:
         """Compute the relevancy and the selection of every Gaussian for each prompt.
 
         Args:
+            texts: prompts.
             negatives: prompts to compare with. If None, use LERF's canonical negatives if the encoder knows them.
             rule: how to compute relevancy from cosines, see `relevancy`. "auto" is lerf with negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
@@ -100,7 +101,7 @@ class LiftedRun:
             min_reliability: minimum R of a selected Gaussian, in 0..1.
             refined: use the refined features, after the vote.
         Raises:
-            ValueError: no prompt, an empty prompt, or one that the encoder does not understand.
+            ValueError: there is no prompt, a prompt is empty, or the encoder does not understand one.
         """
         if not all(isinstance(text, str) for text in texts):
             raise InputError(f'ask takes each prompt as its own argument, as in ask("red", "blue"); got {texts!r}')
@@ -154,8 +155,7 @@ class LiftedRun:
 
         Args:
             path: PLY file to write.
-            part: an answer or a finding, for the Gaussians that it selects, or a mask of Gaussians. If None, write the
-                whole scene.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians. If None, write the whole scene.
             answer: answer that provides relevancies, class_id and instance_id. If None, use that of `part`, if it has
                 one.
             objects: table to write to <stem>_objects.json, with JSON types only.
@@ -166,8 +166,8 @@ class LiftedRun:
             The row indices of the written Gaussians.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: no Gaussian of the part is ever drawn, the mask has another type or length, or a file of the run
-                has that name.
+            ValueError: no Gaussian of the part is ever drawn, the mask has another type or length, or the name is
+                reserved for a file of a run.
         """
         path = check_path("path", path)
         check_bool("overwrite", overwrite)
@@ -204,14 +204,14 @@ class LiftedRun:
         rest: bool = False,
         overwrite: bool = False,
     ) -> list[Path]:
-        """Write a PNG mask for each training image, in its size, and return the paths.
+        """Write a PNG mask for each training image, with the size of the image, and return the paths.
 
         A pixel is 255 if the selection makes up more than half of it, else 0. Gaussians in front occlude the selection.
         Lens distortion is removed, as in training.
 
         Args:
             folder: folder to write to.
-            part: an answer or a finding, for the Gaussians that it selects, or a mask of Gaussians.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians.
             rest: invert the masks. Pixels without any Gaussian are then 255, too.
             overwrite: replace files of these names.
         Raises:
@@ -237,17 +237,18 @@ class LiftedRun:
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
     ) -> Labelled:
-        """Copy a point cloud or mesh, adding the relevancies, class_id and instance_id of the nearest Gaussian to each
-        point.
+        """Label a point cloud or mesh from the nearest Gaussians, and write it to a new PLY file.
+
+        Each point gets the relevancies, class_id and instance_id of its Gaussian.
 
         Args:
             cloud: PLY file to read.
             path: PLY file to write.
-            part: an answer, or one of its findings, whose answer is used.
+            part: an answer, or a finding, which stands for its answer.
             transfer_distance: maximum distance from a point to the center of its Gaussian, in units of the median
                 spacing of the Gaussians.
-            coordinates: coordinate system of the cloud. capture: of the cameras, before nerfstudio rotated and scaled
-                them. scene: of the Gaussians.
+            coordinates: coordinate system of the cloud, "capture" or "scene". "capture" is that of the cameras before
+                nerfstudio rotated and scaled them, "scene" that of the Gaussians.
             overwrite: replace a file of that name.
         Raises:
             FileNotFoundError: the cloud does not exist.
@@ -299,16 +300,18 @@ class LiftedRun:
 
     @cached_property
     def votes(self) -> Votes:
-        """Evidence of the lift by training image. `votes.pictures(why.views[:3])` draws the three images with the
-        largest share."""
+        """Evidence of the lift by training image.
+
+        `votes.pictures(why.views[:3])` draws that of the three images with the largest share.
+        """
         return Votes(self.scene, self.field, cache_folder(self.folder))
 
     def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
         """Explain a selection: which images and regions voted for it, and how far they agree.
 
         Args:
-            part: an answer or a finding, for the Gaussians that it selects, or a mask of Gaussians, for their refined
-                features.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians, for which refined features are
+                used.
         Raises:
             ValueError: the selection is empty, the mask has another type or length, or the cache of a run that stores
                 only directions no longer holds the evidence or the features.
@@ -334,8 +337,8 @@ class LiftedRun:
         every value.
 
         Args:
-            part: an answer or a finding, for the Gaussians that it selects, or a mask of Gaussians, whose objects have
-                no text. A Gaussian that several prompts select belongs to the one with the largest relevancy.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians, whose objects have no text. A
+                Gaussian that several prompts select belongs to the one with the largest relevancy.
             metres_per_unit: length of one unit of the capture in meters. With it, positions in the capture are in
                 meters.
         Raises:
@@ -360,8 +363,9 @@ class LiftedRun:
 
     @property
     def to_capture(self) -> Similarity:
-        """Transform from the coordinates of the Gaussians to those of the capture. It inverts the transform of the
-        training.
+        """Transform from the coordinates of the Gaussians to those of the capture.
+
+        It inverts the transform of the training.
 
         Raises:
             FileNotFoundError, ValueError: as `catalogue`.
@@ -436,8 +440,9 @@ class LiftedRun:
         return cameras[matches[0]]
 
     def render(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> UInt8[Tensor, "h w 3"]:
-        """Render the scene from a camera. With an answer, selected Gaussians are colored by relevancy and the others
-        are gray.
+        """Render the scene from a camera.
+
+        With an answer, selected Gaussians are colored by relevancy and the others are gray.
 
         Args:
             view: training image, as in `camera`, or any camera.
