@@ -1,6 +1,6 @@
 """Training-free open-vocabulary semantics for trained Gaussian splats. See README.md and docs/method.md.
 
-The names below are loaded when they are first used: importing the package costs nothing.
+The names below are imported lazily, on first use, so importing the package is fast.
 """
 
 from importlib import import_module
@@ -83,7 +83,7 @@ _HOMES = {
     "raster.settings": ("RasterSettings",),
     "scenes.opening": ("open_splat",),
 }
-"""Modules by the public names that they define."""
+"""Public names by the module that defines them."""
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = list(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -1,4 +1,4 @@
-"""The front door: opening a trained scene or a lifted run, and lifting."""
+"""Python API: open a trained scene or a lifted run, and lift features."""
 
 from __future__ import annotations
 
@@ -37,29 +37,33 @@ from normlift_ns.together import lift_run_together
 
 
 def open_scene(load_config: str | Path, *, data: str | Path | None = None, load_step: int | None = None) -> Scene:
-    """A trained splatfacto run or a lifted one, from any working directory. A splat without a run: see `open_splat`.
+    """Open a trained splatfacto run or a lifted run, from any working directory.
+
+    For a splat without a nerfstudio run, see `open_splat`.
 
     Args:
         load_config: config.yml of the run.
-        data: where the dataset is now, if it was moved.
-        load_step: step of the checkpoint; None: the last.
+        data: current path of the dataset, if it was moved.
+        load_step: step of the checkpoint, the last one if None.
     Raises:
-        FileNotFoundError: config, checkpoint, dataset or an image is missing.
-        ValueError: a config of another method or program, a damaged checkpoint, another dataset than the run's.
+        FileNotFoundError: the config, the checkpoint, the dataset or an image is missing.
+        ValueError: the config is from another method or program, the checkpoint is damaged, or the dataset is not that
+            of the run.
 
     >>> scene = open_scene(config)
     >>> len(scene.train), scene.train[1].image.shape
     (12, torch.Size([120, 160, 3]))
     """
-    config, place = check_path("load_config", load_config), None if data is None else check_path("data", data)
+    config = check_path("load_config", load_config)
+    data = None if data is None else check_path("data", data)
     load_step = None if load_step is None else check_number("load_step", load_step, int)
     run_dir = Path(os.path.abspath(config)).parent
     if not run_dir.exists():
-        clean(run_dir.parent)  # a lift that was killed while it replaced the run
+        clean(run_dir.parent)  # a lift was killed while it replaced the run
     if config.is_file() and is_saved_splat(run_dir):
-        scene = open_saved_splat(run_dir, data=place, load_step=load_step)
+        scene = open_saved_splat(run_dir, data=data, load_step=load_step)
     else:
-        scene = load_scene(config, data=place, load_step=load_step, by_nerfstudio=_by_nerfstudio)
+        scene = load_scene(config, data=data, load_step=load_step, by_nerfstudio=_by_nerfstudio)
         scene = with_saved(scene, run_dir)
     rules = recorded_rules(run_dir)
     return scene if rules is None else replace(scene, identity={**scene.identity, "gsplat_rules": rules})
@@ -79,16 +83,17 @@ def open_run(
     text_vectors: str | Path | None = None,
     text_template: str | None = None,
 ) -> LiftedRun:
-    """Opens a lifted run, from any working directory.
+    """Open a lifted run, from any working directory.
 
     Args:
         load_config: config.yml of the run.
-        data: where the dataset is now, if it was moved.
-        device: where the text encoder works: auto, cpu or cuda.
-        text_vectors: NPZ file, text -> vector, to look texts up in instead of the encoder that the run was lifted with.
-        text_template: what open_clip reads for a text, which takes the place of {}; None: as the run was lifted.
+        data: current path of the dataset, if it was moved.
+        device: device of the text encoder (auto, cpu or cuda).
+        text_vectors: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
+        text_template: template such as "a photo of {}" that open_clip applies to prompts. If None, use that of the
+            lift.
     Raises:
-        FileNotFoundError, ValueError: as `open_scene`; a run without semantics, or with those of other Gaussians.
+        FileNotFoundError, ValueError: as `open_scene`; also if the run has no semantics, or those of other Gaussians.
 
     >>> run = open_run(config)
     >>> answer = run.ask("red", "yellow", min_reliability=0.3)
@@ -107,18 +112,24 @@ def open_run(
 
 
 def cameras_changed(field: SemanticField, scene: Scene) -> str | None:
-    """A warning where the cameras are not those of the lift; None also for fields that do not know them."""
+    """Return a warning if the cameras differ from those of the lift.
+
+    Return None if they do not, or if the field does not record its cameras.
+    """
     changed = [
-        what
-        for what, key, views in (("training", "cameras", scene.train), ("held-out", "cameras_held_out", scene.held_out))
-        if (known := field.manifest.get(key)) is not None and cameras_differ(known, camera_summary(views.cameras))
+        split
+        for split, key, views in (
+            ("training", "cameras", scene.train),
+            ("held-out", "cameras_held_out", scene.held_out),
+        )
+        if (recorded := field.manifest.get(key)) is not None and cameras_differ(recorded, camera_summary(views.cameras))
     ]
     if len(changed) == 0:
         return None
     return (
-        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the data set "
-        "has changed since. Answers are those of the lift, but pictures and evaluations use the new cameras; restore "
-        "the data set, say where it is with --data, or lift again"
+        f"the {' and '.join(changed)} cameras of {scene.name} are not those that the run was lifted with: the dataset "
+        "has changed since. Query results are those of the lift, but renders and evaluations use the new cameras. "
+        "Restore the dataset, give its path with --data, or lift again"
     )
 
 
@@ -141,36 +152,35 @@ def lift_run(
     report: Report = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> LiftedRun:
-    """Lifts 2D features onto the Gaussians of a trained run, and writes a lifted run beside it.
+    """Lift 2D features onto the Gaussians of a trained run, and write a lifted run next to it.
 
-    The new run is outputs/<experiment>/normlift/<timestamp>, which ns-viewer, ns-render and the ns-normlift commands
-    open.
+    The new run is outputs/<experiment>/normlift/<timestamp>. ns-viewer, ns-render and the ns-normlift commands open it.
 
     Args:
-        config_or_scene: config.yml of the trained run, or a scene of `open_scene` or `open_splat`.
-        source: which 2D features to make of the photographs; None: as ns-normlift does by default.
-        features: features of your own in place of `source`: per training image a label map [H, W] of the undistorted
-            image, at the size that `lift_downscale` leaves, with regions 0..R-1 and -1 for none, and vectors [R, D].
-            One pair per image, or a dictionary by names of images, which may leave some out.
-        texts: with `features`: what the run can be asked, with vectors [D]; they are stored in the run.
-        lift: how to lift.
-        queries: texts to store in the run; ns-render and ns-viewer show their relevancy.
-        data: as in `open_scene`, for a config.
-        load_step: likewise.
-        output_dir: in place of the run's own outputs folder.
-        timestamp: name of the new run directory; None: the present time, with a number where a run has that name.
-        overwrite: replace a run directory of that name, and exported files of other content.
-        check: compare three training views with renders of the scene first; warn where they differ, and refuse splats
-            that do not show what their photographs show.
+        config_or_scene: config.yml of the trained run, or a scene from `open_scene` or `open_splat`.
+        source: which 2D features to compute from the images. If None, use the defaults of ns-normlift.
+        features: your own features, instead of `source`. A training image has a label map [H, W] and vectors [R, D].
+            The label map has the size of the undistorted image after `lift_downscale`. Its values are regions 0..R-1,
+            or -1 for no region. Pass one pair per image, or a dictionary by image name, which may omit images.
+        texts: prompts of your own features, with their vectors [D]. The run stores them and can be queried with them.
+        lift: options of the lift.
+        queries: prompts to store in the run; ns-render and ns-viewer show their relevancy.
+        data: as in `open_scene`, for a config only.
+        load_step: as in `open_scene`, for a config only.
+        output_dir: output folder, instead of the outputs folder of the trained run.
+        timestamp: name of the new run directory. If None, use the current time, with a number if such a run exists.
+        overwrite: replace a run directory of that name, and exported files with other content.
+        check: compare three training images with renders of the scene first. Warn if they differ; raise if the splat
+            does not show what the images show.
         device: auto, cpu or cuda.
-        export: where to write the 2D features too, in LangSplat's format.
-        report: called with (stage, steps done, steps in all).
-        say: called with a sentence once the scene is loaded, for example `print`.
+        export: where to also write the 2D features, in LangSplat's format.
+        report: called with (stage, steps done, total steps).
+        say: called with each status line and warning, for example `print`.
     Raises:
         FileExistsError: the run directory exists and `overwrite` is False.
-        FileNotFoundError, ValueError: as `open_scene`; an image, a label map or an option that does not fit.
-        MemoryError: the GPU's memory does not hold the lift.
-        TypeError: neither a config nor a scene of `open_scene` or `open_splat`.
+        FileNotFoundError, ValueError: as `open_scene`; also if an image, a label map or an option does not fit.
+        MemoryError: the lift does not fit into GPU memory.
+        TypeError: `config_or_scene` is neither a config nor a scene from `open_scene` or `open_splat`.
 
     >>> scene = open_scene(config)
     >>> import torch
@@ -180,7 +190,7 @@ def lift_run(
     True
     """
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
-        raise InputError("data and load_step are for a config; give them to open_scene")
+        raise InputError("data and load_step apply to a config only; pass them to open_scene")
     run = lift_run_together(
         ALONE, opener(config_or_scene, data, load_step), source=source, features=features, texts=texts, lift=lift,
         queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check, device=device,
@@ -193,7 +203,7 @@ def lift_run(
 def opener(
     config_or_scene: str | Path | Scene, data: str | Path | None = None, load_step: int | None = None
 ) -> Callable[[], Scene]:
-    """What opens a scene when it is needed."""
+    """Return a function that opens the scene when called."""
     if not isinstance(config_or_scene, str | Path):
         return lambda: config_or_scene
     return partial(open_scene, config_or_scene, data=data, load_step=load_step)

@@ -1,4 +1,4 @@
-"""A lifted run: a trained scene with its semantics, and all that can be done with it."""
+"""A lifted run: a trained scene with its semantics, and methods to query, export and render it."""
 
 from __future__ import annotations
 
@@ -55,25 +55,25 @@ class LiftedRun:
     """
 
     folder: Path
-    """The run directory, which holds config.yml."""
+    """Run directory, which contains config.yml."""
     scene: Scene
     field: SemanticField
     device: str = "cpu"
-    """Where the text encoder works."""
+    """Device of the text encoder."""
     seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Of each stage of the lift that made the run; empty where it was opened."""
+    """Duration of each stage of the lift, in seconds; empty for a run that was opened from disk."""
 
     def __repr__(self) -> str:
         return f"LiftedRun {self.folder}: {len(self.field):,} Gaussians"
 
     @property
     def config(self) -> Path:
-        """The config.yml, for ns-viewer and the other commands."""
+        """Path of config.yml, for ns-viewer and the other commands."""
         return self.folder / "config.yml"
 
     @cached_property
     def texts(self) -> Texts:
-        """The encoder of texts that fits the field; it loads its network when it first needs it.
+        """Text encoder that fits the field. It loads its network on first use.
 
         Raises:
             ValueError, FileNotFoundError: as `encoder_of`.
@@ -89,20 +89,22 @@ class LiftedRun:
         min_reliability: float = 0.0,
         refined: bool = True,
     ) -> Answer:
-        """Relevancy and selection of every Gaussian for each text.
+        """Compute the relevancy and the selection of every Gaussian for each prompt.
 
         Args:
-            negatives: texts to compare with; None: LERF's, where the encoder knows them.
-            rule: how relevancy follows from cosines, see `relevancy`. "auto": lerf with negatives, else cosine.
-            threshold: relevancy above which a Gaussian is selected. "auto": what the histogram of the relevancies
-                suggests. None: 0.5, for rule margin 0.02, for bare cosines of other encoders than colour "auto".
+            texts: prompts.
+            negatives: prompts to compare with. If None, use LERF's canonical negatives if the encoder knows them.
+            rule: how to compute relevancy from cosines, see `relevancy`. "auto" is lerf with negatives, else cosine.
+            threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
+                relevancies. None is 0.5, or 0.02 for rule margin, or "auto" for bare cosines of encoders other than
+                colour.
             min_reliability: minimum R of a selected Gaussian, in 0..1.
-            refined: use refined features.
+            refined: use the refined features, after the vote.
         Raises:
-            ValueError: no text, an empty one, or one that the encoder does not understand.
+            ValueError: there is no prompt, a prompt is empty, or the encoder does not understand one.
         """
         if not all(isinstance(text, str) for text in texts):
-            raise InputError(f'ask takes texts one after the other, as in ask("red", "blue"); got {texts!r}')
+            raise InputError(f'ask takes each prompt as its own argument, as in ask("red", "blue"); got {texts!r}')
         question = make_question(
             self.field,
             self.texts.rows,
@@ -116,23 +118,23 @@ class LiftedRun:
         return answer(self.field, self.scene.gaussians.means, question)
 
     def ask_stored(self) -> Answer | None:
-        """The answer to the question stored in the run; None if there is none."""
+        """Return the answer to the question stored in the run; None if there is none."""
         question = load_question(self.folder / FIELD_FOLDER)
         return None if question is None else answer(self.field, self.scene.gaussians.means, question)
 
     def save(self, question: Question | Answer) -> Path:
-        """Stores a question in the run, in place of an earlier one: ns-render and ns-viewer draw its answer.
+        """Store a question in the run, replacing an earlier one. ns-render and ns-viewer draw its answer.
 
         Raises:
-            ValueError: vectors of another length than the field's.
+            ValueError: the vectors have another length than the field's directions.
         """
         question = question.question if isinstance(question, Answer) else question
         if not isinstance(question, Question):
-            raise InputError(f"save takes an answer of this run or its question, got {type(question).__name__}")
+            raise InputError(f"save takes an answer from this run or its question, got {type(question).__name__}")
         if question.vectors.shape[1] != self.field.dimension:
             raise InputError(
-                f"the question has vectors of {question.vectors.shape[1]} numbers, the features of {self.folder} have "
-                f"{self.field.dimension}; ask this run, then save its answer"
+                f"the question has vectors of {question.vectors.shape[1]} numbers, but the features of {self.folder} "
+                f"have {self.field.dimension}; ask this run, then save its answer"
             )
         return save_question(self.folder / FIELD_FOLDER, question)
 
@@ -147,32 +149,37 @@ class LiftedRun:
         min_size: int = MIN_SIZE,
         overwrite: bool = False,
     ) -> Int64[ndarray, " m"]:
-        """Writes Gaussians to a PLY file, and beside it their rows in the scene as <stem>_rows.npy; returns those rows.
-        With an answer, the names of its classes and objects go to <stem>_names.json.
+        """Write Gaussians to a PLY file, and their row indices in the scene to <stem>_rows.npy next to it.
+
+        With an answer, the names of its classes and objects are written to <stem>_names.json.
 
         Args:
-            part: what an answer, or one of its findings, selects; or a mask of Gaussians; None: the whole scene.
-            answer: whose relevancies, class_id and instance_id the file gets; None: that of `part`, if it has one.
-            objects: a table to write beside it as <stem>_objects.json, JSON types only.
-            reach: of objects, as in `find_objects`.
-            min_size: likewise.
-            overwrite: replace files of these names; without `objects`, an earlier table of them goes.
+            path: PLY file to write.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians. If None, write the whole scene.
+            answer: answer that provides relevancies, class_id and instance_id. If None, use that of `part`, if it has
+                one.
+            objects: table to write to <stem>_objects.json, with JSON types only.
+            reach: largest gap between Gaussians of one object, as in `find_objects`.
+            min_size: minimum number of Gaussians in an object, as in `find_objects`.
+            overwrite: replace files of these names. Without `objects`, also remove an earlier table of objects.
+        Returns:
+            The row indices of the written Gaussians.
         Raises:
-            FileExistsError: a file is there and `overwrite` is False.
-            ValueError: no Gaussian of the part is ever drawn; a mask of another type or length; the name of a file of a
-                run.
+            FileExistsError: a file exists and `overwrite` is False.
+            ValueError: no Gaussian of the part is ever drawn, the mask has another type or length, or the name is
+                reserved for a file of a run.
         """
         path = check_path("path", path)
         check_bool("overwrite", overwrite)
         if path.name == "":
-            raise InputError(f"{path} is no name of a file; give one such as splat.ply")
+            raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
         if answer is not None and not isinstance(answer, Answer):
-            raise InputError(f"answer must be an answer of this run, got {type(answer).__name__}")
+            raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
         refuse_run_files(*export_files(path), instead="name")
-        answer = _asked(part) if answer is None else answer
-        ply, numbers, names, table = export_files(path)
-        for file, wanted in ((ply, True), (numbers, True), (names, answer is not None), (table, objects is not None)):
-            if wanted and file.exists() and not overwrite:
+        answer = _answer_of(part) if answer is None else answer
+        ply, rows, names, table = export_files(path)
+        for file, written in ((ply, True), (rows, True), (names, answer is not None), (table, objects is not None)):
+            if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
         instances = None if answer is None else instances_of(answer, reach=reach, min_size=min_size)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
@@ -197,21 +204,24 @@ class LiftedRun:
         rest: bool = False,
         overwrite: bool = False,
     ) -> list[Path]:
-        """Writes a PNG per training photograph, of its size, 255 where a selection makes more than half of a pixel,
-        else 0. What stands before hides it. Lens distortion is taken out, as the scene was trained. Returns the paths.
+        """Write a PNG mask for each training image, with the size of the image, and return the paths.
+
+        A pixel is 255 if the selection makes up more than half of it, else 0. Gaussians in front occlude the selection.
+        Lens distortion is removed, as in training.
 
         Args:
-            part: what an answer, or one of its findings, selects; or a mask of Gaussians.
-            rest: 255 where the photograph shows anything else, or nothing.
+            folder: folder to write to.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians.
+            rest: invert the masks. Pixels without any Gaussian are then 255, too.
             overwrite: replace files of these names.
         Raises:
-            FileExistsError: a file is there and `overwrite` is False.
-            ValueError: a mask of another type or length.
+            FileExistsError: a file exists and `overwrite` is False.
+            ValueError: the mask has another type or length.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
-        >>> files = run.masks(folder / "masks", run.ask("red")["red"])
-        >>> len(files) == len(run.scene.train), files[0].suffix
+        >>> paths = run.masks(folder / "masks", run.ask("red")["red"])
+        >>> len(paths) == len(run.scene.train), paths[0].suffix
         (True, '.png')
         """
         settings, folder = RasterSettings.recorded(self.field.manifest), check_path("folder", folder)
@@ -227,20 +237,24 @@ class LiftedRun:
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
     ) -> Labelled:
-        """Writes a point cloud or mesh again, with relevancies, class_id and instance_id of the nearest Gaussian.
+        """Label a point cloud or mesh from the nearest Gaussians, and write it to a new PLY file.
+
+        Each point gets the relevancies, class_id and instance_id of its Gaussian.
 
         Args:
-            cloud: a PLY file.
-            path: the PLY file to write.
-            part: an answer, or one of its findings, whose answer is taken.
-            transfer_distance: how far a point may be from the centre of its Gaussian, in units of their median spacing.
-            coordinates: those of the cloud. capture: of the cameras before nerfstudio turned and scaled them. scene: of
-                the Gaussians.
+            cloud: PLY file to read.
+            path: PLY file to write.
+            part: an answer, or a finding, which stands for its answer.
+            transfer_distance: maximum distance from a point to the center of its Gaussian, in units of the median
+                spacing of the Gaussians.
+            coordinates: coordinate system of the cloud, "capture" or "scene". "capture" is that of the cameras before
+                nerfstudio rotated and scaled them, "scene" that of the Gaussians.
             overwrite: replace a file of that name.
         Raises:
-            FileNotFoundError: no such cloud.
-            FileExistsError: a file is there and `overwrite` is False.
-            ValueError: no answer, no PLY file, one that has such labels already; a distance that is not positive.
+            FileNotFoundError: the cloud does not exist.
+            FileExistsError: a file exists and `overwrite` is False.
+            ValueError: `part` has no answer, the cloud is not a PLY file or already has such labels, or the distance is
+                not positive.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -249,14 +263,21 @@ class LiftedRun:
         >>> labelled.points == len(rows), labelled.share  # every point is a Gaussian
         (True, 1.0)
         """
-        answer, path = _asked(part), check_path("path", path)
+        answer, path = _answer_of(part), check_path("path", path)
         if answer is None:
             raise InputError(
-                f"part must be an answer of this run, or what it says of a text; got {type(part).__name__}"
+                f"part must be an answer from this run, or its finding for one prompt; got {type(part).__name__}"
             )
         check_number("transfer_distance", transfer_distance)
-        how: dict[str, Any] = {"distance": transfer_distance, "coordinates": coordinates, "overwrite": overwrite}
-        return self.transfer_to(read_cloud(check_path("cloud", cloud)), path, answer, instances_of(answer), **how)
+        return self.transfer_to(
+            read_cloud(check_path("cloud", cloud)),
+            path,
+            answer,
+            instances_of(answer),
+            distance=transfer_distance,
+            coordinates=coordinates,
+            overwrite=overwrite,
+        )
 
     def transfer_to(
         self,
@@ -269,7 +290,7 @@ class LiftedRun:
         coordinates: Literal["capture", "scene"],
         overwrite: bool,
     ) -> Labelled:
-        """`transfer`, of a cloud that is read and with objects that are found."""
+        """Run `transfer` with a cloud that has been read and objects that have been found."""
         rows = drawn_rows(self.scene.parameters, spherical_harmonics=self.scene.has_harmonics)
         means = self.scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
         means = self.to_capture.points(means) if coordinates == "capture" else means
@@ -279,18 +300,22 @@ class LiftedRun:
 
     @cached_property
     def votes(self) -> Votes:
-        """What photographs said in the lift; `votes.pictures(why.views[:3])` draws what the heaviest three did."""
+        """Evidence of the lift by training image.
+
+        `votes.pictures(why.views[:3])` draws that of the three images with the largest share.
+        """
         return Votes(self.scene, self.field, cache_folder(self.folder))
 
     def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
-        """Which photographs and regions voted for a selection, and how far they agree.
+        """Explain a selection: which images and regions voted for it, and how far they agree.
 
         Args:
-            part: what an answer, or one of its findings, selects; or a mask of Gaussians, taken with refined features.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians, for which refined features are
+                used.
         Raises:
-            ValueError: nothing is selected; a mask of another type or length; the run stores directions only, and its
-                cache no longer holds the evidence or the features.
-            FileNotFoundError: the run stores directions only, and a photograph is gone.
+            ValueError: the selection is empty, the mask has another type or length, or the cache of a run that stores
+                only directions no longer holds the evidence or the features.
+            FileNotFoundError: the run stores only directions, and an image is missing.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -300,22 +325,25 @@ class LiftedRun:
         >>> [picture.image.shape for picture in run.votes.pictures(why.views[:1])]
         [torch.Size([120, 160, 3])]
         """
-        asked = _asked(part)
-        return self.votes.explain(self._mask(part), refined=asked is None or asked.question.refined)
+        answer = _answer_of(part)
+        return self.votes.explain(self._mask(part), refined=answer is None or answer.question.refined)
 
     def catalogue(
         self, part: Answer | Finding | Bool[Tensor, " n"], *, metres_per_unit: float | None = None
     ) -> Catalogue:
-        """The objects of a selection: number, size, oriented box, centroid, extent, R, and the photographs that show
-        each, in the coordinates of the capture and in those of the scene. docs/objects.md explains every number.
+        """List the objects of a selection, in the coordinates of the capture and in those of the scene.
+
+        Each has a number, size, oriented box, centroid, extent, R and the images that show it. docs/objects.md explains
+        every value.
 
         Args:
-            part: what an answer, or one of its findings, selects; or a mask of Gaussians, whose objects have no text.
-                A Gaussian that several texts select belongs to the one of largest relevancy.
-            metres_per_unit: length of one unit of the capture; places in the capture are in metres then.
+            part: Gaussians selected by an answer or finding, or a mask of Gaussians, whose objects have no text. A
+                Gaussian that several prompts select belongs to the one with the largest relevancy.
+            metres_per_unit: length of one unit of the capture in meters. With it, positions in the capture are in
+                meters.
         Raises:
-            ValueError: a mask of another type or length, a length that is not positive, a damaged
-                dataparser_transforms.json.
+            ValueError: the mask has another type or length, the unit length is not positive, or
+                dataparser_transforms.json is damaged.
             FileNotFoundError: the run has no dataparser_transforms.json.
 
         >>> from normlift_ns import open_run
@@ -328,110 +356,120 @@ class LiftedRun:
         """
         if metres_per_unit is not None:
             check_number("metres_per_unit", metres_per_unit)
-        how: dict[str, Any] = {"metres_per_unit": metres_per_unit, "device": self.device}
-        return make_catalogue(self.scene, self.field, self._instances(part), self.to_capture, **how)
+        instances, transform = self._instances(part), self.to_capture
+        return make_catalogue(
+            self.scene, self.field, instances, transform, metres_per_unit=metres_per_unit, device=self.device
+        )
 
     @property
     def to_capture(self) -> Similarity:
-        """From the coordinates of the Gaussians to those of the capture, the transform of its training undone.
+        """Transform from the coordinates of the Gaussians to those of the capture.
+
+        It inverts the transform of the training.
 
         Raises:
             FileNotFoundError, ValueError: as `catalogue`.
         """
-        found = Similarity.identity()
+        transform = Similarity.identity()
         for world in capture_worlds(self.folder, self.scene.identity):
-            found = Similarity.undoing(world.transform, world.scale).then(found)
-        return found
+            transform = Similarity.undoing(world.transform, world.scale).then(transform)
+        return transform
 
     def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:
-        """Classes and objects of a part."""
+        """Return the classes and objects of a part."""
         if isinstance(part, Answer):
             return instances_of(part)
         text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
         return find_instances((text,), self.scene.gaussians.means, mask.float(), mask)
 
     def floaters(self, limit: float = FLOATER_LIMIT) -> Floaters:
-        """Gaussians that likely belong to no surface, see `insight.floaters`. `run.export(path, ~found.mask)` writes
-        the scene without them.
+        """Find Gaussians that likely belong to no surface, see `insight.floaters`.
+
+        `run.export(path, ~floaters.mask)` writes the scene without them.
 
         Args:
             limit: score above which a Gaussian is a likely floater.
         Raises:
-            ValueError: a limit that is not finite.
+            ValueError: the limit is not finite.
 
         >>> from normlift_ns import open_run
-        >>> found = open_run(config).floaters()
-        >>> 0 < int(found.mask.sum()) < 0.1 * len(found.mask)
+        >>> floaters = open_run(config).floaters()
+        >>> 0 < int(floaters.mask.sum()) < 0.1 * len(floaters.mask)
         True
         """
         return find_floaters(self.scene.gaussians, self.field.scalars, limit=limit)
 
     def _mask(self, part: Any) -> Bool[Tensor, " n"]:
-        """The Gaussians of a part.
+        """Return the mask of the Gaussians in a part.
 
         Raises:
-            ValueError: it is none.
+            ValueError: `part` is not a part of this run.
         """
-        mask = part.mask if isinstance(part, Answer | Finding) else _tensor(part)
+        mask = part.mask if isinstance(part, Answer | Finding) else _as_tensor(part)
         if mask is None or mask.dtype != torch.bool or mask.shape != (len(self.field),):
-            found = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
+            actual = type(part).__name__ if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
             raise InputError(
-                f"part must be an answer of this run, what it says of one text, or a mask of {len(self.field)} "
-                f"booleans; got {found}"
+                f"part must be an answer from this run, its finding for one prompt, or a mask of {len(self.field)} "
+                f"booleans; got {actual}"
             )
         return mask
 
     def camera(self, view: str | Path | int) -> Camera:
-        """The camera of a training image, by its number or its name; folder and suffix may be left out.
+        """Return the camera of a training image.
 
+        Args:
+            view: index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            KeyError, IndexError: no such image.
-            ValueError: a name that several images have; give it with its folder.
+            KeyError, IndexError: there is no such image.
+            ValueError: several images have this name; include the folder.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
             return cameras[operator.index(view)]
         name = Path(view).as_posix()
-        found = [i for i, known in enumerate(names) if known == name] or [
+        matches = [i for i, image in enumerate(names) if image == name] or [
             i
-            for i, known in enumerate(names)
-            if name in (str(Path(known).with_suffix("")), Path(known).name, Path(known).stem)
+            for i, image in enumerate(names)
+            if name in (str(Path(image).with_suffix("")), Path(image).name, Path(image).stem)
         ]
-        if len(found) > 1:
-            raise InputError(f"{len(found)} training images are called {name!r}: {', '.join(names[i] for i in found)}")
-        if len(found) == 0:
+        if len(matches) > 1:
+            options = ", ".join(names[i] for i in matches)
+            raise InputError(f"{len(matches)} training images are called {name!r}: {options}; include the folder")
+        if len(matches) == 0:
             raise KeyError(f"there is no training image {name!r}; there are {len(names)}, {names[0]} to {names[-1]}")
-        return cameras[found[0]]
+        return cameras[matches[0]]
 
     def render(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> UInt8[Tensor, "h w 3"]:
-        """The scene as a camera sees it; with an answer, in grey where nothing is selected, coloured by relevancy.
+        """Render the scene from a camera.
+
+        With an answer, selected Gaussians are colored by relevancy and the others are gray.
 
         Args:
-            view: a training image, as `camera` takes it, or any camera.
-            found: an answer, or what it says of one text.
+            view: training image, as in `camera`, or any camera.
+            found: answer, or its finding for one prompt.
         """
         camera = view if isinstance(view, Camera) else self.camera(view)
         settings = RasterSettings.recorded(self.field.manifest)
-        picture = render_picture(self.scene, camera, settings=settings)
+        image = render_picture(self.scene, camera, settings=settings)
         if found is None:
-            return picture
+            return image
         if not isinstance(found, Answer | Finding):
-            raise TypeError(f"render draws an answer, or what it says of one text; got {type(found).__name__}")
-        shown, answered = (found.index, found.answer) if isinstance(found, Finding) else (None, found)
-        display = make_display(self.field, answered, shown=shown)
-        how = {"rasterize_mode": self.scene.rasterize_mode, "settings": settings}
-        values, alpha = render(self.scene.gaussians, camera, display.values, **how)
-        overlay = draw(display, picture.float() / 255, values, alpha)["overlay"]
+            raise TypeError(f"render draws an answer, or its finding for one prompt; got {type(found).__name__}")
+        shown, answer = (found.index, found.answer) if isinstance(found, Finding) else (None, found)
+        display = make_display(self.field, answer, shown=shown)
+        mode = self.scene.rasterize_mode
+        values, alpha = render(self.scene.gaussians, camera, display.values, rasterize_mode=mode, settings=settings)
+        overlay = draw(display, image.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
-def _asked(part: Any) -> Answer | None:
-    """The answer that a part is of."""
+def _answer_of(part: Any) -> Answer | None:
+    """Return the answer of a part; None for a mask."""
     return part if isinstance(part, Answer) else part.answer if isinstance(part, Finding) else None
 
 
-def _tensor(values: Any) -> Tensor | None:
-    """As a tensor, where it can be one."""
+def _as_tensor(values: Any) -> Tensor | None:
+    """Return values as a tensor; None if that is impossible."""
     try:
         return torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError, OverflowError):

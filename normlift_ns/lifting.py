@@ -1,4 +1,4 @@
-"""From a trained scene and a source of 2D features to a semantic field: the page to read first."""
+"""Pipeline from a trained scene and a source of 2D features to a semantic field. Read this module first."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from normlift_ns.stages import Report, Stages, cost
 from normlift_ns.team.exchange import with_neighbors
 from normlift_ns.team.seen import Drawing, Export, look
 
-_FEW = 0.01
-"""Share of Gaussians with features below which something is wrong, or nearly nothing was labelled."""
+_MIN_LIFTED_SHARE = 0.01
+"""Share of Gaussians with features below which to warn: something is wrong, or almost no pixel was labeled."""
 
 
 class LiftResult(NamedTuple):
-    """A field and how it came about."""
+    """Semantic field of a lift, and the time it took."""
 
     field: SemanticField
     seconds: dict[str, float]
-    """Of each stage, in their order: features, evidence, consensus (if asked for), lift, neighbors, vote, store."""
+    """Duration of each stage, in order: features, evidence, consensus (if enabled), lift, neighbors, vote, store."""
 
 
 def lift_scene(
@@ -58,18 +58,18 @@ def lift_scene(
     export: Export | None = None,
     report: Report = lambda stage, done, total: None,
 ) -> LiftResult:
-    """Lifts 2D features onto the Gaussians of a trained scene.
+    """Lift 2D features onto the Gaussians of a trained scene.
 
     Args:
-        cache: folder for 2D features and evidence; made if missing, may be deleted at any time.
-        device: where to rasterize, lift and vote.
-        encoder: the options that queries need to encode texts likewise; kept in the manifest.
-        export: where to write the 2D features too, in LangSplat's format.
-        report: told of the progress.
+        cache: folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
+        device: device for rasterizing, lifting and voting.
+        encoder: options that queries need to encode prompts in the same way. The manifest stores them.
+        export: where to also write the 2D features, in LangSplat's format.
+        report: called with the progress.
     Raises:
-        ValueError, FileNotFoundError: an image, a label map or an option that does not fit; the message names it.
-            Nothing that is labelled at all.
-        MemoryError: the GPU's memory does not hold the lift.
+        ValueError, FileNotFoundError: an image, a label map or an option does not fit, which the message names, or no
+            pixel is labeled.
+        MemoryError: the lift does not fit into GPU memory.
     """
     result = lift_together(
         ALONE, scene, source, options, cache, device=device, encoder=encoder, export=export, report=report
@@ -90,38 +90,42 @@ def lift_together(
     export: Export | None,
     report: Report,
 ) -> LiftResult | None:
-    """`lift_scene` by the processes of a team, each with the whole scene; process 0 alone gets the result.
+    """Run `lift_scene` in several processes, each with the whole scene. Only rank 0 gets the result.
 
-    It does not depend on how many there are: what is found of a view does not depend on the views beside it, and
-    Gaussians are worked on in the same blocks.
+    The result does not depend on the number of processes. The evidence of a view does not depend on other views, and
+    Gaussians are processed in the same blocks.
     """
     stages = Stages(team.counted(report))
     gaussians, views = scene.gaussians.to(device), scene.train
     options = replace(options, vote=possible(options.vote, len(gaussians))) if options.refine else options
-    drawing = drawing_of(scene, gaussians, options)
+    config = drawing_of(scene, gaussians, options)
     names = set(source.available(views.names))
     usable = [index for index, name in enumerate(views.names) if name in names]
     used = [usable[i] for i in spread(len(usable), options.max_views)]
     if export is not None:
         refuse_equal_stems([views.names[index] for index in used])
-    ready = get_ready(scene, gaussians, options, drawing)
+    wait_for_kernels = get_ready(scene, gaussians, options, config)
     portion = Portion.of(team, gaussians.means)
     evidence, features, level = look(
-        scene, gaussians, used, source, options, drawing, cache, export, stages, ready, portion
+        scene, gaussians, used, source, options, config, cache, export, stages, wait_for_kernels, portion
     )
-    table, agreed = _agree(evidence, features, level, options, portion, stages) if options.consensus else (features, {})
+    table, consensus_facts = features, {}
+    if options.consensus:
+        table, consensus_facts = _run_consensus(evidence, features, level, options, portion, stages)
     with stages("lift") as step:
-        how = {"beta": options.beta, "unlabeled": options.unlabeled}
-        lifted = lift(evidence, table, **how)
-        _check_seen(evidence, lifted.scalars, source, portion)
+        kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
+        lifted = lift(evidence, table, **kwargs)
+        _check_directions(evidence, lifted.scalars, source, portion)
         own = lifted.scalars.own_evidence
         if options.consensus:
-            seen = lift(evidence, features, **how).scalars
-            own = torch.where(lifted.scalars.norm > 0, seen.own_evidence, 0.0)
-            lifted = replace(lifted, scalars=seen_reliability(lifted.scalars, seen))
+            before = lift(evidence, features, **kwargs).scalars
+            own = torch.where(lifted.scalars.norm > 0, before.own_evidence, 0.0)
+            lifted = replace(lifted, scalars=seen_reliability(lifted.scalars, before))
         step()
     counts = {"views": len(used), "left_out": len(views) - len(usable), "excluded": evidence.num_excluded}
-    voted = vote_together(gaussians.means, lifted, own, options.vote, portion, stages) if options.refine else (None, {})
+    copied, vote_facts = None, {}
+    if options.refine:
+        copied, vote_facts = vote_together(gaussians.means, lifted, own, options.vote, portion, stages)
     with stages("store") as step:
         provenance = {
             **scene.identity,
@@ -132,30 +136,35 @@ def lift_together(
             "options": asdict(options),
             "views_lifted": [views.names[index] for index in used],
             "views_without_features": [name for name in views.names if name not in names],
-            "gsplat_rules": drawing.rules,
-            "backend": drawing.backend,
-            "statistics": {**counts, **agreed, **_statistics(portion.join(lifted.scalars.reliability)), **voted[1]},
+            "gsplat_rules": config.rules,
+            "backend": config.backend,
+            "statistics": {
+                **counts,
+                **consensus_facts,
+                **_statistics(portion.join(lifted.scalars.reliability)),
+                **vote_facts,
+            },
         }
-        rule = {"tolerance": options.tolerance, "storage": options.storage}
-        built = SemanticField.build_together(lifted, gaussians.means, voted[0], portion, provenance=provenance, **rule)
+        kwargs = {"tolerance": options.tolerance, "storage": options.storage}
+        field = SemanticField.build_together(lifted, gaussians.means, copied, portion, provenance=provenance, **kwargs)
         step()
-    if built is None:
+    if field is None:
         return None
-    built = replace(built, manifest={**built.manifest, "cost": cost(stages.seconds, device)})
-    return LiftResult(built, stages.seconds)
+    field = replace(field, manifest={**field.manifest, "cost": cost(stages.seconds, device)})
+    return LiftResult(field, stages.seconds)
 
 
 def drawn_by(scene: Scene, options: LiftOptions) -> str:
-    """The version of gsplat by whose rules a lift draws the scene.
+    """Return the gsplat version whose rasterization rules a lift follows.
 
     Raises:
-        ValueError: the rules of the installed gsplat are asked for, and none is there.
+        ValueError: the options ask for the rules of the installed gsplat, but it is not installed.
     """
     return rules_named(options.gsplat_rules, scene.identity.get("gsplat_rules"))
 
 
 def drawing_of(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> Drawing:
-    """How to rasterize, refused before anything has been looked at where it cannot be done."""
+    """Choose how to rasterize, and raise before any image is read if that is impossible."""
     rules = drawn_by(scene, options)
     dtype = torch.float64 if options.precision == "double" else torch.float32
     settings = RasterSettings.of_gsplat(rules)
@@ -165,53 +174,55 @@ def drawing_of(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> 
 
 
 def get_ready(scene: Scene, gaussians: GaussianScene, options: LiftOptions, drawing: Drawing) -> Callable[[], None]:
-    """Has kernels compiled or loaded meanwhile; waits for them when it is called."""
+    """Start to compile or load kernels in the background; return a function that waits for them."""
     if drawing.backend == "numba":
         from normlift_ns.raster.numba import warm  # noqa: PLC0415 (importing numba takes a second)
 
         return warm(drawing.dtype).join
     if drawing.backend != "triton" or len(scene.train) == 0:
         return lambda: None
-    how = {"settings": drawing.settings, "backend": drawing.backend, "dtype": drawing.dtype}
-    return rehearse(gaussians, scene.train.cameras[0], options, rasterize_mode=scene.rasterize_mode, **how).join
+    kwargs = {"settings": drawing.settings, "backend": drawing.backend, "dtype": drawing.dtype}
+    return rehearse(gaussians, scene.train.cameras[0], options, rasterize_mode=scene.rasterize_mode, **kwargs).join
 
 
-def _check_seen(evidence: Evidence, scalars: Scalars, source: FeatureSource, portion: Portion) -> None:
-    """A lift that tells nothing is none.
+def _check_directions(evidence: Evidence, scalars: Scalars, source: FeatureSource, portion: Portion) -> None:
+    """Raise if no Gaussian received a direction.
 
     Raises:
         ValueError: no Gaussian has a direction.
     """
     entries = torch.tensor(evidence.nnz, device=scalars.norm.device)
-    found, entries = portion.team.add(torch.stack([(scalars.norm > 0).sum(), entries])).tolist()
+    lifted, entries = portion.team.add(torch.stack([(scalars.norm > 0).sum(), entries])).tolist()
     total = len(portion.order)
-    if found == 0 and entries == 0:
+    if lifted == 0 and entries == 0:
         raise InputError(
-            f"nothing was labelled: no pixel that any of the {total:,} Gaussians is seen in belongs to a region (of "
-            f"{_named(source)}). Likely causes: every value in the label maps is the background (--regions-background)"
-            " or negative, the level has no regions (--level), masks leave nothing, or the cameras do not see the scene"
+            f"nothing was labeled: no pixel that shows any of the {total:,} Gaussians belongs to a region (from "
+            f"{_describe(source)}). Likely causes: every value in the label maps is negative or the background "
+            "(--regions-background), the level has no regions (--level), masks exclude everything, or the cameras do "
+            "not see the scene"
         )
-    if found == 0:
+    if lifted == 0:
         raise InputError(
-            f"none of the {total:,} Gaussians got a direction, though regions were seen (of {_named(source)}): their "
-            "features cancel in every Gaussian, or unlabelled pixels outweigh them (--unlabeled dilute)"
+            f"none of the {total:,} Gaussians received a direction, although they have regions (from "
+            f"{_describe(source)}): the features cancel out in every Gaussian, or unlabeled pixels outweigh them "
+            "(--unlabeled dilute)"
         )
-    if found < _FEW * total:
+    if lifted < _MIN_LIFTED_SHARE * total:
         warnings.warn(
-            f"only {found:,} of {total:,} Gaussians ({found / total:.2%}) are seen in labelled pixels; the others have "
-            f"no features. If that is not meant, check the regions (of {_named(source)}) and the cameras",
+            f"only {lifted:,} of {total:,} Gaussians ({lifted / total:.2%}) appear in labeled pixels; the others have "
+            f"no features. If you did not expect this, check the regions (from {_describe(source)}) and the cameras",
             stacklevel=2,
         )
 
 
-def _named(source: FeatureSource) -> str:
-    """Where regions come from, for a message."""
+def _describe(source: FeatureSource) -> str:
+    """Describe the source of the regions, for a message."""
     regions = getattr(source, "regions", source)
     kind, folder = regions.identity.get("kind", "your own source"), getattr(regions, "folder", None)
     return str(kind) if folder is None else f"{kind} in {folder}"
 
 
-def _agree(
+def _run_consensus(
     evidence: Evidence,
     features: Float[Tensor, "s d"],
     level: Int64[Tensor, " s"],
@@ -219,15 +230,15 @@ def _agree(
     portion: Portion,
     stages: Stages,
 ) -> tuple[Float[Tensor, "s d"], dict[str, Any]]:
-    """The feature table on which the views agree, and what the manifest says of it."""
+    """Return the features after consensus, and what the manifest records about it."""
     with stages("consensus") as step:
-        how = {
+        kwargs = {
             "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
         }  # fmt: skip
-        found = consensus(evidence, features, level=level, portion=portion, **how)
+        result = consensus(evidence, features, level=level, portion=portion, **kwargs)
         step()
-    facts = {**how, "seed": SEED, "gaussians": found.gaussians, "agreement": found.agreement}
-    return found.features, {"consensus": facts}
+    facts = {**kwargs, "seed": SEED, "gaussians": result.gaussians, "agreement": result.agreement}
+    return result.features, {"consensus": facts}
 
 
 def vote_together(
@@ -238,36 +249,40 @@ def vote_together(
     portion: Portion,
     stages: Stages,
 ) -> tuple[Int32[Tensor, " m"], dict[str, float]]:
-    """Whose direction every Gaussian of the portion takes, and the shares of all Gaussians that change theirs and that
-    nobody supports.
+    """Vote in one or several processes.
+
+    Returns:
+        For every Gaussian of the partition, the Gaussian whose direction it takes. Also the shares of all Gaussians
+        that change their direction and that have no support.
     """
-    mine = portion.gaussians
-    with stages("neighbors", len(mine)):
-        told = partial(stages.tell, "neighbors")
-        of = mine if portion.team.size > 1 else None
-        neighbors = nearest_neighbors(means, config.k, of=of, progress=told, team=portion.team)
-    with stages("vote", len(mine)):
-        told = partial(stages.tell, "vote")
+    gaussians = portion.gaussians
+    with stages("neighbors", len(gaussians)):
+        progress = partial(stages.tell, "neighbors")
+        of = gaussians if portion.team.size > 1 else None
+        neighbors = nearest_neighbors(means, config.k, of=of, progress=progress, team=portion.team)
+    with stages("vote", len(gaussians)):
+        progress = partial(stages.tell, "vote")
         if portion.team.size == 1:
             reliability = lifted.scalars.reliability
-            copied = refine(means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=told)
+            copied = refine(
+                means, lifted.directions, reliability, config, own=own, neighbors=neighbors, progress=progress
+            )
         else:
-            around = with_neighbors(lifted, neighbors, portion)
-            neighbors, reliability = around.neighbors, portion.join(lifted.scalars.reliability)[around.gaussians]
-            own = torch.cat([own, own.new_zeros(len(around.gaussians) - len(own))])
-            how = {"own": None if config.vote == "paper" else own, "progress": told}
+            halo = with_neighbors(lifted, neighbors, portion)
+            neighbors, reliability = halo.neighbors, portion.join(lifted.scalars.reliability)[halo.gaussians]
+            own = torch.cat([own, own.new_zeros(len(halo.gaussians) - len(own))])
+            kwargs = {"own": None if config.vote == "paper" else own, "progress": progress}
             width = decay_width(portion.team.join(neighbors.spacing), config)
-            voting = around.lifted.directions
-            places = vote_of(portion.along, neighbors, voting, reliability, config, width=width, **how)[: len(mine)]
-            copied = around.gaussians[places.long()].int()
-        changed, lost = (copied != mine).sum(), unsupported(neighbors, reliability).sum()
+            directions = halo.lifted.directions
+            rows = vote_of(portion.along, neighbors, directions, reliability, config, width=width, **kwargs)
+            copied = halo.gaussians[rows[: len(gaussians)].long()].int()
+        changed, lost = (copied != gaussians).sum(), unsupported(neighbors, reliability).sum()
         changed, lost = portion.team.add(torch.stack([changed, lost])).tolist()
     return copied, {"refined_share": changed / len(means), "unsupported_share": lost / len(means)}
 
 
 def _statistics(reliability: Float[Tensor, " n"]) -> dict[str, Any]:
-    found = reliability[reliability > 0].double().sort().values
-    shares = (0.05, 0.25, 0.5, 0.75, 0.95)
-    quantiles = {str(q): float(found[round(q * (len(found) - 1))]) for q in shares} if len(found) > 0 else {}
-    n = reliability.numel()
-    return {"gaussians": n, "zero_evidence_share": 1 - len(found) / max(1, n), "reliability_quantiles": quantiles}
+    positive = reliability[reliability > 0].double().sort().values
+    n, count, shares = reliability.numel(), len(positive), (0.05, 0.25, 0.5, 0.75, 0.95)
+    quantiles = {str(q): float(positive[round(q * (count - 1))]) for q in shares} if count > 0 else {}
+    return {"gaussians": n, "zero_evidence_share": 1 - count / max(1, n), "reliability_quantiles": quantiles}

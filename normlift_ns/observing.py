@@ -1,4 +1,4 @@
-"""What the views of a scene say about its Gaussians: evidence and feature rows, block by block, kept in a cache."""
+"""Evidence and features of a scene's views, computed in blocks and cached."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from normlift_ns.raster.kept import Place, joined_views, keep_views, kept_views
 from normlift_ns.raster.rasterize import rasterize_evidence, render_picture
 from normlift_ns.raster.settings import RasterSettings
 
-_LARGEST_CHUNK = 16
+_MAX_CHUNK = 16
 _READERS = 8
-"""Photographs that are read at a time, while one is looked at or a network loads."""
-_SMALLEST = 8
-"""Pixels along a side of an image made smaller; fewer show nothing."""
-_KEY = "normlift_ns.block/6"
-"""Part of every key: to be raised when evidence changes for the same input."""
+"""Images that are read in parallel while one is processed or a network loads."""
+_MIN_SIDE = 8
+"""Minimum side of a downscaled image, in pixels; smaller ones show too little."""
+_CACHE_VERSION = "normlift_ns.block/6"
+"""Version in every cache key; increase it when evidence changes for the same input."""
 
 
 def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
-    """The level of each of `count` regions: the first that it occurs in, 0 for one without cells.
+    """Return the level of each of `count` regions: the first that contains it, 0 for a region without cells.
 
     >>> region_levels(torch.tensor([[0, 0, -1], [1, 2, 2]], dtype=torch.int32), 3).tolist()
     [0, 1, 1]
@@ -48,33 +48,33 @@ def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tenso
 
 
 class Block(NamedTuple):
-    """Some views as the rasterizer and the lift need them."""
+    """Views in the form that the rasterizer and the lift need."""
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
-    """Cells, -1 unlabelled, -2 masked."""
+    """Cells; -1 is unlabeled, -2 masked."""
     regions: list[Int32[Tensor, "levels c"]]
-    """Region of every cell, -1 none."""
+    """Region of every cell, -1 for none."""
     features: list[Float[Tensor, "r d"]]
 
 
 def in_chunks(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
-    """Views that are looked at together, whose evidence is one file: what an interrupted lift may lose.
+    """Split views into chunks. Each chunk has one evidence file, and is the most that an interrupted lift can lose.
 
-    Where several processes divide the chunks, all have as many. What is found of a view does not depend on what else is
-    in its chunk.
+    Every process gets the same number of chunks. The evidence of a view does not depend on the other views in its
+    chunk.
 
     >>> [[len(chunk) for chunk in in_chunks(range(45), processes)] for processes in (1, 2)]
     [[15, 15, 15], [12, 12, 12, 9]]
     """
-    chunks = -(-len(views) // _LARGEST_CHUNK)
+    chunks = -(-len(views) // _MAX_CHUNK)
     chunks = processes * max(1, -(-chunks // processes))
     size = max(1, -(-len(views) // chunks))
     return [views[first : first + size] for first in range(0, len(views), size)]
 
 
 def spread(count: int, most: int | None) -> list[int]:
-    """At most `most` of `count` indices, evenly spread, the first and the last among them.
+    """Return at most `most` of `count` indices, evenly spaced, including the first and the last.
 
     >>> spread(10, 4)
     [0, 3, 6, 9]
@@ -93,16 +93,16 @@ def observe_views(
     divisor: int,
     done: Callable[[View], None],
 ) -> Block:
-    """Labels and features of some training views.
+    """Compute labels and features of some training views.
 
     Args:
-        rendered: look at the trained scene rendered from the cameras, with these constants, instead of at the
-            photographs.
-        divisor: of the size of images and cameras.
-        done: called after every view, with the view as the source saw it.
+        rendered: rasterizer settings to render the trained scene from the cameras, as a substitute for the images. If
+            None, use the images.
+        divisor: factor by which to downscale images and cameras.
+        done: called after every view, with the view as the source received it.
     Raises:
-        ValueError, FileNotFoundError: what `FeatureSource.view` and `check_undistorted` raise; an image, a mask or
-            labels of another size than the camera.
+        ValueError, FileNotFoundError: raised by `FeatureSource.view` and `check_undistorted`. Also if an image, a mask
+            or a label map differs in size from its camera.
     """
     waiting: deque[View] = deque()
 
@@ -112,33 +112,33 @@ def observe_views(
                 read if rendered is None else read._replace(image=render_picture(scene, read.camera, settings=rendered))
             )
             _check_sizes(view)
-            waiting.append(_smaller(view, divisor) if divisor > 1 else view)
+            waiting.append(_downscaled(view, divisor) if divisor > 1 else view)
             check_undistorted(source, view, waiting[-1])
             yield waiting[-1].image, view.name
 
     block = Block([], [], [], [])
-    for found in each_view(source, images()):
-        view = waiting.popleft()
-        if found.labels.shape != view.image.shape[:2]:
+    for result in each_view(source, images()):
+        view, labels = waiting.popleft(), result.labels
+        if labels.shape != view.image.shape[:2]:
             raise InputError(
-                f"labels of {view.name} are {tuple(found.labels.shape)}, but the image is {tuple(view.image.shape[:2])}"
-                " (height x width); a source of features must label every pixel"
+                f"labels of {view.name} are {tuple(labels.shape)}, but the image is {tuple(view.image.shape[:2])} "
+                "(height x width); a feature source must label every pixel"
             )
         block.cameras.append(view.camera)
-        block.labels.append(found.labels if view.mask is None else found.labels.where(view.mask, MASKED))
-        block.regions.append(found.region_of_cell)
-        block.features.append(found.features)
+        block.labels.append(labels if view.mask is None else labels.where(view.mask, MASKED))
+        block.regions.append(result.region_of_cell)
+        block.features.append(result.features)
         done(view)
     return block
 
 
 def _check_sizes(view: View) -> None:
     expected = (view.camera.height, view.camera.width)
-    for what, found in (("image", view.image.shape[:2]), ("mask", expected if view.mask is None else view.mask.shape)):
-        if tuple(found) != expected:
+    for name, size in (("image", view.image.shape[:2]), ("mask", expected if view.mask is None else view.mask.shape)):
+        if tuple(size) != expected:
             raise InputError(
-                f"the {what} of {view.name} is {tuple(found)}, but its camera {expected} (height x width); both must "
-                "be undistorted alike"
+                f"the {name} of {view.name} is {tuple(size)}, but its camera is {expected} (height x width); undistort "
+                "both in the same way"
             )
 
 
@@ -155,23 +155,23 @@ def block_evidence(
     reuse: bool,
     done: Callable[[], None],
 ) -> Evidence:
-    """Evidence of the regions of a block.
+    """Return evidence of the regions in a block.
 
-    That of the cells of a view, from which it is made, is taken from the folder if it was rasterized before with the
-    same scene, camera and labels, whatever the regions and features were, and whichever views were in its block.
+    It is computed from the evidence of each view's cells, which the folder caches. A view is read from the cache if its
+    scene, camera and labels are the same. Its regions, features and the other views of its block may differ.
     """
     facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
     keys = view_keys(gaussians, block, facts)
-    found = kept_views(folder, keys) if reuse else {}
-    new = [view for view in range(len(keys)) if view not in found]
-    for _ in found:
+    cached = kept_views(folder, keys) if reuse else {}
+    missing = [view for view in range(len(keys)) if view not in cached]
+    for _ in cached:
         done()
-    if len(new) > 0:
+    if len(missing) > 0:
         evidence = rasterize_evidence(
             gaussians,
-            [block.cameras[view] for view in new],
-            [block.labels[view] for view in new],
-            num_regions=[block.regions[view].shape[1] for view in new],
+            [block.cameras[view] for view in missing],
+            [block.labels[view] for view in missing],
+            num_regions=[block.regions[view].shape[1] for view in missing],
             backend=backend,
             rasterize_mode=rasterize_mode,
             weight_power=weight_power,
@@ -179,9 +179,9 @@ def block_evidence(
             dtype=dtype,
             progress=lambda *_: done(),
         )
-        keep_views(evidence, folder, [keys[view] for view in new])
-        found.update((view, Place(evidence, place)) for place, view in enumerate(new))
-    return of_regions(joined_views(found).to(gaussians.means.device), block)
+        keep_views(evidence, folder, [keys[view] for view in missing])
+        cached.update((view, Place(evidence, index)) for index, view in enumerate(missing))
+    return of_regions(joined_views(cached).to(gaussians.means.device), block)
 
 
 def kept_evidence(
@@ -195,19 +195,19 @@ def kept_evidence(
     weight_power: int,
     dtype: torch.dtype,
 ) -> Evidence | None:
-    """What `block_evidence` has kept of a block; None where it is not there, and would have to be rasterized again."""
+    """Return the evidence of a block from the cache, or None if a view would have to be rasterized again."""
     facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
-    found = kept_views(folder, view_keys(gaussians, block, facts))
-    return of_regions(joined_views(found), block) if len(found) == len(block.cameras) else None
+    cached = kept_views(folder, view_keys(gaussians, block, facts))
+    return of_regions(joined_views(cached), block) if len(cached) == len(block.cameras) else None
 
 
 def view_keys(gaussians: GaussianScene, block: Block, facts: Sequence[Any]) -> list[str]:
-    """What finds the evidence of the cells of each view again: digests of all that it is made from.
+    """Return the cache key of each view's cell evidence: a digest of everything it depends on.
 
     Args:
-        facts: how it is rasterized, ready for JSON.
+        facts: how it is rasterized, as JSON types.
     """
-    scene = _digest([_KEY, *facts], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities])
+    scene = _digest([_CACHE_VERSION, *facts], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities])
     views = zip(block.cameras, block.labels, block.regions)
     return [
         _digest([scene, regions.shape[1]], [labels, camera.K, camera.world_to_camera])
@@ -216,7 +216,7 @@ def view_keys(gaussians: GaussianScene, block: Block, facts: Sequence[Any]) -> l
 
 
 def of_regions(evidence: Evidence, block: Block) -> Evidence:
-    """Evidence of the regions of a block, from that of its cells."""
+    """Convert evidence of a block's cells to evidence of its regions."""
     counts = torch.tensor([0, *(len(rows) for rows in block.features)])
     first = counts.cumsum(0).tolist()
     columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]
@@ -232,14 +232,14 @@ def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
     return key.hexdigest()
 
 
-def _smaller(view: View, divisor: int) -> View:
-    """The view at a fraction of its size: pixels are averaged, a mask keeps what it keeps throughout."""
+def _downscaled(view: View, divisor: int) -> View:
+    """Downscale a view by averaging pixels; a mask keeps a pixel only if it keeps all of it."""
     camera = view.camera
     height, width = camera.height // divisor, camera.width // divisor
-    if min(height, width) < _SMALLEST:
+    if min(height, width) < _MIN_SIDE:
         raise InputError(
-            f"lift_downscale {divisor:,} leaves {width} x {height} pixels of {view.name}, which has {camera.width} x "
-            f"{camera.height}; give a number that leaves {_SMALLEST} pixels on each side"
+            f"lift_downscale {divisor:,} reduces {view.name} from {camera.width} x {camera.height} to {width} x "
+            f"{height} pixels; give a factor that leaves at least {_MIN_SIDE} pixels on each side"
         )
     scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
     mask = None if view.mask is None else _averaged(view.mask[:, :, None], height, width)[:, :, 0] > 0.999

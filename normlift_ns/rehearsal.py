@@ -1,4 +1,4 @@
-"""Kernels are compiled, or read from their cache, while photographs are read and networks look at them."""
+"""Warm-up of GPU kernels in the background, while images are read and networks process them."""
 
 from __future__ import annotations
 
@@ -29,34 +29,34 @@ def rehearse(
     backend: BackendName,
     dtype: torch.dtype,
 ) -> Thread:
-    """Lifts random features onto some of the Gaussians, in a thread, and forgets them.
+    """Lift random features onto some of the Gaussians in a thread, and discard the result.
 
-    What fails there fails again where it is wanted, and is told then.
+    Errors are suppressed here, because the lift itself will raise them again.
     """
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    some = GaussianScene(*(array[:_GAUSSIANS] for array in arrays))
+    sample = GaussianScene(*(array[:_GAUSSIANS] for array in arrays))
 
     def work() -> None:
         with suppress(Exception), torch.no_grad():  # as the docstring says
             evidence = rasterize_evidence(
-                some, [camera], [_quarters(camera)], num_regions=[_REGIONS], backend=backend,
+                sample, [camera], [_quarters(camera)], num_regions=[_REGIONS], backend=backend,
                 rasterize_mode=rasterize_mode, settings=settings, dtype=dtype, weight_power=options.weight_power,
             )  # fmt: skip
-            features = torch.eye(_REGIONS, _DIMENSION, dtype=dtype, device=some.means.device)
+            features = torch.eye(_REGIONS, _DIMENSION, dtype=dtype, device=sample.means.device)
             if options.consensus:
                 consensus(evidence, features)
             lifted = lift(evidence, features, beta=options.beta, unlabeled=options.unlabeled)
-            if options.refine and len(some) > options.vote.k:
-                neighbors = nearest_neighbors(some.means, options.vote.k)
+            if options.refine and len(sample) > options.vote.k:
+                neighbors = nearest_neighbors(sample.means, options.vote.k)
                 own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
-                refine(some.means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors)
+                refine(sample.means, lifted.directions, reliability, options.vote, own=own, neighbors=neighbors)
 
-    thread = Thread(target=work, name="rehearsal", daemon=True)
+    thread = Thread(target=work, name="kernel warm-up", daemon=True)
     thread.start()
     return thread
 
 
 def _quarters(camera: Camera) -> torch.Tensor:
-    """Labels of the four quarters of an image."""
+    """Return labels of the four quarters of an image."""
     x, y = torch.arange(camera.width), torch.arange(camera.height)
     return (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()

@@ -1,4 +1,4 @@
-"""What a lift tells while it works: how far each stage is, and at its end what it took."""
+"""Progress of a lift: time and steps of each stage, and peak memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from normlift_ns.core.portions import Report
 
 
 class Stages:
-    """Adds up the seconds of each stage and passes on how far it is."""
+    """Timers of the stages of a lift, which also report progress."""
 
     def __init__(self, report: Report) -> None:
         self.seconds: dict[str, float] = {}
@@ -24,10 +24,10 @@ class Stages:
 
     @contextmanager
     def __call__(self, stage: str, total: int = 1) -> Iterator[Callable[[], None]]:
-        """Times a stage, or a part of it; yields what to call after every step.
+        """Time a stage, or a part of it; yield a function to call after every step.
 
         Raises:
-            MemoryError: the GPU's memory is full; says in which stage.
+            MemoryError: the GPU is out of memory. The message names the stage.
         """
 
         def step() -> None:
@@ -47,13 +47,15 @@ class Stages:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
     def tell(self, stage: str, done: int, total: int) -> None:
-        """Passes on how far a stage is that counts its steps itself."""
+        """Report the progress of a stage that counts its own steps."""
         self._report(stage, done, total)
 
 
 def cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
-    """Seconds of the stages so far and in all, and the most memory of this process, where the system tells that, and
-    of the GPU, GiB."""
+    """Return the seconds of each stage and in total, and the peak memory in GiB.
+
+    Memory is that of the GPU and of this process, if the system reports it.
+    """
     peak = peak_gib()
     memory = {} if peak is None else {"memory_gib": peak}
     if torch.device(device).type == "cuda":
@@ -62,17 +64,18 @@ def cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
 
 
 def peak_gib() -> float | None:
-    """Largest resident memory of this process so far, the libraries included, GiB; None where the system does not say.
+    """Return the peak resident memory of this process in GiB, including libraries; None if the system does not report
+    it.
 
-    Linux: `VmHWM` of /proc, since `ru_maxrss` starts from that of the process by which this one was started.
+    On Linux, this is `VmHWM` from /proc, because `ru_maxrss` starts from the value of the parent process.
     """
     status = Path("/proc/self/status")
     if status.exists():
         lines = dict(line.split(":", 1) for line in status.read_text().splitlines() if ":" in line)
         if "VmHWM" in lines:
-            return int(lines["VmHWM"].split()[0]) / 2**20  # of kB
+            return int(lines["VmHWM"].split()[0]) / 2**20  # from kB
     if find_spec("resource") is None:
         return None
-    import resource  # noqa: PLC0415 (Windows has none)
+    import resource  # noqa: PLC0415 (not on Windows)
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)

@@ -1,4 +1,4 @@
-"""Lifting into a new run, by one process or by several."""
+"""Lifting into a new run, in one or several processes."""
 
 from __future__ import annotations
 
@@ -61,21 +61,21 @@ def lift_run_together(
     report: Report,
     say: Callable[[str], None],
 ) -> LiftedRun | None:
-    """`lift_run` by the processes of a team, all with the same arguments; process 0 alone writes and returns the run.
+    """Run `lift_run` in several processes, all with the same arguments. Only rank 0 writes and returns the run.
 
     Args:
-        opened: opens the trained scene; called once mistakes that show without it have been told.
+        opened: opens the trained scene. It is called after all checks that do not need the scene.
     """
     if features is None and texts is not None:
-        raise InputError("texts are for features of your own; give features too, or leave texts out")
+        raise InputError("texts are for your own features; pass features, too, or omit texts")
     if features is not None and source is not None:
-        raise InputError("features of your own take the place of source; give one of the two")
+        raise InputError("features replace source; pass only one of the two")
     check_texts("queries", queries)
     check_bool("overwrite", overwrite)
     check_bool("check", check)
     target = None if output_dir is None else check_path("output_dir", output_dir)
     if timestamp is not None:
-        run_directory(Path(), "run", timestamp)  # its name shows before the scene loads
+        run_directory(Path(), "run", timestamp)  # raise for a bad name before the scene loads
     for name, value, kind in (
         ("source", source, SourceOptions),
         ("lift", lift, LiftOptions),
@@ -85,13 +85,14 @@ def lift_run_together(
             raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
     device, options = choose_device(device), (source or SourceOptions()).looking_for(queries)
     wake(device)
-    made = None if features is not None else make_source(options, device)  # mistakes show before the scene loads
-    if made is not None and len(queries) > 0:
-        made.text(queries)
+    feature_source = None if features is not None else make_source(options, device)  # raises before the scene loads
+    if feature_source is not None and len(queries) > 0:
+        feature_source.text(queries)
     scene = opened()
     if not isinstance(scene, NerfstudioScene | SplatScene):
         raise TypeError(
-            f"lift_run takes the config.yml of a run or a scene of open_scene or open_splat, got {type(scene).__name__}"
+            "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
+            f"{type(scene).__name__}"
         )
     run_dir = run_directory(target or scene.runs_dir, scene.name, timestamp)
     run_dir = run_dir.with_name(team.tell(run_dir.name))  # clocks differ
@@ -99,23 +100,23 @@ def lift_run_together(
         tidy(run_dir)
     if timestamp is not None and team.rank == 0:
         refuse_existing_run(run_dir, overwrite)
-    how, stages = lift or LiftOptions(), Stages(report)
-    some = "" if how.max_views is None else f"{min(how.max_views, len(scene.train))} of "
-    say(f"{len(scene.gaussians):,} Gaussians, {some}{len(scene.train)} training views, on {device}")
+    lift, stages = lift or LiftOptions(), Stages(report)
+    used = "" if lift.max_views is None else f"{min(lift.max_views, len(scene.train))} of "
+    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {device}")
     for remark in scene.remarks:
         say(f"Warning: {remark}")
     if export is not None:
         _refuse_equal_stems(scene.train.names)
     settings = encoder_settings(options)
-    if made is None:
-        made = given_features(features, texts, scene.train.names)
-        texts = made.texts
+    if feature_source is None:
+        feature_source = given_features(features, texts, scene.train.names)
+        texts = feature_source.texts
         settings = given_settings(TEXTS_FILE if texts else None)
         if len(queries) > 0:
-            made.text(queries)
+            feature_source.text(queries)
     if check and team.rank == 0:
         with stages("check") as step:
-            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, how)), device=device)
+            match = match_photographs(scene, RasterSettings.of_gsplat(drawn_by(scene, lift)), device=device)
             warning = judge(match, own_cameras=not isinstance(scene, SplatScene))
             step()
         if warning is not None:
@@ -123,7 +124,7 @@ def lift_run_together(
     cache = cache_folder(run_dir)
     with team.shares(cache):
         result = lift_together(
-            team, scene, made, how, cache, device=device, encoder=settings, export=export, report=report
+            team, scene, feature_source, lift, cache, device=device, encoder=settings, export=export, report=report
         )
     if result is None:
         return None
@@ -132,7 +133,7 @@ def lift_run_together(
         field = replace(field, manifest={**field.manifest, "source": source_settings(options, device)})
     seconds = {**stages.seconds, **seconds}
     with stages("write") as step:
-        question = _question(field, scene.gaussians.means, made, queries)
+        question = _question(field, scene.gaussians.means, feature_source, queries)
         run_dir = write_run(
             scene, field, run_dir, question=question, texts=texts, overwrite=overwrite, exact=timestamp is not None
         )
@@ -143,13 +144,13 @@ def lift_run_together(
 
 
 def _refuse_equal_stems(names: Sequence[str]) -> None:
-    """LangSplat's format names files by the stems of the images."""
+    """Raise if two images have the same stem, because LangSplat's format names files by it."""
     stems = [Path(name).stem for name in names]
     for i, stem in enumerate(stems):
         if stem in stems[:i]:
             raise InputError(
                 f"{names[stems.index(stem)]} and {names[i]} would share the files {stem}_*.npy of LangSplat's format. "
-                "Give the images other names, or lift without --export-langsplat."
+                "Rename one of the images, or lift without --export-langsplat."
             )
 
 
@@ -161,10 +162,10 @@ def _question(
     length = source.text(queries).shape[1]
     if length != field.dimension:
         raise InputError(
-            f"the vectors of --queries have {length} numbers, the features {field.dimension}; name the model that made "
-            "the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
+            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; name the model "
+            "of the features with --encoder-model and --encoder-pretrained, or give --text-vectors"
         )
     negatives = None
-    if isinstance(source, GivenFeatures):  # the file of its texts is not written yet
+    if isinstance(source, GivenFeatures):  # the file with its prompts is not written yet
         negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
     return answer(field, means, make_question(field, source.text, queries, negatives=negatives)).question

@@ -82,12 +82,12 @@ def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_
     for value in (0, -1, -5):
         for unlabeled in ("ignore", "dilute"):
             source = files(tmp_path / "maps", value * FULL)
-            with pytest.raises(InputError, match=r"nothing was labelled: .* 30 .*maps.*--regions-back"):
+            with pytest.raises(InputError, match=r"nothing was labeled: .* 30 .*maps.*--regions-back"):
                 lifted(source, tmp_path / "cache", unlabeled=unlabeled)
     hidden, away = scene(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)), scene()
     away.gaussians.means[:] -= 100
     for made, why in ((hidden, "masks"), (away, "cameras")):
-        with pytest.raises(InputError, match=rf"nothing was labelled: .*{why}"):
+        with pytest.raises(InputError, match=rf"nothing was labeled: .*{why}"):
             lifted(files(tmp_path / "maps", FULL), tmp_path / "cache", made)
     made = scene(count=3000)
     made.gaussians.means[5:, 2] -= 100  # behind the camera
@@ -131,7 +131,7 @@ def test_images_that_share_an_instance_mask_or_a_frame_are_refused(tmp_path: Pat
         run_lerf([run], [tmp_path], LerfOptions())
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))
     run = EvaluatedRun(scene("a/0000.png"), None, ColourEncoder(), True)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="name no object"):
+    with pytest.raises(InputError, match="have no objects"):
         run_lerf([run], [tmp_path], LerfOptions())
 
 

@@ -45,7 +45,7 @@ def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     monkeypatch.setattr(Superpixels, "labels", lambda self, image, name: cut(self, count("cut", 1, image), name))
     monkeypatch.setattr(ColourEncoder, "encode_each", encoding)
     monkeypatch.setattr(observing, "rasterize_evidence", rasterizing)
-    monkeypatch.setattr(observing, "_LARGEST_CHUNK", 4)
+    monkeypatch.setattr(observing, "_MAX_CHUNK", 4)
     return counts
 
 

@@ -1,4 +1,4 @@
-"""The demo room, a small synthetic scene with ground truth: tensors, nerfstudio dataset, trained run."""
+"""The demo room, a small synthetic scene with ground truth: tensors, a nerfstudio dataset and a trained run."""
 
 from normlift_ns.demo.build import DemoRoom
 from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture

@@ -1,4 +1,4 @@
-"""Rooms made in code: Gaussians of known class on the surfaces of parts, a repeatable benchmark for any lift."""
+"""Synthetic rooms: Gaussians of known class on the surfaces of parts, as a reproducible benchmark for any lift."""
 
 from __future__ import annotations
 
@@ -18,62 +18,62 @@ from normlift_ns.demo.shapes import ON_SURFACE, Array, Distance, cover, each, le
 from normlift_ns.errors import InputError
 
 HALF_WIDTH = 1.6
-"""The floor is the square -HALF_WIDTH..HALF_WIDTH in x and y at z = 0, metres; z is up."""
+"""Half the side of the floor, the square -HALF_WIDTH..HALF_WIDTH in x and y at z = 0, in meters; z is up."""
 HEIGHT = 1.8
-"""Of the walls, metres. There is no ceiling."""
+"""Height of the walls in meters. There is no ceiling."""
 
 _OPACITY = 0.97
 _POINTS_PER_GAUSSIAN = 12
-"""Of the dense sample that surfaces are cut from, on average."""
+"""Average number of points per Gaussian in the dense sample that surfaces are divided from."""
 _STRAY_SHARE = 0.1
-"""Of all Gaussians."""
+"""Share of all Gaussians."""
 _FLOATER_SHARE = 0.02
-"""Of all Gaussians."""
-_REACH = 0.05
-"""No part reaches farther beyond the box around its sample, metres."""
-_FAINT = (0.001, 0.1)
-"""Range of the opacities of strays and floaters. Below 1 / 255 a Gaussian is never drawn."""
+"""Share of all Gaussians."""
+_MARGIN = 0.05
+"""Maximum extent of a part beyond the bounding box of its sample, in meters."""
+_FAINT_OPACITIES = (0.001, 0.1)
+"""Range of the opacities of strays and floaters. A Gaussian below 1 / 255 is never drawn."""
 
 
 @dataclass(frozen=True)
 class DemoRoom:
-    """N Gaussians whose colour and class are known."""
+    """N Gaussians of known color and class."""
 
     scene: GaussianScene
-    """In metres, z up, float32."""
+    """Gaussians in meters, z up, float32."""
     colors: Float[Tensor, "n 3"]
     """sRGB in 0..1."""
     labels: Int64[Tensor, " n"]
-    """Class of every Gaussian, an index of `names`; -1: a floater, which belongs to nothing."""
+    """Class of every Gaussian, an index into `names`; -1 for a floater, which belongs to no class."""
     names: tuple[str, ...]
-    """One name of the XKCD colour survey per class."""
+    """Name of each class, from the XKCD color survey."""
 
 
 class Part(NamedTuple):
-    """A surface of a class. Several parts of a room may be of one class."""
+    """Surface of a class. A room may have several parts of the same class."""
 
     name: str
-    """Of the class."""
+    """Name of the class."""
     detail: float
-    """Gaussians per square metre, relative to the walls."""
+    """Gaussians per square meter, relative to the walls."""
     shape: Distance
     paint: Callable[[Array], Array] | None = None
-    """Factors [n, 3] or [n, 1] on the class's colour at points [n, 3] of the surface; None: plain."""
+    """Factors [n, 3] or [n, 1] on the color of the class at points [n, 3] of the surface; None for a plain color."""
     gloss: float = 0.0
-    """Brightness that a highlight adds."""
+    """Brightness of highlights."""
 
 
 class Surface(NamedTuple):
-    """Where the opaque Gaussians of a room lie."""
+    """Positions, normals and parts of the opaque Gaussians in a room."""
 
     means: Array
     normals: Array
     parts: NDArray[np.int64]
-    """[n], indices of the room's parts."""
+    """[n], indices of the room's parts"""
 
 
 Painter = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
-"""sRGB [n, 3] of the Gaussians of a surface, light and shadow included; may leave 0..1."""
+"""sRGB [n, 3] of the Gaussians on a surface, including light and shadow; values may leave 0..1."""
 
 
 class _Gaussians(NamedTuple):
@@ -84,46 +84,44 @@ class _Gaussians(NamedTuple):
     opacities: Array
     colors: Array
     labels: NDArray[Any]
-    """[n], integers: indices of parts."""
+    """[n], integers: indices of parts"""
 
 
 def class_names(parts: Sequence[Part]) -> tuple[str, ...]:
-    """Of the classes, in the order of their first parts."""
+    """Return the names of the classes, in the order of their first parts."""
     return tuple(dict.fromkeys(part.name for part in parts))
 
 
 def built(parts: Sequence[Part], painter: Painter, area: float, num_gaussians: int, seed: int = 0) -> DemoRoom:
-    """Builds a room. The same arguments give the same room.
+    """Build a room. The same arguments give the same room.
 
     Most Gaussians lie flat on the surfaces. As in trained scenes, some faint ones stray above and below the surfaces,
-    where views contradict each other or see nothing, and some float in the air.
+    in places that the views contradict each other about or do not show. Others float in the air.
 
     Args:
-        area: about, of all parts that can be seen, each times its `detail`, square metres.
+        area: approximate visible area of all parts, each multiplied by its `detail`, in square meters.
         num_gaussians: N, at least 2000.
     Raises:
-        ValueError: too few Gaussians.
+        ValueError: `num_gaussians` is too small.
     """
     if num_gaussians < 2000:
-        raise InputError(f"num_gaussians must be at least 2000, or solids have no shape; got {num_gaussians}")
+        raise InputError(f"num_gaussians must be at least 2000 to cover the shapes, got {num_gaussians}")
     rng = np.random.default_rng(seed)
     num_strays, num_floaters = int(_STRAY_SHARE * num_gaussians), int(_FLOATER_SHARE * num_gaussians)
     surface = _surface(parts, painter, area, num_gaussians - num_strays - num_floaters, rng)
     groups = surface, _strays(parts, surface, num_strays, rng), _floaters(num_floaters, rng)
-    means, normals, scales, opacities, colors, of_part = (np.concatenate(values) for values in zip(*groups))
+    means, normals, scales, opacities, colors, labels = (np.concatenate(values) for values in zip(*groups))
     upper = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)  # z axis to normal
     quats /= length(quats)[:, None]
     scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
     names = class_names(parts)
-    of_class = np.array([*(names.index(part.name) for part in parts), -1])
-    return DemoRoom(
-        scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(of_class[of_part.astype(int)]), names
-    )
+    classes = np.array([*(names.index(part.name) for part in parts), -1])[labels.astype(int)]
+    return DemoRoom(scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(classes), names)
 
 
 def _surface(parts: Sequence[Part], painter: Painter, area: float, count: int, rng: np.random.Generator) -> _Gaussians:
-    """All surfaces but those inside other parts."""
+    """Cover all surfaces with Gaussians, except for those inside other parts."""
     low, high = np.array([-HALF_WIDTH, -HALF_WIDTH, 0]), np.array([HALF_WIDTH, HALF_WIDTH, HEIGHT])
     density, shapes = _POINTS_PER_GAUSSIAN * count / area, [part.shape for part in parts]
     near = [points_near(part.shape, low, high, density * part.detail, rng) for part in parts]
@@ -140,28 +138,28 @@ def _surface(parts: Sequence[Part], painter: Painter, area: float, count: int, r
 
 
 def _uncovered(shapes: Sequence[Distance], samples: Sequence[Array]) -> list[Array]:
-    """Those points of each part that lie inside no other part."""
+    """Return the points of each part that lie inside no other part."""
     boxes = [
-        (points.min(axis=0, initial=np.inf) - _REACH, points.max(axis=0, initial=-np.inf) + _REACH)
+        (points.min(axis=0, initial=np.inf) - _MARGIN, points.max(axis=0, initial=-np.inf) + _MARGIN)
         for points in samples
     ]
 
     def uncovered(shape: Distance, points: Array) -> Array:
-        left, axes = np.ones(len(points), bool), points.T.copy()
+        keep, axes = np.ones(len(points), bool), points.T.copy()
         for other, (low, high) in zip(shapes, boxes):
             if other is not shape:
-                inside = left.copy()
+                inside = keep.copy()
                 for axis, least, most in zip(axes, low, high):
                     inside &= (axis > least) & (axis < most)
                 near = np.flatnonzero(inside)
-                left[near] = other(points[near]) > ON_SURFACE
-        return points[left]
+                keep[near] = other(points[near]) > ON_SURFACE
+        return points[keep]
 
     return each(uncovered, shapes, samples)
 
 
 def _strays(parts: Sequence[Part], surface: _Gaussians, count: int, rng: np.random.Generator) -> _Gaussians:
-    """Faint copies of surface Gaussians, up to three of their radii above or below; they belong to the nearest part."""
+    """Return faint copies of surface Gaussians, up to three radii above or below; each belongs to the nearest part."""
     chosen = rng.choice(len(surface.labels), count)
     heights = surface.scales[chosen, :1] * rng.uniform(-3, 3, (count, 1))
     means = surface.means[chosen] + surface.normals[chosen] * heights
@@ -171,7 +169,7 @@ def _strays(parts: Sequence[Part], surface: _Gaussians, count: int, rng: np.rand
 
 
 def _floaters(count: int, rng: np.random.Generator) -> _Gaussians:
-    """Faint grey blobs in the air."""
+    """Return faint gray Gaussians in the air."""
     means = rng.uniform((-1.6, -1.6, 0.2), (1.6, 1.6, 2.0), (count, 3))
     normals = rng.normal(size=(count, 3))
     normals /= length(normals)[:, None]
@@ -181,5 +179,5 @@ def _floaters(count: int, rng: np.random.Generator) -> _Gaussians:
 
 
 def _faint(count: int, rng: np.random.Generator) -> Array:
-    low, high = np.log(_FAINT)
+    low, high = np.log(_FAINT_OPACITIES)
     return np.exp(rng.uniform(low, high, count))

@@ -1,4 +1,4 @@
-"""Cameras in the demo room, its images and true masks, and all of it as a nerfstudio dataset."""
+"""Cameras in the demo room, its images and true masks, and a nerfstudio dataset of them."""
 
 from __future__ import annotations
 
@@ -17,33 +17,35 @@ from normlift_ns.demo.build import DemoRoom
 from normlift_ns.raster.rasterize import render
 
 WIDTH, HEIGHT = 400, 300
-"""Of a photograph, pixels."""
+"""Size of an image, in pixels."""
 _FIELD_OF_VIEW = 75.0
-"""Horizontal, degrees."""
+"""Horizontal field of view, in degrees."""
 
 
 def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Cameras on a circle inside the room, at three heights in turn, looking across the table. Size in pixels."""
+    """Return cameras on a circle inside the room, at three heights in turn, directed across the table. Sizes are in
+    pixels."""
     return [
-        _look((1.4, 360 * i / count, (1.0, 1.35, 1.7)[i % 3]), (0, 0, (0.55, 0.45, 0.35)[i % 3]), width, height)
+        _look_at((1.4, 360 * i / count, (1.0, 1.35, 1.7)[i % 3]), (0, 0, (0.55, 0.45, 0.35)[i % 3]), width, height)
         for i in range(count)
     ]
 
 
 def held_out_cameras(count: int = 4, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Cameras for evaluation, on another circle than `demo_cameras`."""
-    return [_look((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
+    """Return cameras for evaluation, on another circle than those of `demo_cameras`."""
+    return [_look_at((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
 
 
 def view_image(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w 3"]:
-    """The room as the camera sees it, sRGB, on black."""
+    """Render the room from a camera in sRGB, on black."""
     return _image(render(room.scene, camera, room.colors)[0])
 
 
 def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
-    """True class of every pixel: 1 + index into `room.names`, 0 where less than half of the pixel is covered.
+    """Return the true class of every pixel: 1 + index into `room.names`, or 0 if less than half of the pixel is
+    covered.
 
-    The class with the largest sum of compositing weights wins; floaters count for nothing.
+    The class with the largest sum of compositing weights wins, and floaters do not count.
     """
     return _labels(render(room.scene, camera, _one_hot(room))[0])
 
@@ -51,10 +53,11 @@ def view_labels(room: DemoRoom, camera: Camera) -> UInt8[Tensor, "h w"]:
 def write_capture(
     room: DemoRoom, folder: Path, views: int = 24, held_out: int = 4, width: int = WIDTH, height: int = HEIGHT
 ) -> None:
-    """Writes a nerfstudio dataset with true masks; files of the same names are replaced.
+    """Write a nerfstudio dataset with true masks, replacing files of the same names.
 
-    transforms.json (no distortion; the held-out views, last, are its "val" and "test" split), images/0000.png …,
-    instance/0000.png … as `view_labels` gives them, and labels.json: {"labels": {"1": name, …}, "background": 0}.
+    It consists of transforms.json, images/0000.png …, instance/0000.png … as `view_labels` returns them, and
+    labels.json with {"labels": {"1": name, …}, "background": 0}. Images have no distortion. The held-out views come
+    last and are in the "val" and "test" splits.
     """
     cameras = [*demo_cameras(views, width, height), *held_out_cameras(held_out, width, height)]
     paths = [f"images/{i:04d}.png" for i in range(len(cameras))]
@@ -80,7 +83,7 @@ def write_capture(
 
 
 def _one_hot(room: DemoRoom) -> Float[Tensor, "n classes"]:
-    """Whose class every Gaussian is of; floaters are of none."""
+    """Return the class of every Gaussian as a one-hot row; floaters have a zero row."""
     return torch.nn.functional.one_hot(room.labels + 1, len(room.names) + 1)[:, 1:].to(room.colors.dtype)
 
 
@@ -92,9 +95,15 @@ def _labels(shares: Float[Tensor, "h w classes"]) -> UInt8[Tensor, "h w"]:
     return torch.where(shares.sum(dim=2) > 0.5, shares.argmax(dim=2) + 1, 0).byte()
 
 
-def _look(place: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int) -> Camera:
-    """A camera at (distance from the middle of the room, azimuth in degrees, height) that looks at a point."""
-    distance, azimuth, up = place[0], math.radians(place[1]), place[2]
+def _look_at(
+    position: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int
+) -> Camera:
+    """Return a camera that points at a target.
+
+    Args:
+        position: distance from the middle of the room, azimuth in degrees, height.
+    """
+    distance, azimuth, up = position[0], math.radians(position[1]), position[2]
     eye = torch.tensor([distance * math.cos(azimuth), distance * math.sin(azimuth), up], dtype=torch.float64)
     forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - eye, dim=0)
     right = torch.nn.functional.normalize(forward.cross(eye.new_tensor([0, 0, 1]), dim=0), dim=0)
@@ -107,5 +116,5 @@ def _look(place: tuple[float, float, float], target: tuple[float, float, float],
 
 
 def _opengl_pose(camera: Camera) -> Float[Tensor, "4 4"]:
-    """Camera to world, x right, y up, z backward."""
+    """Return camera to world with x right, y up, z backward."""
     return camera.world_to_camera.double().inverse() * torch.tensor([1, -1, -1, 1], dtype=torch.float64)

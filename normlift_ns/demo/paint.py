@@ -1,4 +1,4 @@
-"""Textures: factors on the colour of a surface at points of it, all by formulas. Lengths in metres."""
+"""Textures as formulas: factors on the color of a surface at its points. Lengths are in meters."""
 
 from __future__ import annotations
 
@@ -9,37 +9,38 @@ import numpy as np
 from normlift_ns.demo.shapes import Array
 
 Paint = Callable[[Array], Array]
-"""Factors [n, 3] or [n, 1] at points [n, 3]."""
+"""Returns factors [n, 3] or [n, 1] at points [n, 3]."""
 
 _WAVES = 9
-"""Of a noise; fewer look regular."""
+"""Number of waves in the noise; fewer give a regular pattern."""
 
 
 def noise(points: Array, size: float, seed: int = 0) -> Array:
-    """Smooth noise with spots of about `size`, [n], mean 0, most of it in -1..1: plane waves of random direction."""
+    """Return smooth noise with spots of about `size`, [n], mean 0, mostly in -1..1: plane waves of random
+    directions."""
     rng = np.random.default_rng(seed)
     waves = rng.normal(size=(_WAVES, 3)) * (2 / size)
     return np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, _WAVES)).sum(axis=1) / np.sqrt(_WAVES)
 
 
 def mottled(size: float, depth: float, seed: int = 0) -> Paint:
-    """Spots of about `size`, lighter and darker by about `depth`."""
+    """Return spots of about `size`, lighter and darker by about `depth`."""
     return lambda p: 1 + depth * noise(p, size, seed)[:, None]
 
 
 def wood(width: float, across: int, ring: float = 0.035, joint: float = 0.006, contrast: float = 1.0) -> Paint:
-    """Boards of `width` with grain, laid side by side along the horizontal axis `across` (0: x, 1: y).
+    """Return boards of `width` with grain, side by side along the horizontal axis `across` (0: x, 1: y).
 
     Args:
-        ring: distance of the lines of the grain.
-        joint: half width of the dark line between two boards.
-        contrast: of the grain; dark woods need more.
+        ring: distance between the lines of the grain.
+        joint: half the width of the dark line between two boards.
+        contrast: contrast of the grain; dark woods need more.
     """
 
     def paint(p: Array) -> Array:
         board = np.floor(p[:, across] / width)
-        own = p + 7.3 * board[:, None]  # each board is cut from elsewhere
-        stretched = own * np.where(np.arange(3) == 1 - across, 0.18, 1)  # the grain runs along the board
+        local = p + 7.3 * board[:, None]  # each board has another part of the grain
+        stretched = local * np.where(np.arange(3) == 1 - across, 0.18, 1)  # the grain runs along the board
         rings = stretched[:, across] / ring + 1.1 * noise(stretched, 0.12, 1)
         grain = 0.09 * np.sin(2 * np.pi * rings) + 0.05 * noise(stretched, 0.03, 2)
         tone = 0.09 * np.sin(board * 12.9898)
@@ -50,7 +51,7 @@ def wood(width: float, across: int, ring: float = 0.035, joint: float = 0.006, c
 
 
 def woven(band: float, half_length: float, half_width: float) -> Paint:
-    """A rug around the origin with rows of diamonds, `band` long, and a darker border."""
+    """Return the pattern of a rug around the origin, with rows of diamonds of length `band` and a darker border."""
 
     def paint(p: Array) -> Array:
         x, y = p[:, 0] / band, p[:, 1] / band
@@ -64,14 +65,14 @@ def woven(band: float, half_length: float, half_width: float) -> Paint:
 
 
 def cloth(thread: float = 0.03) -> Paint:
-    """Threads across each other, somewhat uneven."""
+    """Return a slightly uneven weave of crossing threads."""
     return lambda p: (
         1 + 0.05 * np.sin(2 * np.pi * (p[:, :1] + p[:, 2:]) / thread) * np.sin(2 * np.pi * p[:, 1:2] / thread)
     ) * (1 + 0.05 * noise(p, 0.12, 4)[:, None])  # fmt: skip
 
 
 def ribs(count: int, depth: float) -> Paint:
-    """Dark furrows between the ribs of `things.gourd`."""
+    """Return dark furrows between the ribs of `things.gourd`."""
 
     def paint(p: Array) -> Array:
         furrow = 1 - np.abs(np.cos(count / 2 * np.arctan2(p[:, 1], p[:, 0])))
@@ -81,5 +82,5 @@ def ribs(count: int, depth: float) -> Paint:
 
 
 def banded(tones: Callable[[Array], Array], tint: tuple[float, float, float]) -> Paint:
-    """`tint` where `tones` of the points is 1, the plain colour where it is 0."""
+    """Return `tint` at points whose `tones` is 1, and the plain color at those whose `tones` is 0."""
     return lambda p: 1 + tones(p).clip(0, 1)[:, None] * (np.array(tint) - 1)

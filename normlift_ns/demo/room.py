@@ -1,7 +1,7 @@
-"""The demo room: things that are what their colours are named after, on a table, in a room with light and texture.
+"""The demo room: objects with the names of their colors, on a table, in a room with light and texture.
 
-The colour encoder knows only names of colours. Many names of the XKCD colour survey are those of things, so that a
-question for a tomato finds the tomatoes here: by their colour.
+The color encoder knows only names of colors. Many names in the XKCD color survey are names of objects. The prompt
+"tomato red" thus finds the tomatoes here, by their color.
 """
 
 from __future__ import annotations
@@ -18,53 +18,54 @@ from normlift_ns.demo.light import shade
 from normlift_ns.demo.shapes import Array, box, capsule, cavity, cone, place, union
 
 _TABLE = 0.62
-"""Height of its top, metres."""
+"""Height of the table top in meters."""
 _EXPOSURE = 0.8
-"""This share of the surface of each part is no brighter than the colour that its name stands for."""
+"""Share of each part's surface that is no brighter than the color of its name."""
 _ROUGHNESS = 0.012
-"""Standard deviation of a random factor on every colour."""
+"""Standard deviation of a random factor on every color."""
 _DETAILED_AREA = 130.0
-"""Visible area of all parts, each times its `detail`, square metres."""
+"""Visible area of all parts, each multiplied by its `detail`, in square meters."""
 _RIPE = (1.0, 1.0, 1.0)
-"""Factors that make the survey's pale banana as yellow as one in a shop."""
+"""Factors that make the pale banana yellow of the survey as yellow as a real banana."""
 _STEM = (0.42, 0.33, 0.3)
 """Factors that make the ends of a banana brown."""
 _VEIN = (1.7, 1.5, 2.0)
 """Factors that make the middle of a leaf lighter."""
-_GOLDEN = 137.5
-"""Degrees from leaf to leaf of a plant."""
+_GOLDEN_ANGLE = 137.5
+"""Angle in degrees between successive leaves of a plant."""
 
 
 def demo_room(num_gaussians: int = 45_000, seed: int = 0) -> DemoRoom:
-    """Builds the room. The same arguments give the same room.
+    """Build the room. The same arguments give the same room.
 
     Args:
         num_gaussians: N, at least 2000.
     Raises:
-        ValueError: too few Gaussians.
+        ValueError: `num_gaussians` is too small.
     """
     return built([*_walls(), *_furniture(), *_plant(), *_fruit()], _painted, _DETAILED_AREA, num_gaussians, seed)
 
 
 def _painted(parts: Sequence[Part], surface: Surface, rng: np.random.Generator) -> Array:
-    """Colours of surface Gaussians, [n, 3]: that of their class, textured and lit."""
+    """Return the colors of surface Gaussians, [n, 3], from their classes, textures and light."""
     light, shine = shade(union(*(part.shape for part in parts)), surface.means, surface.normals)
     colors = np.empty_like(light)
     for i, part in enumerate(parts):
-        mine = surface.parts == i
-        if not mine.any():
+        rows = surface.parts == i
+        if not rows.any():
             continue
-        factors = 1.0 if part.paint is None else part.paint(surface.means[mine])
-        lit = light[mine] / np.quantile(light[mine].mean(axis=1), _EXPOSURE)
-        matt = np.array(to_rgb(f"xkcd:{part.name}")) * factors * lit
-        matt /= matt.max(axis=1, keepdims=True).clip(1)  # a channel that is cut off would change the hue
-        colors[mine] = matt + part.gloss * shine[mine, None]
+        factors = 1.0 if part.paint is None else part.paint(surface.means[rows])
+        lit = light[rows] / np.quantile(light[rows].mean(axis=1), _EXPOSURE)
+        matte = np.array(to_rgb(f"xkcd:{part.name}")) * factors * lit
+        matte /= matte.max(axis=1, keepdims=True).clip(1)  # a clipped channel would change the hue
+        colors[rows] = matte + part.gloss * shine[rows, None]
     return colors * rng.normal(1, _ROUGHNESS, (len(colors), 1))
 
 
 def _at(part: Part, x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> Part:
-    """The part, its texture with it, rolled about x, tilted about y (its +x end down) and turned about z, in degrees,
-    then moved.
+    """Move a part together with its texture: roll about x, tilt about y (+x end down), turn about z, then translate.
+
+    Angles are in degrees.
     """
     matrix = Rotation.from_euler("xyz", (roll, tilt, turn), degrees=True).as_matrix()
     shape, painted = part.shape, part.paint
@@ -108,18 +109,18 @@ def _furniture() -> list[Part]:
 
 
 def _plant() -> list[Part]:
-    """In the corner, on the floor."""
+    """Return a plant on the floor, in the corner."""
     x, y, rim = 1.18, -1.18, 0.42
     pot = union(place(cone(0.17, 0.23, 0.38, 0.012), x, y, 0.19), place(cone(0.255, 0.255, 0.08, 0.015), x, y, 0.38))
     vein = paint.banded(lambda p: 1.2 - np.abs(p[:, 1]) / 0.008, _VEIN)
     blade = Part("forest", 9, things.leaf(0.42, 0.19, 0.03), vein)
-    leaves = [_at(blade, x, y, rim + 0.1 + 0.06 * i, _GOLDEN * i + 40, -18 - 4.2 * i) for i in range(13)]
+    leaves = [_at(blade, x, y, rim + 0.1 + 0.06 * i, _GOLDEN_ANGLE * i + 40, -18 - 4.2 * i) for i in range(13)]
     stalk = Part("forest", 6, capsule((x, y, rim - 0.1), (x, y, rim + 0.8), 0.022))
     return [Part("white", 6, pot, paint.mottled(0.1, 0.03)), stalk, *leaves]
 
 
 def _fruit() -> list[Part]:
-    """On the table."""
+    """Return the objects on the table."""
     z = _TABLE
     tomato = Part("tomato red", 30, things.gourd(0.105, 0.175, 5, 0.06, 0.18), paint.mottled(0.08, 0.02), 0.4)
     star = Part("forest", 40, things.calyx(0.065))
@@ -145,13 +146,13 @@ def _fruit() -> list[Part]:
 
 
 def _ring(count: int, radius: float, height: float) -> Array:
-    """[count, 3] places around the vertical."""
+    """Return [count, 3] positions around the vertical axis."""
     angles = 2 * np.pi * np.arange(count) / count + radius
     return np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)], axis=1)
 
 
 def _bananas(x: float, y: float, z: float) -> list[Part]:
-    """A bunch, its stems at (x, y), arched over the table."""
+    """Return a bunch with its stems at (x, y), arched over the table."""
     tints = paint.banded(things.banana_end, _STEM)
     banana = Part("banana yellow", 26, things.banana(0.044), lambda p: _RIPE * tints(p), 0.15)
     return [_at(banana, x, y, z + 0.012 * i, -75 + 17 * i, -62 + 16 * i) for i in range(4)]

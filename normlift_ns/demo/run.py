@@ -1,4 +1,4 @@
-"""The demo room as a splatfacto run, written by nerfstudio's own trainer but without any training."""
+"""The demo room as a splatfacto run, written by nerfstudio's own trainer without training."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from normlift_ns.demo.build import DemoRoom
 
 
 def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:
-    """Writes output_dir/<name of the capture>/splatfacto/<time> as `ns-train splatfacto` does, on the CPU, in seconds.
+    """Write output_dir/<name of the capture>/splatfacto/<time> as `ns-train splatfacto` does, on the CPU, in seconds.
 
-    The stock trainer sets up everything and saves its full checkpoint, optimizers and schedulers included, after one
-    step with zero gradients, which leaves the Gaussians of the room as they are. Only the weights of the LPIPS metric
-    are missing from it.
+    The stock trainer sets up everything and saves its full checkpoint, including optimizers and schedulers. It does so
+    after one step with zero gradients, which does not change the Gaussians of the room. Only the weights of the LPIPS
+    metric are missing from the checkpoint.
 
     Args:
-        capture_folder: written by `write_capture`. The config names it as given here, relative or absolute.
+        capture_folder: folder written by `write_capture`. The config contains this path unchanged, relative or
+            absolute.
     Returns:
         The run's config.yml.
     Raises:
@@ -41,12 +42,12 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     config.pipeline.model.num_random = len(room.scene)
     config.set_timestamp()
     config.save_config()
-    config.vis = "none"  # nothing is trained: no log, whose thread would write as long as the process lives
+    config.vis = "none"  # no training, so no log, whose thread would write until the process ends
     trainer = config.setup()
     with (
         # The metric would download its weights.
         patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()),
-        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # of the whole process; another training has its own
+        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # global in the process; another training has its own
     ):
         trainer.setup()
     dataset = trainer.pipeline.datamanager.train_dataparser_outputs
@@ -71,7 +72,8 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
 
 
 def splatfacto_config() -> Any:
-    """Method splatfacto of nerfstudio, without importing the list of all its methods, which takes seconds more."""
+    """Return nerfstudio's method splatfacto without importing the list of all its methods, which takes seconds
+    longer."""
     from nerfstudio.models.splatfacto import SplatfactoModelConfig  # noqa: PLC0415
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig  # noqa: PLC0415
 
@@ -84,10 +86,10 @@ def splatfacto_config() -> Any:
 
 
 def to_dataparser_world(scene: GaussianScene, transform: Float[Tensor, "3 4"], scale: float) -> GaussianScene:
-    """The scene in the world of nerfstudio's dataparser, p' = scale (R p + t) with transform = [R | t]."""
+    """Transform the scene to the world of nerfstudio's dataparser, p' = scale (R p + t) with transform = [R | t]."""
     rotation = Rotation.from_matrix(transform[:, :3].numpy())
     means = scale * (scene.means @ transform[:, :3].T + transform[:, 3])
-    quats = (rotation * Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy())).as_quat()  # SciPy has w last
+    quats = (rotation * Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy())).as_quat()  # SciPy puts w last
     return GaussianScene(
         means, torch.from_numpy(quats).roll(1, dims=1).to(means), scale * scene.scales, scene.opacities
     )

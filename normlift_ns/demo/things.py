@@ -1,4 +1,4 @@
-"""Shapes of things that people recognise, around the origin, standing or lying on z = 0. Metres."""
+"""Shapes of familiar objects around the origin, standing or lying on z = 0, in meters."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from normlift_ns.demo.shapes import Array, Distance, capsule, cone, length, plac
 Point = tuple[float, float, float]
 
 _NEAR = 0.25
-"""Beyond this distance from its bounding sphere a thing is taken for the sphere: who lights the room asks often."""
+"""Distance from the bounding sphere beyond which the sphere replaces the object, because lighting evaluates it
+often."""
 
 _DIMPLE = 0.38
-"""Width of the dimple of a fruit, in its radii."""
+"""Width of a fruit's dimple, in radii."""
 
 
-def bounded(shape: Distance, centre: Point, radius: float) -> Distance:
-    """The shape, which lies within a sphere; from afar, the distance to the sphere."""
+def bounded(shape: Distance, center: Point, radius: float) -> Distance:
+    """Return a shape that lies within a sphere; far from it, use the distance to the sphere."""
 
     def distance(p: Array) -> Array:
-        found = length(p - centre) - radius
-        near = found < _NEAR
-        found[near] = shape(p[near])
-        return found
+        result = length(p - center) - radius
+        near = result < _NEAR
+        result[near] = shape(p[near])
+        return result
 
     return distance
 
 
 def ellipsoid(a: float, b: float, c: float) -> Distance:
-    """Around the origin; right near the surface, where it is needed."""
+    """Return an ellipsoid around the origin. Its distance is accurate near the surface, where it is needed."""
     radii = np.array([a, b, c])
 
     def distance(p: Array) -> Array:
@@ -41,7 +42,7 @@ def ellipsoid(a: float, b: float, c: float) -> Distance:
 
 
 def gourd(radius: float, height: float, ribs: int, furrow: float, dimple: float, belly: float = 0.0) -> Distance:
-    """A tomato, an apple, a pumpkin: a flattened ball with ribs and a dimple at its poles.
+    """Return a tomato, an apple or a pumpkin: a flattened sphere with ribs and a dimple at its poles.
 
     Args:
         furrow: depth of the furrows between ribs, in radii.
@@ -64,7 +65,7 @@ def gourd(radius: float, height: float, ribs: int, furrow: float, dimple: float,
 
 
 def tapered(start: Point, end: Point, first: float, last: float) -> Distance:
-    """Balls along a line segment, their radii from `first` to `last`."""
+    """Return spheres along a line segment, with radii from `first` to `last`."""
     a, b = np.array(start), np.array(end)
 
     def distance(p: Array) -> Array:
@@ -75,33 +76,33 @@ def tapered(start: Point, end: Point, first: float, last: float) -> Distance:
 
 
 BANANA_BEND, BANANA_ARC = 0.24, np.radians(55)
-"""Radius of the middle line of a banana, and half the angle that it spans."""
+"""Radius of the center line of a banana, and half the angle that it spans."""
 
 
 def banana(radius: float) -> Distance:
-    """From its stem, at the origin, along -y, bent about z, its middle towards +x."""
+    """Return a banana from its stem at the origin along -y, bent about z, with its middle toward +x."""
     start = np.array([BANANA_BEND * np.cos(BANANA_ARC), BANANA_BEND * np.sin(BANANA_ARC), 0])
     stem = tapered((-0.035, 0.03, 0), (0, 0, 0), 0.3 * radius, 0.36 * radius)
 
     def distance(p: Array) -> Array:
-        q = p + start  # from the centre of the bend
+        q = p + start  # from the center of the bend
         angle = np.arctan2(q[:, 1], q[:, 0]).clip(-BANANA_ARC, BANANA_ARC)
-        part = np.abs(angle) / BANANA_ARC
+        position = np.abs(angle) / BANANA_ARC
         nearest = BANANA_BEND * np.stack([np.cos(angle), np.sin(angle), np.zeros(len(p))], axis=1)
-        return length(q - nearest) - radius * (1 - 0.25 * part**2 - 0.4 * part**8)
+        return length(q - nearest) - radius * (1 - 0.25 * position**2 - 0.4 * position**8)
 
     return bounded(union(distance, stem), (0.03, -0.2, 0), 0.27)
 
 
 def banana_end(points: Array) -> Array:
-    """How far a point of a banana belongs to its dark ends, [n], above 0 near them."""
+    """Return how close points of a banana are to its dark ends, [n], positive near them."""
     x, y = BANANA_BEND * np.cos(BANANA_ARC), BANANA_BEND * np.sin(BANANA_ARC)
     to_end = BANANA_BEND * (BANANA_ARC - np.abs(np.arctan2(points[:, 1] + y, points[:, 0] + x)))
     return 1.6 - to_end / 0.012
 
 
 def calyx(radius: float, leaves: int = 5) -> Distance:
-    """The green star on a tomato, with its stem."""
+    """Return the green star on a tomato, with its stem."""
     angles = 2 * np.pi * np.arange(leaves) / leaves
     tips = [(radius * np.cos(a), radius * np.sin(a), 0.004) for a in angles]
     star = [tapered((0, 0, 0.01), tip, 0.2 * radius, 0.06 * radius) for tip in tips]
@@ -110,21 +111,21 @@ def calyx(radius: float, leaves: int = 5) -> Distance:
 
 
 def aubergine() -> Distance:
-    """Lying along y, its thin end towards +y."""
+    """Return an eggplant along y, with its thin end toward +y."""
     thick = tapered((0, -0.13, 0.1), (0, 0.02, 0.085), 0.1, 0.085)
     thin = tapered((0, 0, 0.087), (0.02, 0.15, 0.062), 0.087, 0.05)
     return bounded(union(thick, thin), (0, 0, 0.09), 0.26)
 
 
 def aubergine_cap() -> Distance:
-    """The green cap and stem at the thin end of `aubergine`."""
+    """Return the green cap and stem at the thin end of `aubergine`."""
     cap = tapered((0.018, 0.16, 0.064), (0.024, 0.22, 0.06), 0.06, 0.02)
     stem = tapered((0.024, 0.2, 0.06), (0.045, 0.31, 0.085), 0.018, 0.013)
     return bounded(union(cap, stem), (0.03, 0.2, 0.06), 0.14)
 
 
 def bottle(radius: float, height: float) -> Distance:
-    """Of wine: a body, shoulders and a neck."""
+    """Return a wine bottle with a body, shoulders and a neck."""
     body, neck = 0.46 * height, 0.32 * radius
     return union(
         place(cone(radius, radius, body, 0.012), 0, 0, body / 2),
@@ -134,7 +135,7 @@ def bottle(radius: float, height: float) -> Distance:
 
 
 def bowl(radius: float, thickness: float) -> Distance:
-    """A half sphere with a flat foot, open upwards."""
+    """Return a hemisphere with a flat foot, open at the top."""
 
     def distance(p: Array) -> Array:
         q = p - (0, 0, radius)
@@ -144,14 +145,14 @@ def bowl(radius: float, thickness: float) -> Distance:
     return union(distance, place(cone(0.5 * radius, 0.45 * radius, 0.04, 0.01), 0, 0, 0.02))
 
 
-def heap(centres: Array, radius: float) -> Distance:
-    """Balls of one radius."""
-    tree = KDTree(centres)
+def heap(centers: Array, radius: float) -> Distance:
+    """Return spheres of the same radius."""
+    tree = KDTree(centers)
     return lambda p: np.asarray(tree.query(p)[0]) - radius
 
 
 def leaf(long: float, wide: float, thick: float) -> Distance:
-    """A blade that grows from the origin along x and bends downwards."""
+    """Return a blade that grows from the origin along x and bends downward."""
     blade = ellipsoid(long / 2, wide / 2, thick / 2)
 
     def distance(p: Array) -> Array:

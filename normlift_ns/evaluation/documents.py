@@ -1,4 +1,4 @@
-"""JSON files that others wrote, as the types that a protocol expects."""
+"""JSON files from other programs, validated against the types that a protocol expects."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ import msgspec
 from normlift_ns.errors import InputError
 
 Name = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*\S")]
-"""A text that can be asked: not blank, and without halves of characters."""
-_LARGEST = 2**26
-"""Bytes; label files have some thousands."""
+"""Text that can be used as a prompt: not blank, and without lone surrogates."""
+_MAX_BYTES = 2**26
+"""Maximum file size in bytes; label files have some thousands."""
 T = TypeVar("T")
 
 
 def read_document(path: Path, kind: type[T]) -> T:
-    """The content of a JSON file.
+    """Read a JSON file and convert it to a type.
 
     Raises:
-        ValueError: no file, one that is too large or no JSON, keys that stand twice, values of other types.
+        ValueError: the file is missing, too large or not valid JSON, a key occurs twice, or a value has another type.
     """
     if not os.path.isfile(path):
-        raise InputError("it is no file")
+        raise InputError("it is not a file")
     try:
         with path.open("rb") as file:
-            content = file.read(_LARGEST + 1)
-        if len(content) > _LARGEST:
-            raise InputError(f"it has more than {_LARGEST:,} bytes")
-        found = json.loads(content.decode("utf8"), object_pairs_hook=_once, parse_constant=_no_number)
-        return msgspec.convert(found, kind)
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise InputError(f"it has more than {_MAX_BYTES:,} bytes")
+        document = json.loads(content.decode("utf8"), object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
+        return msgspec.convert(document, kind)
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise InputError(f"{type(error).__name__}: {error}") from None
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
         keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise InputError(f"the key {twice!r} stands twice")
-    return found
+        duplicate = next(key for key in keys if keys.count(key) > 1)
+        raise InputError(f"the key {duplicate!r} occurs twice")
+    return result
 
 
-def _no_number(text: str) -> float:
-    raise InputError(f"{text} is no number in JSON")
+def _reject_constant(text: str) -> float:
+    raise InputError(f"{text} is not a valid JSON number")

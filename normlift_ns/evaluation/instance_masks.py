@@ -1,4 +1,4 @@
-"""Captures with instance masks: per-Gaussian truth from the masks' own evidence, and pixels of held-out views."""
+"""Evaluation with instance masks: true classes of Gaussians from the evidence of the masks, and held-out pixels."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from normlift_ns.evaluation.results import Evaluation
 _VALUE = re.compile(r"0|-?[1-9][0-9]{0,9}")
 
 
-class _Named(msgspec.Struct):
-    """The file with names."""
+class _NamesFile(msgspec.Struct):
+    """Content of the file of names."""
 
     labels: dict[str, Name]
     background: int | None = None
@@ -34,106 +34,108 @@ class _Named(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Names:
-    """What the values of instance masks are called."""
+    """Class names of the values of instance masks."""
 
     classes: tuple[str, ...]
-    """Distinct names, the queries."""
+    """Distinct names, used as prompts."""
     class_of: Mapping[int, int]
-    """Class of every value; values that are not there do not count."""
+    """Class of each value; pixels with other values do not count."""
 
 
 def read_names(path: Path) -> Names:
-    """Reads {"labels": {"1": "table", ...}, "background": 0}, or only the inner part; equal names are one class.
+    """Read {"labels": {"1": "table", ...}, "background": 0}, or only the inner part; equal names are one class.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file of another form.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another format.
     """
     expected = 'expected {"labels": {"1": "table", ...}}'
     if not os.path.lexists(path):
-        raise FileNotFoundError(f'names of the masks {path} do not exist; write {{"labels": {{"1": "table", ...}}}}')
+        raise FileNotFoundError(f'mask names {path} do not exist; write {{"labels": {{"1": "table", ...}}}} to it')
     try:
-        found = read_document(path, dict[str, Any])
-        named = msgspec.convert(found if "labels" in found else {"labels": found}, _Named)
-        of_value = _by_value(named.labels)
-        if named.background is not None and named.background in of_value:
+        document = read_document(path, dict[str, Any])
+        named = msgspec.convert(document if "labels" in document else {"labels": document}, _NamesFile)
+        name_of = _by_value(named.labels)
+        if named.background is not None and named.background in name_of:
             raise InputError(f"value {named.background} is the background, but has a name")
-        if len(of_value) == 0:
-            raise InputError("there is no name in it")
+        if len(name_of) == 0:
+            raise InputError("it has no names")
     except ValueError as error:
-        raise InputError(f"{path} names no masks ({error}); {expected}") from error
-    classes = tuple(dict.fromkeys(of_value.values()))
-    return Names(classes, {value: classes.index(name) for value, name in of_value.items()})
+        raise InputError(f"{path} is not a valid file of mask names ({error}); {expected}") from error
+    classes = tuple(dict.fromkeys(name_of.values()))
+    return Names(classes, {value: classes.index(name) for value, name in name_of.items()})
 
 
 def _by_value(labels: Mapping[str, str]) -> dict[int, str]:
     wrong = [key for key in labels if _VALUE.fullmatch(key) is None]
     if len(wrong) > 0:
-        raise InputError(f"{wrong[0]!r} is no value of a mask: a whole number such as 1")
+        raise InputError(f"{wrong[0]!r} is not a mask value, expected an integer such as 1")
     return {int(value): name for value, name in labels.items()}
 
 
 def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width: int) -> Int64[Tensor, "h w"]:
-    """Class of every pixel of an image, -1 where it does not count.
+    """Return the class of every pixel of an image; -1 if it does not count.
 
     Raises:
-        FileNotFoundError, ValueError: a mask that is missing, damaged or of another size; the message names it.
+        FileNotFoundError, ValueError: the mask is missing, damaged or of another size; the message names it.
     """
     values = masks.values(name)
     if values.shape != (1, height, width):
         size = values.shape if len(values) > 1 else values.shape[1:]
         raise InputError(
-            f"mask {masks.path(name)} has shape {size}, its image {name} is {height} x {width} (height x width); make "
-            "masks of the size of the (undistorted) image"
+            f"mask {masks.path(name)} has shape {size}, but its image {name} is {height} x {width} (height x width); "
+            "give masks the size of the undistorted image"
         )
-    found, inverse = np.unique(values[0], return_inverse=True)
-    table = torch.tensor([names.class_of.get(int(value), NO_CLASS) for value in found])
+    unique, inverse = np.unique(values[0], return_inverse=True)
+    table = torch.tensor([names.class_of.get(int(value), NO_CLASS) for value in unique])
     return table[torch.from_numpy(inverse.reshape(height, width))]
 
 
 def gaussian_truth(
     evidence: Evidence, classes: int, *, purity: float = 0.75, min_weight: float = 1.0
 ) -> Int64[Tensor, " n"]:
-    """Class of every Gaussian from evidence of the exact masks, whose columns are the classes view by view.
+    """Return the true class of every Gaussian from evidence of the exact masks, with one column per view and class.
+
+    A Gaussian below either minimum has class -1.
 
     Args:
-        purity: least share of the class in the weight of the Gaussian, pixels that do not count included.
-        min_weight: least weight in all views together, in pixels; -1 below either.
+        purity: minimum share of the class in the weight of the Gaussian, including pixels that do not count.
+        min_weight: minimum weight in all views together, in pixels.
     """
     columns = torch.arange(evidence.num_regions) % classes
     by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.rows.weight))
     total = by_class.sum(1) + evidence.unlabeled.row_sums().to(by_class)
     best = by_class.max(dim=1)
-    known = (total >= min_weight) & (best.values >= purity * total)
-    return torch.where(known, best.indices, NO_CLASS)
+    valid = (total >= min_weight) & (best.values >= purity * total)
+    return torch.where(valid, best.indices, NO_CLASS)
 
 
 def evaluate_masks(
     names: Sequence[str],
     truth: Int64[Tensor, " n"],
-    found: Int64[Tensor, " n"],
+    prediction: Int64[Tensor, " n"],
     pixels: Sequence[tuple[Int64[Tensor, "h w"], Int64[Tensor, "h w"]]],
     reliability: Float[Tensor, " n"],
     settings: Mapping[str, object],
 ) -> Evaluation:
-    """miou_3d and macc_3d over Gaussians, miou_2d and macc_2d over the pixels of all held-out views together.
+    """Compute miou_3d and macc_3d over Gaussians, and miou_2d and macc_2d over all pixels of the held-out views.
 
     Args:
-        pixels: truth and answer of every held-out view.
+        pixels: true and predicted classes of every held-out view.
     """
     classes = len(names)
-    of_gaussians = class_scores(confusion(truth, found, classes))
+    of_gaussians = class_scores(confusion(truth, prediction, classes))
     counts = sum((confusion(t, f, classes) for t, f in pixels), torch.zeros(classes, classes + 1, dtype=torch.int64))
     of_pixels = class_scores(counts)
-    known = truth >= 0
-    correct = (found == truth)[known].double()
+    scored = truth >= 0
+    correct = (prediction == truth)[scored].double()
     results = {
         "miou_3d": of_gaussians.miou,
         "macc_3d": of_gaussians.macc,
         "accuracy_3d": float(correct.mean()) if len(correct) > 0 else float("nan"),
         "miou_2d": of_pixels.miou,
         "macc_2d": of_pixels.macc,
-        "gaussians_with_truth_share": float(known.double().mean()),
+        "gaussians_with_truth_share": float(scored.double().mean()),
         "zero_evidence_share": float((reliability == 0).double().mean()),
     }
     rows = [

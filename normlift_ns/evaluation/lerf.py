@@ -1,4 +1,4 @@
-"""2D open-vocabulary segmentation on LERF-OVS: scores of prompts are composited, not feature maps."""
+"""2D open-vocabulary segmentation on LERF-OVS, with composited scores of prompts instead of feature maps."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from normlift_ns.evaluation.options import LANGSPLAT, Average, Masking
 from normlift_ns.evaluation.results import Evaluation, mean
 from normlift_ns.evaluation.sfs import cleaned, histogram_threshold
 
-_BOX, _THRESHOLD, _REACH = 30, 0.4, 3
-"""LangSplat's: side of the box filter, threshold, and half the side of the window of the majority."""
+_BOX, _THRESHOLD, _HALF_WINDOW = 30, 0.4, 3
+"""LangSplat's values: side of the box filter, threshold, and half the side of the majority window."""
 
 
 class FrameScores(NamedTuple):
-    """Composited scores of one frame."""
+    """Composited scores of a frame."""
 
     frame: LabeledFrame
     prompts: Float[Tensor, "h w q"]
-    """Of the frame's categories, in the order of `frame.masks`."""
+    """Scores of the frame's categories, in the order of `frame.masks`."""
     background: Float[Tensor, "h w b"]
-    """Masking "background": of `BACKGROUND_WORDS`. Masking "langsplat": relevancies are in `prompts` already; empty."""
+    """Scores of `BACKGROUND_WORDS`, for masking "background". With LangSplat's maskings, `prompts` are relevancies
+    already."""
 
 
 def found_mask(
@@ -40,13 +41,13 @@ def found_mask(
     margin: float,
     instances: int,
 ) -> Bool[Tensor, "h w"]:
-    """The pixels that a prompt is found in.
+    """Return the mask of a prompt.
 
     Args:
-        masking: "background": score above every background word by the margin. "auto": the score reaches SFS's
-            threshold from the histogram of scores, which is told the number of true instances. "langsplat" and
-            "langsplat_composited": the relevancy, scaled to 0..1 over the image, exceeds 0.7 (0.4 after 2 x - 1), by
-            the majority of pixels.
+        masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores that
+            reach SFS's threshold, computed from their histogram and the number of true instances. "langsplat" and
+            "langsplat_composited" scale the relevancy to 0..1 over the image. They select pixels if it exceeds 0.7 (0.4
+            after 2 x - 1) in the majority of the pixels around them.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin
@@ -57,14 +58,15 @@ def found_mask(
 
 
 def _majority(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """What more than half of the pixels at most 3 rows and columns away are, as LangSplat counts them: without the last
-    row and the last column of the image.
+    """Select a pixel if more than half of the pixels at most 3 rows and columns away are selected.
+
+    As in LangSplat, the last row and the last column of the image do not count.
     """
     sums = torch.nn.functional.pad(mask.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
 
     def window(size: int) -> tuple[Tensor, Tensor]:
-        places = torch.arange(size)
-        return (places - _REACH).clamp(min=0), (places + _REACH + 1).clamp(max=size - 1)
+        positions = torch.arange(size)
+        return (positions - _HALF_WINDOW).clamp(min=0), (positions + _HALF_WINDOW + 1).clamp(max=size - 1)
 
     (top, bottom), (left, right) = (window(size) for size in mask.shape)
     inside = sums[bottom][:, right] - sums[top][:, right] - sums[bottom][:, left] + sums[top][:, left]
@@ -72,8 +74,10 @@ def _majority(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
 
 
 def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """LangSplat: the mean over 30 x 30 pixels, where the peak is looked for, and its mean with the relevancy itself,
-    which is thresholded.
+    """Apply LangSplat's box filter.
+
+    Returns:
+        The mean over 30 x 30 pixels, which determines the peak, and its mean with the relevancy, for the threshold.
     """
     image = relevancy.float().numpy()
     kernel = np.full((_BOX, _BOX), 1 / _BOX**2, np.float32)
@@ -82,7 +86,10 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
 
 
 def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: bool) -> list[dict[str, Any]]:
-    """IoU, recall and whether the peak is in the mask (LangSplat's maskings: any peak, in any box), per category."""
+    """Compute IoU, recall and localization of each category.
+
+    A category is localized if its peak lies in the mask. With LangSplat's maskings, any peak may lie in any box.
+    """
     rows = []
     frame, langsplat = scores.frame, masking in LANGSPLAT
     for q, (category, truth) in enumerate(frame.masks.items()):
@@ -92,14 +99,14 @@ def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: b
             peaks, score = box_filtered(score)
             inside = in_boxes(frame.boxes[category], *truth.shape)
         instances = len(frame.boxes[category])
-        found = found_mask(score, scores.background, masking, margin=margin, instances=instances)
-        found = cleaned(found) if clean else found
+        mask = found_mask(score, scores.background, masking, margin=margin, instances=instances)
+        mask = cleaned(mask) if clean else mask
         rows.append(
             {
                 "frame": frame.stem,
                 "category": category,
-                "iou": mask_iou(found, truth, empty=math.nan if langsplat else 0.0),
-                "accuracy": mask_recall(found, truth),
+                "iou": mask_iou(mask, truth, empty=math.nan if langsplat else 0.0),
+                "accuracy": mask_recall(mask, truth),
                 "localized": float(localized(peaks, inside, any_peak=langsplat)),
             }
         )
@@ -107,7 +114,7 @@ def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: b
 
 
 def in_boxes(boxes: Sequence[tuple[float, float, float, float]], height: int, width: int) -> Bool[Tensor, "h w"]:
-    """Pixels inside any of the boxes, edges included."""
+    """Return the pixels inside any of the boxes, including their edges."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     inside = torch.zeros(height, width, dtype=torch.bool)
     for x1, y1, x2, y2 in boxes:
@@ -116,18 +123,20 @@ def in_boxes(boxes: Sequence[tuple[float, float, float, float]], height: int, wi
 
 
 def summarize_lerf(rows: Sequence[dict[str, Any]], average: Average, settings: dict[str, Any]) -> Evaluation:
-    """miou, macc and loc_acc of every scene and their means over scenes, as the paper averages; with _pooled: over the
-    frames, pairs or categories of all scenes together.
+    """Compute miou, macc and loc_acc of every scene and their means over scenes, as the paper averages.
+
+    Results with _pooled are averaged over the frames, pairs or categories of all scenes together.
 
     Args:
-        rows: of `frame_rows`, each with its scene.
-        average: "frames": over the categories of a frame, then over frames (SFS's code). "pairs": over all pairs of
-            frame and category (LangSplat's). "categories": over the frames of a category, then over categories.
+        rows: results of `frame_rows`, each with its scene.
+        average: "frames" averages over the categories of a frame, then over frames (SFS's code). "pairs" averages over
+            all pairs of frame and category (LangSplat's). "categories" averages over the frames of a category, then
+            over categories.
     """
     by_scene = _grouped(rows, lambda row: row["scene"])
     scenes = [
-        {"scene": scene, "frames": len({row["frame"] for row in some}), **_averages(some, average)}
-        for scene, some in by_scene.items()
+        {"scene": scene, "frames": len({row["frame"] for row in group}), **_averages(group, average)}
+        for scene, group in by_scene.items()
     ]
     pooled = {f"{name}_pooled": value for name, value in _averages(rows, average).items()}
     results = {name: mean([scene[name] for scene in scenes]) for name in _METRICS} | pooled
@@ -138,13 +147,13 @@ _METRICS = {"miou": "iou", "macc": "accuracy", "loc_acc": "localized"}
 
 
 def _averages(rows: Sequence[Mapping[str, Any]], average: Average) -> dict[str, float]:
-    key: Callable[[Mapping[str, Any]], Hashable] = {
+    group_key: Callable[[Mapping[str, Any]], Hashable] = {
         "frames": lambda row: (row["scene"], row["frame"]),
         "categories": lambda row: row["category"],
         "pairs": id,
     }[average]
-    groups = _grouped(rows, key).values()
-    return {name: mean([mean([row[of] for row in group]) for group in groups]) for name, of in _METRICS.items()}
+    groups = _grouped(rows, group_key).values()
+    return {name: mean([mean([row[key] for row in group]) for group in groups]) for name, key in _METRICS.items()}
 
 
 def _grouped(

@@ -32,58 +32,59 @@ class _Object(msgspec.Struct):
 
 
 class _File(msgspec.Struct):
-    """What a label file holds."""
+    """Content of a label file."""
 
     info: _Info
     objects: list[_Object]
 
 
 class LabeledFrame(NamedTuple):
-    """One annotated frame."""
+    """Masks and boxes of an annotated frame."""
 
     stem: str
-    """Of the image that it annotates."""
+    """File stem of the annotated image."""
     masks: dict[str, Bool[Tensor, "h w"]]
-    """By category; several objects of a category are one mask."""
+    """Mask of each category, the union of its objects."""
     boxes: dict[str, list[tuple[float, float, float, float]]]
     """(x1, y1, x2, y2) of every object of a category, in pixels."""
 
 
 def read_frames(folder: Path) -> list[Path]:
-    """The JSON files of a folder such as lerf_ovs/label/figurines, by name.
+    """Return the JSON files of a folder such as lerf_ovs/label/figurines, sorted by name.
 
     Raises:
-        FileNotFoundError: no such folder, or none in it.
+        FileNotFoundError: the folder does not exist or has no JSON files.
     """
     files = sorted(folder.glob("*.json")) if os.path.isdir(folder) else []
     if len(files) == 0:
         raise FileNotFoundError(
-            f"{folder} holds no label files; give the folder with frame_00041.json and the like, lerf_ovs/label/SCENE"
+            f"{folder} has no label files; give the folder with files such as frame_00041.json, lerf_ovs/label/SCENE"
         )
     return files
 
 
 def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
-    """Reads one file and fills its polygons at the size of the image, to which they are scaled.
+    """Read a label file and fill its polygons, scaled to the size of the image.
 
     Raises:
-        ValueError: a file of another form, or of an image with another aspect ratio; the message names it.
+        ValueError: the file has another format, or is for an image with another aspect ratio. The message names the
+            file.
     """
     try:
-        found = read_document(file, _File)
-        labelled = found.info.width, found.info.height
-        shapes = [(o.category, _points(o.segmentation, *labelled), _box(o.bbox, *labelled)) for o in found.objects]
+        document = read_document(file, _File)
+        size = document.info.width, document.info.height
+        shapes = [(o.category, _points(o.segmentation, *size), _box(o.bbox, *size)) for o in document.objects]
     except ValueError as error:
         raise InputError(
-            f"{file} is no label file of LERF-OVS ({error}); expected "
+            f"{file} is not a LERF-OVS label file ({error}); expected "
             '{"info": {"width", "height"}, "objects": [{"category", "segmentation": [[x, y], ...], "bbox"}]}'
         ) from error
-    if abs(labelled[0] * height - labelled[1] * width) > 0.01 * labelled[0] * height:
+    if abs(size[0] * height - size[1] * width) > 0.01 * size[0] * height:
         raise InputError(
-            f"{file} labels an image of {labelled[0]} x {labelled[1]} pixels, the run's is {width} x {height}; use the "
-            "images that the labels were drawn on"
+            f"{file} labels an image of {size[0]} x {size[1]} pixels, but that of the run has {width} x {height}; use "
+            "the images that the labels were drawn on"
         )
-    scale = np.array([width / labelled[0], height / labelled[1]])
+    scale = np.array([width / size[0], height / size[1]])
     masks: dict[str, np.ndarray] = {}
     boxes: dict[str, list[tuple[float, float, float, float]]] = {}
     for category, points, box in shapes:
@@ -93,8 +94,8 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
         cv2.fillPoly(drawn, [np.int32(scaled)], 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
         if not drawn.any():
             raise InputError(
-                f"{file}: a segmentation of {category!r} lies wholly outside of its image of {labelled[0]} x "
-                f"{labelled[1]} pixels; correct or remove it"
+                f"{file}: a segmentation of {category!r} lies completely outside its image of {size[0]} x {size[1]} "
+                "pixels; correct or remove it"
             )
         mask |= drawn
         low, high = (scaled.min(0), scaled.max(0)) if box is None else box * scale
@@ -103,10 +104,12 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 
 
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
-    """Polygons may be drawn a little past the border, but not a whole image past it."""
+    """Return the points of a polygon, which may lie slightly outside the image, but not by its whole size."""
     points = np.array(segmentation, dtype=float)
     if np.abs(points / (width, height) - 0.5).max() > 1.5:
-        raise InputError(f"a segmentation of an image of {width} x {height} pixels has {np.abs(points).max():g} in it")
+        raise InputError(
+            f"a segmentation of an image of {width} x {height} pixels has the coordinate {np.abs(points).max():g}"
+        )
     return points
 
 
@@ -115,25 +118,27 @@ def _box(box: tuple[float, float, float, float] | None, width: int, height: int)
 
 
 def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path, str], list[str]]:
-    """The image of every label file, which has the same stem, and the stems of the files without one.
+    """Match label files with images by their stems.
 
+    Returns:
+        The image of every label file that has one, and the stems of the files without one.
     Raises:
-        ValueError: none has an image, or one has several.
+        ValueError: no file has an image, or a file has several.
     """
     images: dict[str, list[str]] = {}
     for name in names:
         images.setdefault(PurePosixPath(name).stem, []).append(name)
-    found = {file: images[file.stem] for file in files if file.stem in images}
-    if len(found) == 0:
-        some = ", ".join(sorted(images)[:3])
+    matches = {file: images[file.stem] for file in files if file.stem in images}
+    if len(matches) == 0:
+        stems = ", ".join(sorted(images)[:3])
         raise InputError(
-            f"none of the {len(files)} label files in {files[0].parent} has an image in the run; the first is "
-            f"{files[0].name}, the run has {some}, …"
+            f"none of the {len(files)} label files in {files[0].parent} has an image in the run; the first file is "
+            f"{files[0].name}, but the run has {stems}, …"
         )
-    for file, candidates in found.items():
+    for file, candidates in matches.items():
         if len(candidates) > 1:
             raise InputError(
-                f"{file} labels one image, but {' and '.join(candidates)} of the run are both called {file.stem}; "
-                "rename the images so that one of them is"
+                f"{file} labels one image, but {' and '.join(candidates)} of the run are all called {file.stem}; "
+                "rename all but one of them"
             )
-    return {file: candidates[0] for file, candidates in found.items()}, [f.stem for f in files if f not in found]
+    return {file: candidates[0] for file, candidates in matches.items()}, [f.stem for f in files if f not in matches]

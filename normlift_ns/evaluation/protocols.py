@@ -1,4 +1,4 @@
-"""The three protocols on lifted runs: from files and options to figures."""
+"""The three evaluation protocols on lifted runs: from files and options to metrics."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ from normlift_ns.raster.rasterize import rasterize_evidence, render
 from normlift_ns.raster.settings import RasterSettings
 
 _CHANNELS = 64
-"""Of features, composited at once."""
+"""Number of feature channels that are composited together."""
 
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """A lifted run, and which of its features are scored."""
+    """A lifted run, and which of its features to evaluate."""
 
     scene: Scene
     field: SemanticField
     texts: TextEncoder
     refined: bool
     cache: Path | None = None
-    """Where the lift keeps 2D features."""
+    """Folder in which the lift caches 2D features."""
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
-        """Of every Gaussian's direction to the texts, 0 without direction."""
+        """Return the cosine between every Gaussian's direction and each prompt; 0 without a direction."""
         return self.field.query(self.texts.text(names), refined=self.refined).float()
 
     @property
@@ -63,21 +63,21 @@ class EvaluatedRun:
 
     @property
     def settings(self) -> RasterSettings:
-        """Constants of the rasterizer, those of the lift."""
+        """Rasterizer settings of the lift."""
         return RasterSettings.recorded(self.field.manifest)
 
     def composited(self, camera: Camera, values: Float[Tensor, "n q"]) -> tuple[Tensor, Tensor]:
-        """[H, W, Q] and alpha [H, W], drawn as for the lift."""
-        how = {"rasterize_mode": self.scene.rasterize_mode, "settings": self.settings}
-        return render(self.scene.gaussians, camera, values, **how)
+        """Render values [H, W, Q] and alpha [H, W] with the settings of the lift."""
+        mode = self.scene.rasterize_mode
+        return render(self.scene.gaussians, camera, values, rasterize_mode=mode, settings=self.settings)
 
     def feature_lengths(
         self, cameras: Sequence[Camera], factor: Float[Tensor, "n 1"] | float = 1.0
     ) -> list[Float[Tensor, "h w"]]:
-        """Length of the composited feature vector of every pixel, some channels at a time.
+        """Return the length of every pixel's composited feature vector, computed in groups of channels.
 
         Args:
-            factor: what directions are multiplied by before they are composited.
+            factor: factor on the directions before they are composited.
         """
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
@@ -87,13 +87,14 @@ class EvaluatedRun:
         return [square.sqrt() for square in squares]
 
     def cameras(self) -> dict[str, Camera]:
-        """Of all photographs, trained and held out, by the name of the image."""
-        views = (self.scene.train, self.scene.held_out)
-        return {name: camera for some in views for name, camera in zip(some.names, some.cameras)}
+        """Return the cameras of all training and held-out images by image name."""
+        splits = (self.scene.train, self.scene.held_out)
+        return {name: camera for views in splits for name, camera in zip(views.names, views.cameras)}
 
 
 def scene_names(labels: Sequence[Path]) -> list[str]:
-    """What the scenes of some labels are called: the name of the file or folder; the whole path where names are equal.
+    """Return scene names for label files or folders: the name of the file or folder, or the whole path if names are
+    equal.
 
     >>> scene_names([Path("label/ramen"), Path("a/scene0000_00_vh_clean_2.labels.ply")])
     ['ramen', 'scene0000_00']
@@ -107,44 +108,47 @@ def scene_names(labels: Sequence[Path]) -> list[str]:
 def label_scene(
     lifted: EvaluatedRun, name: str, path: Path, nyu40: Int64[Tensor, " n"], options: ScannetOptions
 ) -> SceneLabels:
-    """What protocol scannet needs of a run.
+    """Return the data of a run that protocol scannet needs.
 
     Raises:
-        ValueError: another number of vertices than Gaussians.
+        ValueError: the number of vertices differs from that of Gaussians.
     """
     check_identity(name, len(lifted.scene.gaussians), nyu40, path)
-    asked = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
-    cosine = lifted.cosine(tuple(asked.values()))
+    prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
+    cosine = lifted.cosine(tuple(prompts.values()))
     return SceneLabels(name, cosine, lifted.valid, lifted.scene.gaussians.opacities, nyu40)
 
 
 def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> Evaluation:
-    """Protocol scannet over one run per scene.
+    """Run protocol scannet with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: labels that are missing, damaged or of another number of points.
+        FileNotFoundError, ValueError: labels are missing, damaged or of another number of points.
     """
     truths = [read_labels(path) for path in labels]
-    given = zip(runs, scene_names(labels), labels, truths)
-    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in given]
-    rule = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
-    found = evaluate_scannet(scenes, **rule)
-    return replace(found, settings={**found.settings, "spelling": options.spelling})
+    inputs = zip(runs, scene_names(labels), labels, truths)
+    scenes = [label_scene(lifted, name, path, nyu40, options) for lifted, name, path, nyu40 in inputs]
+    kwargs = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
+    evaluation = evaluate_scannet(scenes, **kwargs)
+    return replace(evaluation, settings={**evaluation.settings, "spelling": options.spelling})
 
 
 def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: LerfOptions) -> Evaluation:
-    """Protocol lerf over one run per scene.
+    """Run protocol lerf with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: labels that are missing, damaged or of other images.
+        FileNotFoundError, ValueError: labels are missing, damaged or of other images.
     """
     files = [read_frames(folder) for folder in labels]
     rows, missing = [], []
-    for scene, given, lifted in zip(scene_names(labels), files, runs):
+    for scene, frames, lifted in zip(scene_names(labels), files, runs):
         cameras = lifted.cameras()
-        found, absent = match_views(given, list(cameras))
-        missing += [f"{scene}/{stem}" for stem in absent]
-        views = [(cameras[name], read_frame(f, cameras[name].width, cameras[name].height)) for f, name in found.items()]
+        images, unmatched = match_views(frames, list(cameras))
+        missing += [f"{scene}/{stem}" for stem in unmatched]
+        views = [
+            (cameras[name], read_frame(file, cameras[name].width, cameras[name].height))
+            for file, name in images.items()
+        ]
         views = [(camera, frame) for camera, frame in views if len(frame.masks) > 0]
         factor = lifted.field.scalars.norm[:, None].float() if options.scale == "norm" else 1.0
         lengths: list[Tensor | None] = [None] * len(views)
@@ -157,7 +161,7 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
                 for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
             ]
     if len(rows) == 0:
-        raise InputError(f"the label files in {', '.join(map(str, labels))} name no object; nothing can be scored")
+        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; nothing can be scored")
     settings = {**asdict(options), "labels_without_image": missing}
     return summarize_lerf(rows, options.average, settings)
 
@@ -170,10 +174,10 @@ def _frame_scores(
     length: Float[Tensor, "h w"] | None,
     options: LerfOptions,
 ) -> FrameScores:
-    """Composited scores, divided by the length of the pixel's feature where it is given."""
+    """Return composited scores, divided by the length of each pixel's feature if given."""
     prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT
-    others = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
-    values, _ = lifted.composited(camera, factor * lifted.cosine((*prompts, *others)))
+    negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
+    values, _ = lifted.composited(camera, factor * lifted.cosine((*prompts, *negatives)))
     if length is not None:
         values = torch.where(length[:, :, None] > 0, values / length[:, :, None], 0.0).to(values)
     values, background = values[:, :, : len(prompts)], values[:, :, len(prompts) :]
@@ -182,29 +186,31 @@ def _frame_scores(
 
 @dataclass(frozen=True)
 class MaskTruth:
-    """What instance masks tell of a run."""
+    """Ground truth of a run from its instance masks."""
 
     classes: tuple[str, ...]
     gaussians: Int64[Tensor, " n"]
-    """Class of every Gaussian, -1 where it does not count."""
+    """Class of every Gaussian, -1 if it does not count."""
     held_out: Sequence[Int64[Tensor, "h w"]]
-    """Class of every pixel of the held-out views."""
+    """Class of every pixel in the held-out views."""
     settings: Mapping[str, Any]
 
 
 def mask_truth(
     scene: Scene, folder: Path, options: MaskOptions, *, settings: RasterSettings | None = None
 ) -> MaskTruth:
-    """The truth of Gaussians from the masks of the training views, and that of pixels in held-out views.
+    """Derive the truth of Gaussians from the masks of the training views, and that of pixels in held-out views.
 
     Args:
-        settings: constants of the rasterizer; those of gsplat 1.4 by default.
+        settings: rasterizer settings, those of gsplat 1.4 if None.
     Raises:
-        FileNotFoundError, ValueError: masks or names that are missing or damaged; the message names the file.
+        FileNotFoundError, ValueError: masks or names are missing or damaged; the message names the file.
     """
     masks = LabelFiles(folder, what="instance mask", flag="--labels")
-    every = [*scene.train.names, *scene.held_out.names]
-    refuse_shared(((name, masks.path(name)) for name in every), masks.what, "in folders named like those of the images")
+    images = [*scene.train.names, *scene.held_out.names]
+    refuse_shared(
+        ((name, masks.path(name)) for name in images), masks.what, "in folders named like those of the images"
+    )
     names = read_names(options.names or folder.parent / "labels.json")
 
     def classes(views: Views) -> Iterator[Tensor]:
@@ -215,7 +221,7 @@ def mask_truth(
     evidence = rasterize_evidence(
         scene.gaussians,
         scene.train.cameras,
-        (found.int().clamp(min=UNLABELED) for found in classes(scene.train)),
+        (labels.int().clamp(min=UNLABELED) for labels in classes(scene.train)),
         num_regions=[count] * len(scene.train),
         rasterize_mode=scene.rasterize_mode,
         settings=settings,
@@ -223,18 +229,18 @@ def mask_truth(
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
     if not bool((truth >= 0).any()):
         raise InputError(
-            f"no Gaussian lies in a mask of {folder}: check that their values are those named in "
-            f"{options.names or folder.parent / 'labels.json'}, and --purity and --min-weight"
+            f"no Gaussian lies in a mask of {folder}; check that the mask values are those in "
+            f"{options.names or folder.parent / 'labels.json'}, and check --purity and --min-weight"
         )
     facts = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
     return MaskTruth(names.classes, truth, list(classes(scene.held_out)), facts)
 
 
 def run_masks(lifted: EvaluatedRun, truth: MaskTruth) -> Evaluation:
-    """Protocol masks on one run: 3D over Gaussians, 2D in held-out views."""
+    """Run protocol masks on one run: 3D over Gaussians, 2D in held-out views."""
     cosine, pixels = lifted.cosine(truth.classes), []
     for camera, exact in zip(lifted.scene.held_out.cameras, truth.held_out):
         values, alpha = lifted.composited(camera, cosine)
         pixels.append((exact, classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)))
-    found, reliability = classify(cosine, lifted.valid), lifted.field.scalars.reliability
-    return evaluate_masks(truth.classes, truth.gaussians, found, pixels, reliability, truth.settings)
+    prediction, reliability = classify(cosine, lifted.valid), lifted.field.scalars.reliability
+    return evaluate_masks(truth.classes, truth.gaussians, prediction, pixels, reliability, truth.settings)

@@ -1,4 +1,4 @@
-"""What an evaluation finds, in the JSON shape of ns-eval."""
+"""Results of an evaluation, in the JSON format of ns-eval."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from normlift_ns.core.files import write_text
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures of one protocol over one or several runs."""
+    """Metrics of one protocol over one or several runs."""
 
     results: Mapping[str, float]
-    """By name, as `results` of ns-eval. Shares are in 0..1."""
+    """Metrics by name, as `results` of ns-eval. Shares are in 0..1."""
     rows: Sequence[Mapping[str, Any]]
-    """Per class (and scene or frame), JSON types only."""
+    """Metrics per class (and scene or frame), as JSON types."""
     settings: Mapping[str, Any]
-    """The protocol and the reading of it."""
+    """The protocol and its settings."""
     scenes: Sequence[Mapping[str, Any]] = ()
-    """Results of every scene, where `results` are their means."""
+    """Metrics of each scene, if `results` are their means."""
 
 
 def mean(values: Sequence[float]) -> float:
-    """Mean of the values that are numbers; NaN if there is none.
+    """Return the mean of the values that are not NaN; NaN if there are none.
 
     >>> mean([1.0, float("nan"), 3.0])
     2.0
     """
-    found = [value for value in values if not math.isnan(value)]
-    return sum(found) / len(found) if len(found) > 0 else float("nan")
+    numbers = [value for value in values if not math.isnan(value)]
+    return sum(numbers) / len(numbers) if len(numbers) > 0 else float("nan")
 
 
 def write_evaluation(
@@ -46,11 +46,13 @@ def write_evaluation(
     studies: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Writes experiment_name, method_name, checkpoint and results as ns-eval does, then settings, scenes, rows and
-    studies; NaN as null.
+    """Write experiment_name, method_name, checkpoint and results as ns-eval does, then settings, scenes, rows and
+    studies.
+
+    NaN is written as null.
 
     Raises:
-        FileExistsError: the file is there and `overwrite` is False.
+        FileExistsError: the file exists and `overwrite` is False.
     """
     document = {
         "experiment_name": experiment_name,
@@ -62,12 +64,12 @@ def write_evaluation(
         "rows": evaluation.rows,
         **({"studies": studies} if studies else {}),
     }
-    write_text(path, json.dumps(_plain(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
+    write_text(path, json.dumps(_to_json(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(key): _plain(x) for key, x in value.items()}
+        return {str(key): _to_json(x) for key, x in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(x) for x in value]
+        return [_to_json(x) for x in value]
     return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,4 +1,4 @@
-"""3D semantic segmentation on ScanNet as OpenGaussian runs it: Gaussian i is vertex i of the labelled mesh."""
+"""3D semantic segmentation on ScanNet with OpenGaussian's protocol: Gaussian i is vertex i of the labeled mesh."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ NYU40 = {
     10: "bookshelf", 11: "picture", 12: "counter", 14: "desk", 16: "curtain", 24: "refrigerator", 28: "showercurtain",
     33: "toilet", 34: "sink", 36: "bathtub",
 }  # fmt: skip
-"""Names that are queried, bare and spelled as in OpenGaussian's script, by NYU40 id."""
+"""Prompts by NYU40 id: bare class names, spelled as in OpenGaussian's script."""
 PAPER_SPELLING = {28: "shower curtain"}
-"""Names that the paper prints otherwise."""
+"""Class names that the paper spells differently."""
 _LAST_ID = 40
 CLASS_SETS = {
     19: tuple(NYU40),
@@ -39,84 +39,86 @@ SCENES = tuple(f"scene{x}_00" for x in ["0000", "0062", "0070", "0097", "0140", 
 
 
 class SceneLabels(NamedTuple):
-    """What the protocol needs of one scene."""
+    """Data of one scene that the protocol needs."""
 
     name: str
     cosine: Float[Tensor, "n 19"]
-    """Of every Gaussian to the names of `NYU40`, in their order."""
+    """Cosine between every Gaussian and the names of `NYU40`, in their order."""
     valid: Bool[Tensor, " n"]
     """Gaussians that have a direction."""
     opacity: Float[Tensor, " n"]
     nyu40: Int64[Tensor, " n"]
-    """True NYU40 id of the vertex of every Gaussian."""
+    """True NYU40 id of each Gaussian's vertex."""
 
 
 def read_labels(path: Path) -> Int64[Tensor, " n"]:
-    """Property `label` of the vertices of a PLY file, such as scene0000_00_vh_clean_2.labels.ply.
+    """Read the property `label` of the vertices of a PLY file, such as scene0000_00_vh_clean_2.labels.ply.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no PLY file, a damaged one, or one without labels.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not a PLY file, is damaged, or has no labels.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(
-            f"labels {path} do not exist; ScanNet's *_vh_clean_2.labels.ply is wanted, which its licence lets you "
-            "download after registration"
+            f"labels {path} do not exist; expected ScanNet's *_vh_clean_2.labels.ply, which you may download after "
+            "registration, under its license"
         )
     try:
-        found = read_column(path, "label")
-        whole = np.nan_to_num(found.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
-        if (whole != found).any():
-            raise InputError("its labels are no whole numbers of 32 bits")
+        column = read_column(path, "label")
+        labels = np.nan_to_num(column.astype(float), nan=0.5).clip(-(2**31), 2**31).astype(np.int64)
+        if (labels != column).any():
+            raise InputError("its labels are not 32-bit integers")
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path} is damaged or no PLY file with vertices and their labels ({error}); the file "
-            "*_vh_clean_2.labels.ply is meant: download it again"
+            f"{path} is damaged, or not a PLY file with labeled vertices ({error}); download the scene's "
+            "*_vh_clean_2.labels.ply again"
         ) from error
-    known = np.isin(whole, list(NYU40))
-    if not known.any():
+    if not np.isin(labels, list(NYU40)).any():
         raise InputError(
             f"{path}: no label is one of the NYU40 ids {', '.join(map(str, NYU40))}; nothing can be scored"
         )
-    strange = (whole > _LAST_ID) | (whole < -1)
-    if strange.any():
+    unknown = (labels > _LAST_ID) | (labels < -1)
+    if unknown.any():
         warnings.warn(
-            f"{path}: {int(strange.sum()):,} of {len(whole):,} labels are no NYU40 ids ({whole[strange][0]} among "
-            "them); they count as unlabelled",
+            f"{path}: {int(unknown.sum()):,} of {len(labels):,} labels are not NYU40 ids, such as "
+            f"{labels[unknown][0]}; they count as unlabeled",
             stacklevel=2,
         )
-    return torch.from_numpy(np.where(strange, 0, whole))
+    return torch.from_numpy(np.where(unknown, 0, labels))
 
 
 def check_identity(name: str, gaussians: int, labels: Int64[Tensor, " n"], path: Path) -> None:
-    """Gaussian i must be vertex i.
+    """Check that there are as many Gaussians as vertices, because Gaussian i must be vertex i.
 
     Raises:
         ValueError: their numbers differ.
     """
     if len(labels) != gaussians:
         raise InputError(
-            f"run {name} has {gaussians:,} Gaussians, {path} {len(labels):,} vertices; the protocol needs one Gaussian "
-            "per vertex, in their order: train from all vertices with densification and culling off and positions fixed"
+            f"run {name} has {gaussians:,} Gaussians, but {path} has {len(labels):,} vertices; the protocol needs one "
+            "Gaussian per vertex, in the same order. Train from all vertices with densification and culling off and "
+            "positions fixed"
         )
 
 
 def scene_scores(
     scene: SceneLabels, classes: int, *, min_opacity: float = 0.1, without_direction: WithoutDirection = "first"
 ) -> ClassScores:
-    """Scores of one scene for one of `CLASS_SETS`.
+    """Score one scene with one of `CLASS_SETS`.
 
-    Truth outside the set, and that of Gaussians of opacity below `min_opacity`, does not count. All names of the set
-    are asked, also those that the scene lacks; IoU and recall are of the classes that it has.
+    A Gaussian is not scored if its true class is outside the set, or if its opacity is below `min_opacity`. All names
+    of the set are prompts, including those that the scene lacks. IoU and recall are computed for the classes that it
+    has.
     """
-    truth, found = answers(scene, classes, min_opacity=min_opacity, without_direction=without_direction)
-    return class_scores(confusion(truth, found, classes))
+    truth, prediction = answers(scene, classes, min_opacity=min_opacity, without_direction=without_direction)
+    return class_scores(confusion(truth, prediction, classes))
 
 
 def answers(
     scene: SceneLabels, classes: int, *, min_opacity: float, without_direction: WithoutDirection
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Truth and answer of every Gaussian, as indices into the set of classes; see `scene_scores`."""
+    """Return the true and the predicted class of every Gaussian, as indices into the set of classes; see
+    `scene_scores`."""
     ids = list(NYU40)
     columns = [ids.index(i) for i in CLASS_SETS[classes]]
     class_of = torch.full((max(int(scene.nyu40.max()), *ids) + 1,), NO_CLASS)
@@ -129,8 +131,9 @@ def answers(
 def evaluate_scannet(
     scenes: Sequence[SceneLabels], *, min_opacity: float = 0.1, without_direction: WithoutDirection = "first"
 ) -> Evaluation:
-    """mIoU and mAcc of every set of classes, means over scenes; beside them the other reading of Gaussians without
-    direction, as `..._none` or `..._first`.
+    """Compute mIoU and mAcc of every set of classes, averaged over scenes.
+
+    `..._none` or `..._first` are the results with the other treatment of Gaussians without direction.
     """
     other: WithoutDirection = "none" if without_direction == "first" else "first"
     results, rows = {}, []
@@ -149,12 +152,12 @@ def evaluate_scannet(
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])
             results[f"macc_{classes}{suffix}"] = mean([s.macc for s in scores[rule]])
-        for row, found in zip(by_scene, scores[without_direction]):
-            row |= {f"miou_{classes}": found.miou, f"macc_{classes}": found.macc}
-        for scene, found in zip(scenes, scores[without_direction]):
+        for row, score in zip(by_scene, scores[without_direction]):
+            row |= {f"miou_{classes}": score.miou, f"macc_{classes}": score.macc}
+        for scene, score in zip(scenes, scores[without_direction]):
             rows += [
                 {"scene": scene.name, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
-                for i, iou, accuracy in zip(ids, found.iou.tolist(), found.accuracy.tolist())
+                for i, iou, accuracy in zip(ids, score.iou.tolist(), score.accuracy.tolist())
                 if not math.isnan(iou)  # the scene lacks the class
             ]
     names = [scene.name for scene in scenes]

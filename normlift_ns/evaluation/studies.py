@@ -1,4 +1,4 @@
-"""What else a protocol can tell of lifted runs: ablation, sweeps of parameters, signals of R, what lifting took."""
+"""Further studies of lifted runs: ablation, parameter sweeps, signals of R, comparison with other methods, timing."""
 
 from __future__ import annotations
 
@@ -28,78 +28,78 @@ def study_votes(
     votes: Callable[[Sequence[Vote]], Iterator[Sequence[Vote]]],
     device: str,
 ) -> list[Row]:
-    """Results of the protocol with every vote, around what each run was lifted with; equal votes are taken once."""
+    """Evaluate the protocol with every vote, around that of each run; equal votes are evaluated once."""
     voters = [voter(lifted.field, lifted.scene.gaussians.means, device) for lifted in runs]
-    known: dict[Any, Mapping[str, float]] = {}
+    results: dict[Any, Mapping[str, float]] = {}
     rows = []
-    for each in votes([own_vote(lifted.field.manifest) for lifted in runs]):
-        key = tuple((vote.variant, vote.config, vote.beta) for vote in each)
-        if key not in known:
+    for run_votes in votes([own_vote(lifted.field.manifest) for lifted in runs]):
+        key = tuple((vote.variant, vote.config, vote.beta) for vote in run_votes)
+        if key not in results:
             voted = (
                 replace(lifted, field=vote_again(vote), refined=True)
-                for lifted, vote_again, vote in zip(runs, voters, each)
+                for lifted, vote_again, vote in zip(runs, voters, run_votes)
             )
-            known[key] = evaluate(voted).results
-        rows.append({**each[0].label, **known[key]})
+            results[key] = evaluate(voted).results
+        rows.append({**run_votes[0].label, **results[key]})
     return rows
 
 
 def study_ablation(
     runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, tell: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Results of the protocol with every variant, without consensus and with it, whichever way the runs were lifted.
+    """Evaluate the protocol with every variant, with and without consensus, no matter how the runs were lifted.
 
     Args:
-        tell: told why variants are left out: the features of a run cannot be made again.
+        tell: called with the reason if variants are left out, because the features of a run cannot be computed again.
     """
     rows: list[Row] = []
     for on, votes in ((False, ablation), (True, agreed_ablation)):
         try:
-            some = [with_consensus(lifted, on, device) for lifted in runs]
+            variants = [with_consensus(lifted, on, device) for lifted in runs]
         except (ValueError, FileNotFoundError) as error:
             tell(f"The ablation leaves out all variants {'with' if on else 'without'} consensus: {error}")
             continue
-        rows += study_votes(some, evaluate, votes, device)
+        rows += study_votes(variants, evaluate, votes, device)
     return rows
 
 
 def signal_rows(names: Sequence[str], scenes: Sequence[SceneSignals]) -> list[Row]:
-    """`signals` of every scene and, if there are several, of all of them pooled."""
+    """Return `signals` of every scene and, if there are several, of all of them pooled."""
     rows: list[Row] = [{"scene": name, **signals(scene)} for name, scene in zip(names, scenes)]
     return [*rows, {"scene": POOLED, **signals(*scenes)}] if len(rows) > 1 else rows
 
 
 POOLED = "all scenes"
-"""What the row of all Gaussians of all scenes is called."""
+"""Scene name of the pooled row."""
 
 
 def scannet_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path], options: ScannetOptions) -> list[Row]:
-    """`signal_rows` by the 19 classes."""
+    """Return `signal_rows` for the 19 classes of ScanNet."""
     names, scenes = scene_names(labels), []
-    rule = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
+    kwargs = {"min_opacity": options.min_opacity, "without_direction": options.without_direction}
     for lifted, name, path in zip(runs, names, labels):
-        nyu40, found, truth = read_labels(path), {}, None
-        for kind, run in _both(lifted).items():
-            truth, found[kind] = answers(label_scene(run, name, path, nyu40, options), 19, **rule)
-        scenes.append(SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities, truth, found))
+        nyu40, predictions, truth = read_labels(path), {}, None
+        for kind, run in _by_refinement(lifted).items():
+            truth, predictions[kind] = answers(label_scene(run, name, path, nyu40, options), 19, **kwargs)
+        scenes.append(SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities, truth, predictions))
     return signal_rows(names, scenes)
 
 
 def mask_signals(lifted: EvaluatedRun, truth: MaskTruth) -> list[Row]:
-    """`signal_rows` of a run by the classes of its masks."""
-    found = {kind: classify(run.cosine(truth.classes), run.valid) for kind, run in _both(lifted).items()}
-    scene = SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities, truth.gaussians, found)
+    """Return `signal_rows` of a run for the classes of its masks."""
+    predictions = {kind: classify(run.cosine(truth.classes), run.valid) for kind, run in _by_refinement(lifted).items()}
+    scene = SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities, truth.gaussians, predictions)
     return signal_rows([lifted.scene.name], [scene])
 
 
 def plain_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path]) -> list[Row]:
-    """`signal_rows` without a truth of Gaussians."""
+    """Return `signal_rows` without true classes."""
     scenes = [SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities) for lifted in runs]
     return signal_rows(scene_names(labels), scenes)
 
 
-def _both(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
-    """The run's unrefined directions and, where it was lifted with a vote, the refined ones."""
+def _by_refinement(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
+    """Return the run with unrefined directions and, if it was lifted with a vote, with refined ones."""
     kinds = {"unrefined": False, "refined": True}
     if not lifted.field.manifest.get("options", {}).get("refine", True):
         del kinds["refined"]
@@ -107,7 +107,7 @@ def _both(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
 
 
 def baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> list[Row]:
-    """Results of the protocol for the runs and for `BASELINES` on the same features; those are not refined.
+    """Evaluate the protocol for the runs and for `BASELINES` on the same features. Baselines are not refined.
 
     Raises:
         ValueError, FileNotFoundError: as `seen_blocks`.
@@ -118,19 +118,20 @@ def baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> 
         results = evaluate(replace(lifted, refined=refined) for lifted in runs).results
         rows.append({"method": name, "what": what, **results})
     for method, what in BASELINES.items():
-        others = (replace(lifted, field=baseline_field(method, lifted, device), refined=False) for lifted in runs)
-        rows.append({"method": method, "what": what, **evaluate(others).results})
+        relifted = (replace(lifted, field=baseline_field(method, lifted, device), refined=False) for lifted in runs)
+        rows.append({"method": method, "what": what, **evaluate(relifted).results})
     return rows
 
 
 def timing(
     runs: Sequence[EvaluatedRun], device: str = "cpu", tell: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Seconds of every stage and peak memory of every lift, as their manifests have them, and on a GPU those of SFS's
-    way and of ours on some views of each, measured now; and the means.
+    """Return the seconds of every stage and the peak memory of every lift, from the manifests, and their means.
+
+    On a GPU, also time SFS's method and this package's on some views of each run.
 
     Args:
-        tell: told why SFS's way is left out, where it is.
+        tell: called with the reason if SFS's method is left out.
     """
     rows = []
     for lifted in runs:
@@ -139,10 +140,10 @@ def timing(
         if reason is None:
             try:
                 row |= time_sfs_way(lifted, device)
-            except (ValueError, FileNotFoundError) as error:  # its features cannot be made again
+            except (ValueError, FileNotFoundError) as error:  # its features cannot be computed again
                 reason = str(error)
         if reason is not None:
-            tell(f"The timing of {lifted.scene.name} leaves out SFS's way (512 channels through gsplat): {reason}")
+            tell(f"The timing of {lifted.scene.name} leaves out SFS's method (512 channels through gsplat): {reason}")
         rows.append(row)
     keys = list(dict.fromkeys(key for row in rows for key in row if key != "scene"))
     table: list[Row] = [{"scene": row["scene"], **{key: row.get(key, math.nan) for key in keys}} for row in rows]

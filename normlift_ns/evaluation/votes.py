@@ -1,4 +1,4 @@
-"""Other votes over the directions that a run stores: the paper's ablation, and a sweep of every parameter."""
+"""Alternative votes over the stored directions of a run: the paper's ablation, and a sweep of every parameter."""
 
 from __future__ import annotations
 
@@ -26,49 +26,54 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "gamma": (0.05, 0.1, 0.2, 0.4, 0.8),
     "delta": (0.0, 0.05, 0.1, 0.2, 0.3),
 }
-"""Values tried besides the default and those of the runs, the others as the run was lifted; beta, K and Delta as in the
-paper's appendix."""
+"""Values of each parameter, in addition to its default and the values of the runs; the others stay as in the lift.
+
+beta, K and Delta are as in the paper's appendix.
+"""
 AGREED: dict[str, Variant] = {"consensus": "none", "consensus_paper": "paper", "consensus_posterior": "posterior"}
-"""What follows the consensus, by name."""
+"""Vote after the consensus, by variant name."""
 BETA = LiftOptions().beta
-"""The default."""
+"""Default beta."""
 
 
 @dataclass(frozen=True)
 class Vote:
-    """One way to refine."""
+    """Variant and parameters of a vote."""
 
     variant: Variant
     config: RefineConfig
     beta: float
     label: Mapping[str, Any]
-    """What tells it from the others."""
+    """Columns that distinguish it from other votes."""
 
 
 def own_vote(manifest: Mapping[str, Any]) -> Vote:
-    """The vote that a run was lifted with; the defaults where its manifest does not say."""
+    """Return the vote that a run was lifted with, with defaults for values that its manifest does not record."""
     options = manifest.get("options", {})
-    kind = {"vote": "paper"} if "vote" in options else {}  # version 0.1 knew no other
+    kind = {"vote": "paper"} if "vote" in options else {}  # the only one in version 0.1
     config = RefineConfig(**{**kind, **options.get("vote", {})})
     return Vote(config.vote, config, options.get("beta", BETA), {})
 
 
 def voting_scalars(field: SemanticField) -> Scalars:
-    """The numbers that a run votes with: with consensus, ||f|| is that of which its R is made, the one before it."""
-    found, options = field.scalars, field.manifest.get("options", {})
+    """Return the scalars that a run votes with.
+
+    With consensus, ||f|| is the one before the consensus, from which R was computed.
+    """
+    scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False):
-        return found
-    support = found.n_eff / (found.n_eff + options.get("beta", BETA))
-    return replace(found, norm=torch.where(support > 0, found.reliability / support, 0.0).clamp(max=1))
+        return scalars
+    support = scalars.n_eff / (scalars.n_eff + options.get("beta", BETA))
+    return replace(scalars, norm=torch.where(support > 0, scalars.reliability / support, 0.0).clamp(max=1))
 
 
 def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """The variants of the paper's table 2 and the posterior vote, one vote per run."""
+    """Yield the variants of the paper's table 2 and the posterior vote, one vote per run."""
     return _variants(owns, {variant: variant for variant in get_args(Variant)})
 
 
 def agreed_ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """`AGREED`, for runs with consensus, one vote per run."""
+    """Yield `AGREED` for runs with consensus, one vote per run."""
     return _variants(owns, AGREED)
 
 
@@ -78,8 +83,9 @@ def _variants(owns: Sequence[Vote], variants: Mapping[str, Variant]) -> Iterator
 
 
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """`SWEEPS` around each run's own values, with the default and all own values among them and marked; one vote per
-    run.
+    """Yield the votes of `SWEEPS` around the values of each run, one vote per run.
+
+    They include the default and the values of the runs, and mark both.
     """
     for parameter, values in SWEEPS.items():
         default = default_of(parameter, owns[0].config.vote)
@@ -90,7 +96,7 @@ def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
 
 
 def default_of(parameter: str, kind: VoteKind) -> float:
-    """The default of one of the parameters of `SWEEPS` in a kind of vote."""
+    """Return the default of a parameter of `SWEEPS` for a kind of vote."""
     return _value(Vote(kind, RefineConfig(vote=kind), BETA, {}), parameter)
 
 
@@ -108,18 +114,21 @@ def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) 
 
 
 def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:
-    """Votes again, on the device; neighbours are searched once per K. Only linear averaging holds all directions."""
-    there, places = field.to(device), means.to(device)
-    scalars = voting_scalars(there)
+    """Return a function that votes again on the device.
+
+    It searches neighbors once per K. Only linear averaging holds all directions in memory.
+    """
+    device_field, means = field.to(device), means.to(device)
+    scalars = voting_scalars(device_field)
 
     @cache
     def neighbors(k: int) -> Neighbors:
-        return nearest_neighbors(places, k)
+        return nearest_neighbors(means, k)
 
     def unrefined(gaussians: Tensor) -> Tensor:
-        return there.directions(gaussians, refined=False)
+        return device_field.directions(gaussians, refined=False)
 
-    def voted(vote: Vote) -> SemanticField:
+    def apply(vote: Vote) -> SemanticField:
         near = neighbors(vote.config.k)
         own = torch.arange(len(field), dtype=torch.int32)
         if vote.variant == "none":
@@ -127,12 +136,14 @@ def voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Cal
         if vote.variant == "linear":
             r = variant_reliability(vote.variant, scalars, vote.beta)
             config = variant_config(vote.variant, vote.config)
-            found = linear_average(unrefined(own.long().to(device)), r, near, config)
-            has = (found != 0).any(dim=1)
-            norm = torch.where(has & (there.scalars.norm <= 0), 1.0, there.scalars.norm)
+            directions = linear_average(unrefined(own.long().to(device)), r, near, config)
+            valid = (directions != 0).any(dim=1)
+            norm = torch.where(valid & (device_field.scalars.norm <= 0), 1.0, device_field.scalars.norm)
             changed = replace(field.scalars, norm=norm.to(field.scalars.norm))
-            return replace(field, scalars=changed, source=own, store=StoredDirections(found[has].half().cpu(), None))
-        how = {"beta": vote.beta, "neighbors": near}
-        return replace(field, source=variant_source(vote.variant, places, unrefined, scalars, vote.config, **how).cpu())
+            store = StoredDirections(directions[valid].half().cpu(), None)
+            return replace(field, scalars=changed, source=own, store=store)
+        kwargs = {"beta": vote.beta, "neighbors": near}
+        source = variant_source(vote.variant, means, unrefined, scalars, vote.config, **kwargs)
+        return replace(field, source=source.cpu())
 
-    return voted
+    return apply

@@ -1,1 +1,1 @@
-"""What a lift will take: from a short look at a capture on this machine to seconds, memory and disk."""
+"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine."""

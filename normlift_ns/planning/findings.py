@@ -1,4 +1,4 @@
-"""What a check of a capture and a machine has found, each in one row: ok, a warning or an error, and what to type."""
+"""Diagnostics of a capture and a machine: one row per check, with its state (ok, warning or error) and advice."""
 
 from __future__ import annotations
 
@@ -23,71 +23,73 @@ from normlift_ns.scenes.match import in_view
 from normlift_ns.stages import peak_gib
 
 State = Literal["ok", "warning", "error"]
-_SAMPLE = 100_000
-"""Gaussians that are looked for in the cameras."""
+_PROJECTED_GAUSSIANS = 100_000
+"""Number of Gaussians that are projected into the cameras."""
 _FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
-"""Shares of Gaussians in view below which something may be wrong, and is."""
-_TIGHT = 0.8
-"""Share of a memory or a disk that an estimate may fill without a warning."""
-_SMALLER = "lift less at a time: --lift-downscale 2, or --max-views 50"
-_SHOWN = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
+"""Shares of Gaussians in view below which the check warns, and fails."""
+_HIGH_SHARE = 0.8
+"""Share of free memory or disk space above which an estimate gets a warning."""
+_LIFT_LESS = "lift less: --lift-downscale 2, or --max-views 50"
+_SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One row."""
+    """Result of one check."""
 
     what: str
     state: State
     found: str
     advice: str = ""
-    """What to type or to do about it."""
+    """Advice, such as an option to add."""
 
 
 def of_views(scene: Scene) -> Finding:
-    """How many of the Gaussians the training views have before them."""
+    """Check how many Gaussians lie in the training views."""
     means = scene.gaussians.means
-    means = means[:: max(1, len(means) // _SAMPLE)]
-    seen = torch.zeros(len(means), dtype=torch.bool)
+    means = means[:: max(1, len(means) // _PROJECTED_GAUSSIANS)]
+    visible = torch.zeros(len(means), dtype=torch.bool)
     for camera in scene.train.cameras:
-        seen |= in_view(means, camera)
-    share = float(seen.float().mean())
-    found = f"{share:.1%} of the Gaussians are in one of {len(scene.train)} training views"
+        visible |= in_view(means, camera)
+    share = float(visible.float().mean())
+    message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
     if share < _NONE_IN_VIEW:
-        return Finding("in view", "error", found, "give the cameras of this splat, or --world-transform")
+        return Finding("in view", "error", message, "give the cameras of this splat, or --world-transform")
     if share < _FEW_IN_VIEW:
-        return Finding("in view", "warning", found, "the others get no semantics; are these the cameras of the splat?")
-    return Finding("in view", "ok", found)
+        return Finding(
+            "in view", "warning", message, "the others get no semantics; are these the cameras of the splat?"
+        )
+    return Finding("in view", "ok", message)
 
 
 def of_device(device: str) -> Finding:
-    """What will work."""
+    """Check which device the lift will use."""
     if torch.device(device).type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         name = torch.cuda.get_device_name(device)
         return Finding("device", "ok", f"{name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free")
-    found = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
+    message = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
     if torch.cuda.is_available():
-        return Finding("device", "warning", f"{found}, though there is one", "--device cuda")
-    return Finding("device", "ok", found)
+        return Finding("device", "warning", f"{message}, although one is available", "--device cuda")
+    return Finding("device", "ok", message)
 
 
 def of_versions() -> Finding:
-    """Which packages are installed."""
-    needs = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()  # none in a source tree
-    names = [name.split(";")[0].strip() for name in needs if "extra ==" not in name]
-    bare = ["".join(c if c.isalnum() or c in "-_." else " " for c in name).split()[0] for name in names]
-    missing = [name for name in bare if _version(name) is None]
-    found = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN)
+    """Check which packages are installed."""
+    required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()  # none in a source tree
+    specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
+    names = ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
+    missing = [name for name in names if _version(name) is None]
+    message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
     if missing == ["nerfstudio"]:
         return Finding(
-            "versions", "warning", f"{found}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
+            "versions", "warning", f"{message}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
         )
     if len(missing) > 0:
         return Finding(
-            "versions", "error", f"{found}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
+            "versions", "error", f"{message}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
         )
-    return Finding("versions", "ok", f"{found}, normlift_ns {_version('normlift-ns') or 'from source'}")
+    return Finding("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 
 def _version(name: str) -> str | None:
@@ -98,64 +100,66 @@ def _version(name: str) -> str | None:
 
 
 def missing_weights(options: SourceOptions, device: str) -> list[str]:
-    """Weights of networks that the options need and this machine does not have, in words."""
-    found = []
+    """Describe the network weights that the options need and this machine does not have."""
+    missing = []
     if options.features == "none" and (kind := resolve_regions(options, device)) in ("sam", "sam3"):
         model = options.sam_model or (DEFAULT_SAM if kind == "sam" else DEFAULT_SAM3)
         if not sam_weights_at_hand(model):
-            found.append(f"those of SAM, {model}")
+            missing.append(f"those of SAM, {model}")
     family = FAMILIES.get(options.encoder)
     if options.features == "none" and family is not None and local_folder(model_of(options, family)) is None:
-        found.append(f"those of {options.encoder}, {model_of(options, family)}")
+        missing.append(f"those of {options.encoder}, {model_of(options, family)}")
     model, weights = options.encoder_model, options.encoder_pretrained
     if options.features == "none" and options.encoder == "open_clip" and clip_weights_at_hand(model, weights) is False:
-        found.append(f"those of OpenCLIP, {model} {weights}")
-    return found
+        missing.append(f"those of OpenCLIP, {model} {weights}")
+    return missing
 
 
 def of_weights(missing: Sequence[str]) -> Finding:
-    """Whether all weights are here."""
+    """Check that all weights are on this machine."""
     if len(missing) == 0:
-        return Finding("weights", "ok", "all that is needed is on this machine")
-    found = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
-    return Finding("weights", "warning", found, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
+        return Finding("weights", "ok", "all required weights are on this machine")
+    message = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
+    return Finding("weights", "warning", message, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
 
 
 def of_memory(plan: Plan, device: str) -> list[Finding]:
-    """Whether memory holds the lift."""
+    """Check that the lift fits into memory."""
     rows = []
     free = _free_memory()
     if free is not None:
-        held = int((peak_gib() or 0.0) * 2**30)
-        rows.append(_room("memory", plan.host_bytes, free + held, f"free memory, {_SMALLER}"))
+        own = int((peak_gib() or 0.0) * 2**30)
+        rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"free memory, {_LIFT_LESS}"))
     if plan.device_bytes is not None:
         free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
-        rows.append(_room("GPU memory", plan.device_bytes, free, f"{_SMALLER}, or --device cpu"))
+        rows.append(_check_capacity("GPU memory", plan.device_bytes, free, f"{_LIFT_LESS}, or --device cpu"))
     return rows
 
 
 def of_disk(plan: Plan, folder: Path) -> Finding:
-    """Whether the disk takes what will be written."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    return _room("disk", plan.disk_bytes, shutil.disk_usage(there).free, f"free some in {there}, or give --output-dir")
+    """Check that the output fits on the disk."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    advice = f"free space in {existing}, or give --output-dir"
+    return _check_capacity("disk", plan.disk_bytes, shutil.disk_usage(existing).free, advice)
 
 
-def _room(what: str, needed: int, free: int, advice: str) -> Finding:
-    found = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
-    state: State = "error" if needed > free else "warning" if needed > _TIGHT * free else "ok"
-    return Finding(what, state, found, "" if state == "ok" else advice)
+def _check_capacity(name: str, needed: int, free: int, advice: str) -> Finding:
+    """Compare needed bytes with free bytes."""
+    message = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
+    state: State = "error" if needed > free else "warning" if needed > _HIGH_SHARE * free else "ok"
+    return Finding(name, state, message, "" if state == "ok" else advice)
 
 
 def _free_memory() -> int | None:
-    """Bytes that this process may still take; None where the system does not say."""
-    found = []
+    """Return the bytes that this process may still allocate; None if the system does not report them."""
+    limits = []
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
-        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        found += [int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text())] if limit != "max" else []
+        limits += [int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text())] if limit != "max" else []
     except (OSError, ValueError, IndexError):
         pass
-    if len(found) == 0 and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        found.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return min(found) if len(found) > 0 else None
+    if len(limits) == 0 and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
+        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return min(limits) if len(limits) > 0 else None

@@ -1,6 +1,6 @@
-"""A short look at a capture: a few views are encoded and rasterized for real, and some Gaussians lifted.
+"""Short measurement of a capture: encode and rasterize a few views, and lift some Gaussians.
 
-Nothing is kept of it, and nothing downloaded. What is in the cache is looked up, and not computed again.
+The results are discarded, and nothing is downloaded. Cached views are read, not computed again.
 """
 
 from __future__ import annotations
@@ -32,29 +32,31 @@ from normlift_ns.stages import peak_gib
 
 Clock = Callable[[], float]
 Result = TypeVar("Result")
-LOOKED_AT = 4
-"""Views that are rasterized for real, at most, and encoded; more are encoded where several are cut at a time."""
-_LOADED = 3.0
-"""Seconds that kernels take at most to be loaded; longer, they were compiled, which is done once."""
-_ENOUGH = 20.0
-"""Seconds of the first view from which on only as many others are looked at as are cut at a time: how many of these
-seconds were loading is not known."""
-_LOOKED_UP = 16
-"""Views that are looked up in the cache, at most."""
+_MAX_VIEWS = 4
+"""Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
+_MAX_LOAD_S = 3.0
+"""Maximum number of seconds to load kernels. If it takes longer, they were compiled, which happens only once."""
+_SLOW_FIRST_VIEW_S = 20.0
+"""If the first view takes this many seconds, only one more batch is measured.
+
+How many of these seconds were loading is unknown.
+"""
+_MAX_LOOKUPS = 16
+"""Maximum number of views that are looked up in the cache."""
 
 
-class _Look(NamedTuple):
-    """Some views, and the seconds that it took to see them."""
+class _Observed(NamedTuple):
+    """Some views, and the seconds that it took to observe them."""
 
     block: Block
     seconds: float
 
 
 def load_kernels(scene: Scene, options: LiftOptions, *, device: str = "cpu", clock: Clock = perf_counter) -> float:
-    """Loads or compiles the kernels of a lift; returns the seconds that the next process will need for it."""
+    """Load or compile the kernels of a lift; return the seconds that the next process will need for it."""
     gaussians = scene.gaussians.to(device)
     ready = get_ready(scene, gaussians, options, drawing_of(scene, gaussians, options))
-    return min(_LOADED, _seconds(ready, clock=clock, device=device)[0])
+    return min(_MAX_LOAD_S, _seconds(ready, clock=clock, device=device)[0])
 
 
 def measure(
@@ -67,13 +69,13 @@ def measure(
     before: Mapping[str, float] | None = None,
     clock: Clock = perf_counter,
 ) -> Facts:
-    """Looks at a few views of a scene as a lift would.
+    """Process a few views of a scene as a lift would.
 
     Args:
         source: as in `lift_scene`.
-        cache: folder of 2D features and evidence, which is read.
-        before: seconds of what a lift does before it looks at views, by name: start, open, kernels, check.
-        clock: tells seconds; `time.process_time` for those of all cores.
+        cache: folder of 2D features and evidence, which is only read.
+        before: seconds of the steps that precede the views, by name (start, open, kernels, check).
+        clock: returns seconds; use `time.process_time` for the time of all cores.
     Raises:
         ValueError, FileNotFoundError, MemoryError: as `lift_scene`.
     """
@@ -87,79 +89,81 @@ def measure(
     used = [usable[i] for i in spread(len(usable), options.max_views)]
     rendered = drawing.settings if options.image_source == "render" else None
 
-    def look(indices: Sequence[int], seen: FeatureSource) -> _Look:
-        how = {"rendered": rendered, "divisor": options.lift_downscale, "done": lambda view: None}
-        seconds, block = timed(lambda: observe_views(scene, indices, seen, **how))
-        return _Look(block, seconds)
+    def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
+        kwargs = {"rendered": rendered, "divisor": options.lift_downscale, "done": lambda view: None}
+        seconds, block = timed(lambda: observe_views(scene, indices, source, **kwargs))
+        return _Observed(block, seconds)
 
-    chosen = [used[i] for i in spread(len(used), _LOOKED_UP)]
-    kept: dict[int, Block] = {}
-    there = only_kept(source, cache)
+    chosen = [used[i] for i in spread(len(used), _MAX_LOOKUPS)]
+    cached: dict[int, Block] = {}
+    cached_source = only_kept(source, cache)
     if options.reuse_evidence:
         for index in chosen:
             with suppress(NotKeptError):
-                kept[index] = look([index], there).block
-    new = [index for index in chosen if index not in kept]
-    at_once = cut_at_once(source)
-    encoded = [new[i] for i in spread(len(new), max(LOOKED_AT, 1 + 2 * at_once))]
-    seen, load_s = _seen(encoded, partial(look, seen=source), at_once)
-    kept_s = look(list(kept)[:_LOOKED_UP], there).seconds / len(kept) if len(kept) > 0 else None
-    some = _joined([seen.block, *kept.values()], LOOKED_AT)
+                cached[index] = observe([index], cached_source).block
+    new = [index for index in chosen if index not in cached]
+    batch = cut_at_once(source)
+    encoded = [new[i] for i in spread(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
+    observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
+    cached_s = observe(list(cached)[:_MAX_LOOKUPS], cached_source).seconds / len(cached) if len(cached) > 0 else None
+    block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
     with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
-        rasterize = partial(_evidence, gaussians, some, scene, options, drawing, Path(folder))
+        rasterize = partial(_evidence, gaussians, block, scene, options, drawing, Path(folder))
         if cuda:  # kernels for labels like these are compiled once for all lifts
-            _evidence(gaussians, some, scene, options, drawing, Path(folder) / "first")
+            _evidence(gaussians, block, scene, options, drawing, Path(folder) / "first")
         evidence_s, evidence = timed(rasterize)
-        kept_evidence_s, _ = timed(rasterize)
+        cached_evidence_s, _ = timed(rasterize)
         saved_s, _ = timed(lambda: evidence.save(Path(folder) / "again.safetensors"))
         saved = (Path(folder) / "again.safetensors").stat().st_size
-    count = len(some.cameras)
-    held = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
-    rates, field_bytes = core_rates(gaussians, evidence, torch.cat(some.features), options, len(used), timed)
+    count = len(block.cameras)
+    device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
+    rates, field_bytes = core_rates(gaussians, evidence, torch.cat(block.features), options, len(used), timed)
     entries = evidence.nnz + evidence.unlabeled.weight.numel()
-    maps = sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(some.labels, some.features))
+    maps = sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(block.labels, block.features))
     return Facts(
-        device=_named(device),
+        device=_device_name(device),
         views=len(used),
         gaussians=len(gaussians),
-        dimension=some.features[0].shape[1],
-        regions=sum(map(len, some.features)) / count,
+        dimension=block.features[0].shape[1],
+        regions=sum(map(len, block.features)) / count,
         entries=entries / count,
         entry_bytes=4 + evidence.rows.weight.element_size(),
         before_s=before or {},
         load_s=load_s,
-        features_s=seen.seconds / len(seen.block.cameras) if len(seen.block.cameras) > 0 else None,
-        kept_features_s=kept_s,
-        features_kept=len(kept) / len(chosen),
+        features_s=observed.seconds / len(observed.block.cameras) if len(observed.block.cameras) > 0 else None,
+        kept_features_s=cached_s,
+        features_kept=len(cached) / len(chosen),
         evidence_s=evidence_s / count,
-        kept_evidence_s=kept_evidence_s / count,
-        evidence_kept=_evidence_kept(gaussians, seen, kept, len(chosen), scene, options, drawing, cache),
+        kept_evidence_s=cached_evidence_s / count,
+        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), scene, options, drawing, cache),
         core_s=rates,
         field_bytes=field_bytes,
         run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
         write_bytes_s=saved / max(saved_s, 1e-6),
         view_bytes=maps / count,
         host_bytes=round((peak_gib() or 0.0) * 2**30),
-        device_bytes=held,
-        looked_at=max(count, len(seen.block.cameras)),
+        device_bytes=device_bytes,
+        looked_at=max(count, len(observed.block.cameras)),
     )
 
 
-def _seen(indices: Sequence[int], look: Callable[[Sequence[int]], _Look], at_once: int) -> tuple[_Look, float]:
-    """Views as a lift sees them once networks are loaded, and the seconds until they are."""
+def _observe_loaded(
+    indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
+) -> tuple[_Observed, float]:
+    """Observe views. Return them, with the seconds that it takes once networks are loaded, and the loading time."""
     if len(indices) == 0:
-        return _Look(Block([], [], [], []), 0.0), 0.0
-    first = look(indices[:1])
+        return _Observed(Block([], [], [], []), 0.0), 0.0
+    first = observe(indices[:1])
     if len(indices) == 1:
         return first, 0.0
-    others = indices[1 : 1 + at_once if first.seconds > _ENOUGH else None]
-    rest = look(others)
+    others = indices[1 : 1 + batch if first.seconds > _SLOW_FIRST_VIEW_S else None]
+    rest = observe(others)
     each = rest.seconds / len(others)
-    return _Look(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)
+    return _Observed(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)
 
 
 def _joined(blocks: Sequence[Block], most: int | None = None) -> Block:
-    """The views of all blocks, as far as there are no more than `most`."""
+    """Join the views of all blocks, up to `most` views."""
     parts = zip(Block([], [], [], []), *blocks)
     return Block(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
@@ -174,37 +178,37 @@ def _evidence(
     )  # fmt: skip
 
 
-def _evidence_kept(
+def _evidence_cached(
     gaussians: GaussianScene,
-    seen: _Look,
-    kept: Mapping[int, Block],
-    looked_up: int,
+    observed: _Observed,
+    cached: Mapping[int, Block],
+    chosen: int,
     scene: Scene,
     options: LiftOptions,
     drawing: Drawing,
     cache: Path,
 ) -> float:
-    """Share of the views whose evidence is in the cache; views whose features are there count for those."""
+    """Return the share of views whose evidence is cached. Views with cached features represent all such views."""
     if not options.reuse_evidence:
         return 0.0
     facts = [scene.rasterize_mode, options.weight_power, str(drawing.dtype), asdict(drawing.settings), drawing.backend]
     share = 0.0
-    for block, views in ((_joined(list(kept.values())), len(kept)), (seen.block, looked_up - len(kept))):
-        known = known_views(cache / "evidence", view_keys(gaussians, block, facts))
-        share += sum(known) / max(1, len(known)) * views / looked_up
+    for block, views in ((_joined(list(cached.values())), len(cached)), (observed.block, chosen - len(cached))):
+        hits = known_views(cache / "evidence", view_keys(gaussians, block, facts))
+        share += sum(hits) / max(1, len(hits)) * views / chosen
     return share
 
 
-def _named(device: str) -> str:
+def _device_name(device: str) -> str:
     if torch.device(device).type != "cuda":
         return f"{device}, {torch.get_num_threads()} threads"
     return torch.cuda.get_device_name(device)
 
 
 def _seconds(work: Callable[[], Result], *, clock: Clock, device: str) -> tuple[float, Result]:
-    """What some work takes, on a GPU until it is done there, and what it gives."""
+    """Return the duration of some work, until the GPU is done if there is one, and its result."""
     start = clock()
-    found = work()
+    result = work()
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
-    return clock() - start, found
+    return clock() - start, result

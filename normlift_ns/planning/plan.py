@@ -1,4 +1,4 @@
-"""From what a few views have shown to seconds and bytes of the whole lift: arithmetic, nothing else."""
+"""Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 _EVIDENCE_COPIES = 3
-"""Copies of the evidence that are held while the parts of all blocks are joined, and their regions formed."""
+"""Copies of the evidence in memory while the parts of all blocks are joined and converted to regions."""
 _DIRECTION_COPIES = 2
-"""Copies of the directions that are held while the vote gathers and storage chooses."""
-_OFFSETS = 16
-"""Bytes per Gaussian of a file of evidence, whatever it holds."""
+"""Copies of the directions in memory while the vote gathers them and a storage format is chosen."""
+_OFFSET_BYTES = 16
+"""Minimum bytes per Gaussian in an evidence file."""
 
 
 @dataclass(frozen=True)
 class Rate:
-    """What a stage costs: a fixed part, and so much for each of its items."""
+    """Cost of a stage: a fixed part, and a part for each item."""
 
     fixed: float
     each: float
     count: float
-    """Items in the whole lift."""
+    """Number of items in the whole lift."""
 
     def of(self, share: float = 1.0) -> float:
-        """The cost of a share of the items.
+        """Return the cost of a share of the items.
 
         >>> Rate(fixed=2.0, each=0.5, count=10).of(0.5)
         4.5
@@ -34,52 +34,52 @@ class Rate:
 
 @dataclass(frozen=True)
 class Facts:
-    """What a short look has shown of a capture on a machine. Seconds are of one device."""
+    """Measurements of a capture on a machine. Seconds are for one device."""
 
     device: str
     views: int
-    """That will be lifted."""
+    """Number of views to lift."""
     gaussians: int
     dimension: int
-    """Of the features."""
+    """Length of the feature vectors."""
     regions: float
-    """Per view."""
+    """Regions per view."""
     entries: float
-    """Of the evidence, per view."""
+    """Evidence entries per view."""
     entry_bytes: int
-    """Of the evidence, per entry."""
+    """Bytes per evidence entry."""
     before_s: Mapping[str, float]
-    """What has been done already and will be done again, by name: start, open, kernels, check."""
+    """Seconds of steps that were done already and will be repeated, by name (start, open, kernels, check)."""
     load_s: float
-    """Until a network is loaded."""
+    """Seconds until the network is loaded."""
     features_s: float | None
-    """Per view whose features are new; None: all are kept."""
+    """Seconds per view with new features; None if all are cached."""
     kept_features_s: float | None
-    """Per view whose features are kept; None: none are."""
+    """Seconds per view with cached features; None if none are cached."""
     features_kept: float
-    """Share of the views whose features are kept, in 0..1."""
+    """Share of the views with cached features, in 0..1."""
     evidence_s: float
-    """Per view that is rasterized."""
+    """Seconds per view that is rasterized."""
     kept_evidence_s: float
-    """Per view whose evidence is kept."""
+    """Seconds per view with cached evidence."""
     evidence_kept: float
-    """Share of the views whose evidence is kept, in 0..1."""
+    """Share of the views with cached evidence, in 0..1."""
     core_s: Mapping[str, Rate]
-    """Of consensus, lift, neighbors, vote and store, as far as they are asked for."""
+    """Cost of consensus, lift, neighbors, vote and store, as far as they are enabled."""
     field_bytes: Rate
-    """Of the stored semantics."""
+    """Size of the stored semantics."""
     run_bytes: int
-    """Of the checkpoint that goes with them."""
+    """Size of the checkpoint that is stored with them."""
     write_bytes_s: float
-    """Bytes that are written in a second."""
+    """Bytes written per second."""
     view_bytes: float
-    """Of the features and regions of a view in the cache."""
+    """Size of a view's features and regions in the cache."""
     host_bytes: int
-    """The most that this process has held so far."""
+    """Peak memory of this process so far."""
     device_bytes: int | None
-    """The most that it has held on the GPU until the evidence was there; None: there is none."""
+    """Peak GPU memory until the evidence was computed; None without a GPU."""
     looked_at: int = 0
-    """Views that were looked at for this."""
+    """Number of views that were measured."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ class Stage:
     name: str
     seconds: float
     remark: str = ""
-    """What of it is cached."""
+    """Cached part of the stage, in words."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a lift will take."""
+    """Estimated time, memory and disk space of a lift."""
 
     device: str
     num_devices: int
@@ -102,62 +102,64 @@ class Plan:
     gaussians: int
     stages: tuple[Stage, ...]
     features_kept: int
-    """Views whose 2D features are cached, about."""
+    """Approximate number of views with cached 2D features."""
     evidence_kept: int
-    """Views whose evidence is cached, about."""
+    """Approximate number of views with cached evidence."""
     host_bytes: int
     """Memory of each process."""
     device_bytes: int | None
-    """Memory of each GPU; None: there is none."""
+    """Memory of each GPU; None without a GPU."""
     disk_bytes: int
-    """What will be written."""
+    """Bytes to be written."""
     looked_at: int
-    """Views that the plan rests on."""
+    """Number of views that the estimate is based on."""
 
     @property
     def seconds(self) -> float:
-        """Of all stages."""
+        """Total time of all stages."""
         return sum(stage.seconds for stage in self.stages)
 
     def to_json(self) -> dict[str, Any]:
-        """The same as plain types, with `seconds` of each stage and `total_s`."""
+        """Return the plan as JSON types, with `seconds` of each stage and `total_s`."""
         facts = {name: value for name, value in asdict(self).items() if name != "stages"}
         return {**facts, "seconds": {stage.name: stage.seconds for stage in self.stages}, "total_s": self.seconds}
 
 
 def make_plan(facts: Facts, *, num_devices: int = 1) -> Plan:
-    """The plan of a lift.
+    """Estimate the cost of a lift.
 
-    Views and Gaussians are shared out between the devices; what is done before, loading and writing are not.
+    Views and Gaussians are divided among the devices. The preceding steps, loading and writing are not.
 
     Args:
-        num_devices: processes that share the work, each with a device of its own; at least 1.
+        num_devices: number of processes that share the work, each with its own device; at least 1.
     Raises:
-        ValueError: fewer devices than one.
+        ValueError: `num_devices` is less than 1.
     """
     if num_devices < 1:
         raise ValueError(f"num_devices must be at least 1, got {num_devices}")
     views, share = facts.views, 1 / num_devices
-    kept, rasterized = (_share_of(views, part) for part in (facts.features_kept, facts.evidence_kept))
-    new = views - kept
-    look = share * (new * (facts.features_s or 0.0) + kept * (facts.kept_features_s or 0.0))
-    features = look + (facts.load_s if new > 0 else 0.0)
-    evidence = share * ((views - rasterized) * facts.evidence_s + rasterized * facts.kept_evidence_s)
+    features_cached, evidence_cached = (
+        _share_of(views, cached) for cached in (facts.features_kept, facts.evidence_kept)
+    )
+    new = views - features_cached
+    features = share * (new * (facts.features_s or 0.0) + features_cached * (facts.kept_features_s or 0.0))
+    features += facts.load_s if new > 0 else 0.0
+    evidence = share * ((views - evidence_cached) * facts.evidence_s + evidence_cached * facts.kept_evidence_s)
     field_bytes = facts.field_bytes.of()
     evidence_bytes = facts.entries * views * facts.entry_bytes
     stages = (
         *(Stage(name, seconds) for name, seconds in facts.before_s.items()),
-        Stage("features", features, _cached(kept, views)),
-        Stage("evidence", evidence, _cached(rasterized, views)),
+        Stage("features", features, _cached(features_cached, views)),
+        Stage("evidence", evidence, _cached(evidence_cached, views)),
         *(Stage(name, rate.of(share)) for name, rate in facts.core_s.items()),
         Stage("write", (field_bytes + facts.run_bytes) / facts.write_bytes_s),
     )
     table = facts.regions * views * facts.dimension * 4
-    held = (
+    lift_bytes = (
         share * (_EVIDENCE_COPIES * evidence_bytes + _DIRECTION_COPIES * facts.gaussians * facts.dimension * 4)
         + 2 * table
     )
-    files = (views - rasterized) / max(1, views) * (evidence_bytes + facts.gaussians * _OFFSETS * views / 16)
+    files = (views - evidence_cached) / max(1, views) * (evidence_bytes + facts.gaussians * _OFFSET_BYTES * views / 16)
     on_gpu = facts.device_bytes is not None
     return Plan(
         device=facts.device,
@@ -165,17 +167,17 @@ def make_plan(facts: Facts, *, num_devices: int = 1) -> Plan:
         views=views,
         gaussians=facts.gaussians,
         stages=stages,
-        features_kept=kept,
-        evidence_kept=rasterized,
-        host_bytes=round(facts.host_bytes + (table if on_gpu else held)),
-        device_bytes=None if facts.device_bytes is None else round(facts.device_bytes + held),
+        features_kept=features_cached,
+        evidence_kept=evidence_cached,
+        host_bytes=round(facts.host_bytes + (table if on_gpu else lift_bytes)),
+        device_bytes=None if facts.device_bytes is None else round(facts.device_bytes + lift_bytes),
         disk_bytes=round(files + new * facts.view_bytes + field_bytes + facts.run_bytes),
         looked_at=facts.looked_at,
     )
 
 
 def _share_of(views: int, share: float) -> int:
-    """How many views; all only if the share is 1, and none only if it is 0.
+    """Return the number of views in a share. It is all views only if the share is 1, and 0 only if the share is 0.
 
     >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
     (44, 45, 0)
@@ -183,7 +185,7 @@ def _share_of(views: int, share: float) -> int:
     return views if share >= 1 else min(views - 1, max(int(share > 0), round(share * views)))
 
 
-def _cached(kept: int, views: int) -> str:
-    if kept in (0, views):
-        return "" if kept == 0 else "cached"
-    return f"about {kept} of {views} views cached"
+def _cached(cached: int, views: int) -> str:
+    if cached in (0, views):
+        return "" if cached == 0 else "cached"
+    return f"about {cached} of {views} views cached"

@@ -243,7 +243,7 @@ def test_cameras_that_see_nothing_and_wrong_bounds_are_refused(unchecked):
             coverage_of(scene, found, min_reliability=wrong)
     away = [looking((-3.0, 0.0, 0.0), (-9.0, 0.0, 0.0)) for _ in range(8)]
     blind = wall(train=Photographs(scene.train.names, away), held_out=NONE)
-    with pytest.raises(InputError, match="no photograph shows a Gaussian"):
+    with pytest.raises(InputError, match="no image shows a Gaussian"):
         coverage_of(blind, found)
 
 

@@ -109,7 +109,7 @@ def test_names_say_what_is_wrong(tmp_path: Path) -> None:
         ('{"labels": {"1": " "}}', "regex"),
         ('{"labels": {"0": "a"}, "background": 0}', "0 is the background"),
         ('{"labels": {"1": "a"}, "background": true}', r"`int \| null`, got `bool`"),
-        ('{"labels": {"' + "9" * 5000 + '": "a"}}', "value of a mask"),
+        ('{"labels": {"' + "9" * 5000 + '": "a"}}', "not a mask value"),
         ("[" * 100000, "RecursionError"),
         *((text, "") for text in ("[1]", '{"labels": {}}', '{"labels": {"a": "b"}}', "{")),
         ('{"labels": {"1": "\\ud800"}}', "regex"),

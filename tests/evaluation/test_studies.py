@@ -116,7 +116,7 @@ def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
     assert (list(default.get_xdata()), list(default.get_ydata())) == ([1], [0.5])
     assert (list(own.get_xdata()), list(own.get_ydata())) == ([0], [0.4])
     assert list(result.get_ydata()) == [0.45, 0.45]
-    assert {x.get_text() for x in of_beta.get_legend().get_texts()} == {"default", "of the run", "result"}
+    assert {x.get_text() for x in of_beta.get_legend().get_texts()} == {"default", "this run", "result"}
 
 
 def test_every_scene_has_its_signals_drawn():

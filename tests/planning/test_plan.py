@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from normlift_ns.observing import Block
-from normlift_ns.planning.measure import _Look, _seen
+from normlift_ns.planning.measure import _observe_loaded, _Observed
 from normlift_ns.planning.plan import Facts, Rate, make_plan
 
 FACTS = Facts(
@@ -69,12 +69,12 @@ def test_what_is_cached_costs_no_disk_and_no_network() -> None:
 def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, at_once: int, looked_at: int) -> None:
     seen: list[int] = []
 
-    def look(indices: Sequence[int]) -> _Look:
+    def observe(indices: Sequence[int]) -> _Observed:
         seconds = sum(0.5 if seen or i > 0 else first_s for i in range(len(indices)))
         seen.extend(indices)
-        return _Look(Block([], [], [], []), seconds)
+        return _Observed(Block([], [], [], []), seconds)
 
-    found, load_s = _seen([3, 5, 7, 9], look, at_once)
+    found, load_s = _observe_loaded([3, 5, 7, 9], observe, at_once)
     assert seen == [3, 5, 7, 9][:looked_at]
     assert found.seconds == pytest.approx(0.5 * looked_at)
     assert load_s == pytest.approx(first_s - 0.5)

@@ -100,6 +100,6 @@ def test_texts_of_sam3_are_those_of_the_lift(checked, monkeypatch, trained, tmp_
 
 def test_memory_and_disk_are_compared_with_what_is_free() -> None:
     for needed, state in ((70, "ok"), (90, "warning"), (101, "error")):
-        row = findings._room("disk", needed, 100, "free some")
+        row = findings._check_capacity("disk", needed, 100, "free some")
         assert row.state == state and (row.advice == "") == (state == "ok")
     assert findings._free_memory() is None or findings._free_memory() > 2**20

@@ -154,7 +154,7 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
 
 
 def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("normlift_ns.observing._LARGEST_CHUNK", 2)
+    monkeypatch.setattr("normlift_ns.observing._MAX_CHUNK", 2)
     rasterize, calls = seen.block_evidence, []
 
     def interrupted(*args, **kwargs):

@@ -1,1 +1,1 @@
-"""Where to look next: regions without reliable evidence, photographs that were left out and would help, new poses."""
+"""Coverage study: regions without reliable evidence, unused images that would help, and new poses."""

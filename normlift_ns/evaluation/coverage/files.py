@@ -1,4 +1,4 @@
-"""What the study leaves on disk: pictures of the new poses, and a camera path for ns-render."""
+"""Output files of the coverage study: renders of the new poses, and a camera path for ns-render."""
 
 from __future__ import annotations
 
@@ -20,31 +20,32 @@ from normlift_ns.evaluation.coverage.poses import Pose
 from normlift_ns.evaluation.options import pose_files
 from normlift_ns.raster.rasterize import render, render_picture
 
-_PIXELS = 300_000
-"""Of a picture, at most."""
+_MAX_RENDER_PIXELS = 300_000
+"""Maximum number of pixels in a render."""
 _INCHES, _DPI = 6.0, 100
 
 
 class Picture(NamedTuple):
-    """What a pose sees."""
+    """Render from a pose."""
 
     image: UInt8[Tensor, "h w 3"]
     reliability: Float[Tensor, "h w"]
-    """R in 0..1, NaN where nothing is."""
+    """R in 0..1, NaN for empty pixels."""
 
 
 def draw_pose(drawn: Drawn, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> Picture:
-    """The trained scene from a new pose, and the mean R of what every pixel shows."""
-    camera = smaller(pose.camera, _PIXELS)
-    how = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
+    """Render the trained scene from a new pose, with the mean R at every pixel."""
+    camera = smaller(pose.camera, _MAX_RENDER_PIXELS)
+    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
     image = render_picture(scene, camera, settings=drawn.settings, gaussians=drawn.gaussians)
-    values, alpha = render(drawn.gaussians, camera, reliability[:, None].to(drawn.gaussians.means), **how)
+    values, alpha = render(drawn.gaussians, camera, reliability[:, None].to(drawn.gaussians.means), **kwargs)
     return Picture(image, torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.nan).cpu())
 
 
 def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
-    """What `ns-render camera-path` reads, one second per pose; for the run that the poses are of, whose coordinates
-    they have.
+    """Return a camera path for `ns-render camera-path`, one second per pose.
+
+    It applies to the run of the poses, because it uses the coordinates of that run.
     """
     width, height = (poses[0].camera.width, poses[0].camera.height)
     cameras = [
@@ -67,33 +68,33 @@ def write_poses(
     documents: Mapping[Path, Mapping[str, Any]] | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes <stem>_camera_path.json and <stem>_pose_1.png …, all or none of them; nothing where there is no pose.
+    """Write <stem>_camera_path.json and <stem>_pose_1.png …, either all or none; without poses, write none of them.
 
     Args:
-        documents: more JSON files of the same folder.
-        overwrite: replace files of these names; then those of an earlier study go too.
+        documents: more JSON files for the same folder.
+        overwrite: replace files of these names, and remove those of an earlier study.
     Raises:
-        FileExistsError: one is there, and `overwrite` is False.
-        OSError: they cannot be written.
+        FileExistsError: a file exists and `overwrite` is False.
+        OSError: the files cannot be written.
     """
-    path, *names = pose_files(stem)
-    named, more = names[: len(poses)], dict(documents or {})
+    path, *images = pose_files(stem)
+    json_files = dict(documents or {})
     if len(poses) > 0:
-        more[path] = camera_path(poses)
-    written = [*more, *named]
+        json_files[path] = camera_path(poses)
+    written = [*json_files, *images[: len(poses)]]
     if len(written) == 0:
         return []
-    old = [file for file in (path, *names) if overwrite and file not in written]
+    old = [file for file in (path, *images) if overwrite and file not in written]
     with new_files(*written, overwrite=overwrite, remove=old) as drafts:
-        for draft, content in zip(drafts, more.values()):
+        for draft, content in zip(drafts, json_files.values()):
             draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf8")
-        for i, (draft, pose, picture) in enumerate(zip(drafts[len(more) :], poses, pictures), 1):
-            save_picture(draft, f"pose {i}, sees: region {', '.join(map(str, pose.regions))}", picture)
+        for i, (draft, pose, picture) in enumerate(zip(drafts[len(json_files) :], poses, pictures), 1):
+            save_picture(draft, f"pose {i}, shows region {', '.join(map(str, pose.regions))}", picture)
     return written
 
 
 def save_picture(path: Path, title: str, picture: Picture) -> None:
-    """The scene beside its reliability, with a colour scale."""
+    """Save the scene next to its reliability, with a color scale."""
     height, width = picture.reliability.shape
     figure = Figure(figsize=(2 * _INCHES, _INCHES * height / width + 0.6), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)

@@ -1,4 +1,4 @@
-"""Which photographs of a scene were lifted, and why others were not."""
+"""Images of a scene: which were lifted, and why others were not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from normlift_ns.observing import spread
 
 Why = Literal["max_views", "no features", "held out"]
 MOST_VIEWS = 256
-"""Photographs that are looked at, of those that were lifted and of those that were not."""
+"""Maximum number of lifted images, and of other images, that are examined."""
 
 
 class _Counts(msgspec.Struct):
@@ -26,8 +26,8 @@ class _Options(msgspec.Struct):
     max_views: Annotated[int, msgspec.Meta(ge=1)] | None = None
 
 
-class _Recorded(msgspec.Struct):
-    """What a manifest tells of the photographs of a lift."""
+class _LiftRecord(msgspec.Struct):
+    """Record of the images of a lift in a manifest."""
 
     views_lifted: list[str] | None = None
     views_without_features: list[str] = []
@@ -36,48 +36,48 @@ class _Recorded(msgspec.Struct):
 
 
 class Photographs(NamedTuple):
-    """All that can be looked at, the lifted ones first."""
+    """Images to examine, the lifted ones first."""
 
     lifted: int
     names: list[str]
     cameras: list[Camera]
     why: list[Why]
-    """Of those that were not lifted."""
+    """Reasons for the images that were not lifted."""
     left_out: dict[Why, int]
 
 
 def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], set[str]]:
-    """Names of the photographs that were lifted, and of those that had no features.
+    """Return the names of the images that were lifted, and of those without features.
 
     Raises:
-        ValueError: the manifest does not tell, or names photographs that the scene no longer has.
+        ValueError: the manifest does not record them, or the scene no longer has some of them.
     """
     names = list(scene.train.names)
     try:
-        known = msgspec.convert(
-            {key: manifest[key] for key in _Recorded.__struct_fields__ if key in manifest}, _Recorded
+        record = msgspec.convert(
+            {key: manifest[key] for key in _LiftRecord.__struct_fields__ if key in manifest}, _LiftRecord
         )
     except msgspec.ValidationError as error:
-        raise InputError(f"the run's record of its photographs is damaged ({error}); lift again") from None
-    used, counts = known.views_lifted, known.statistics
+        raise InputError(f"the run's record of its images is damaged ({error}); lift again") from None
+    used, counts = record.views_lifted, record.statistics
     if used is None and counts.left_out == 0:  # version 0.1 has only counts
-        some = spread(len(names), known.options.max_views)
-        used = [names[i] for i in some] if len(some) == counts.views else None
+        indices = spread(len(names), record.options.max_views)
+        used = [names[i] for i in indices] if len(indices) == counts.views else None
     if used is None:
         raise InputError(
-            "the run does not tell which photographs were lifted: it is of an older version, and some had no features; "
-            "lift again with: ns-normlift --load-config ..."
+            "the run does not record which images were lifted: it is from an older version, and some images had no "
+            "features; lift again with: ns-normlift --load-config ..."
         )
     if not set(used) <= set(names):
         raise InputError(
-            f"the run was lifted from photographs that {scene.name} no longer has; restore the data set, say where it "
-            "is with --data, or lift again"
+            f"the run was lifted from images that {scene.name} no longer has; restore the dataset, give its path with "
+            "--data, or lift again"
         )
-    return set(used), set(known.views_without_features)
+    return set(used), set(record.views_without_features)
 
 
 def photographs_of(scene: Scene, manifest: Mapping[str, Any]) -> Photographs:
-    """Photographs of a scene, by what the manifest of the lift says; of very many, an even spread.
+    """Return the images of a scene according to the manifest of the lift; of very many, an evenly spaced selection.
 
     Raises:
         ValueError: as `lifted_names`.

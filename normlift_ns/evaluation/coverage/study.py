@@ -1,4 +1,4 @@
-"""Where to look next, for a lifted run: the page to read first."""
+"""Coverage study of a lifted run. Read this module first."""
 
 from __future__ import annotations
 
@@ -39,98 +39,99 @@ from normlift_ns.ranges import check_number, check_path
 from normlift_ns.raster.settings import RasterSettings
 
 RELIABLE = 0.5
-"""R above which a Gaussian is reliable: more than one view that agrees with itself gives, at beta 1."""
-PHOTOGRAPHS = 12
-"""Photographs that are suggested."""
+"""R above which a Gaussian is reliable; at beta 1, a single consistent view gives this value."""
+_MAX_IMAGES = 12
+"""Maximum number of suggested images."""
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph that was left out of the lift."""
+    """An image that was left out of the lift."""
 
     name: str
     why: Why
-    """Why it was left out."""
+    """Reason for leaving it out."""
     gain: float
-    """Expected rise of the mean reliability of all surface, beside the lift and the photographs above it."""
+    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the images above it."""
     regions: list[int]
-    """Numbers of the regions that it sees, from 1."""
+    """Numbers of the regions that it shows, from 1."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What a lift lacks, and where to get it.
+    """Gaps in the evidence of a lift, and views that would fill them.
 
     >>> from normlift_ns import coverage, open_run
-    >>> found = coverage(open_run(config))
-    >>> [photograph.why for photograph in found.photographs]
+    >>> result = coverage(open_run(config))
+    >>> [image.why for image in result.photographs]
     ['held out', 'held out']
-    >>> 0 < found.reliability < 1
+    >>> 0 < result.reliability < 1
     True
     """
 
     reliability: float
-    """Mean R_j(S) of `evaluation.coverage.gain`, over all surface that the photographs show, in 0..1."""
+    """Mean R_j(S) of `evaluation.coverage.gain` over all surfaces that the images show, in 0..1."""
     regions: list[Region]
-    """The one that lacks most comes first."""
+    """Regions that lack evidence, worst first."""
     photographs: list[Photograph]
-    """In the order in which to add them."""
+    """Images to add to the lift, in this order."""
     poses: list[Pose]
-    """New ones, in the order in which to take them."""
+    """New poses for more images, in this order."""
     pictures: list[Picture]
-    """What the poses see."""
+    """Renders of the poses."""
     left_out: dict[Why, int]
-    """Photographs that are not in the lift."""
+    """Number of images that are not in the lift, by reason."""
     remarks: list[str]
-    """In whole sentences."""
+    """Remarks in whole sentences."""
 
     def to_json(self) -> dict[str, Any]:
-        """The same as plain types, without the pictures."""
+        """Return the result as JSON types, without the renders."""
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "pictures"}
         rows = {name: [asdict(row) for row in plain[name]] for name in ("regions", "photographs")}
         return {**plain, **rows, "poses": [pose.to_json() for pose in self.poses]}
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Writes a JSON file with all of it, and beside it <stem>_pose_1.png … and <stem>_camera_path.json, which
-        `ns-render camera-path` takes with the run; returns their paths.
+        """Write a JSON file, and next to it <stem>_pose_1.png … and <stem>_camera_path.json; return the paths.
+
+        `ns-render camera-path` renders the camera path with the run.
 
         Args:
             overwrite: replace files of these names.
         Raises:
-            FileExistsError: one is there, and `overwrite` is False.
-            ValueError: the name of a file of a run.
-            OSError: they cannot be written.
+            FileExistsError: a file exists and `overwrite` is False.
+            ValueError: a file of the run has that name.
+            OSError: the files cannot be written.
 
         >>> from normlift_ns import coverage, open_run
         >>> [path.name for path in coverage(open_run(config)).save(folder / "next.json")][:2]
         ['next.json', 'next_camera_path.json']
         """
-        place = check_path("path", path)
-        if place.name in ("", ".."):
-            raise InputError(f"{place} is no name of a file; give one such as next.json")
-        stem = place.with_suffix("")
-        refuse_run_files(place, *pose_files(stem), instead="name")
-        documents = {place: self.to_json()}
+        path = check_path("path", path)
+        if path.name in ("", ".."):
+            raise InputError(f"{path} is not a valid file name; give one such as next.json")
+        stem = path.with_suffix("")
+        refuse_run_files(path, *pose_files(stem), instead="name")
+        documents = {path: self.to_json()}
         return write_poses(stem, self.poses, self.pictures, documents=documents, overwrite=overwrite)
 
 
 def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str | None = None) -> Coverage:
-    """Which regions lack reliable evidence, which photographs left out of the lift would help most, and new poses that
-    would see the worst regions.
+    """Find regions that lack reliable evidence, unused images that would help most, and new poses for the worst
+    regions.
 
-    Nothing is lifted and no image is read: weights of views are rasterized at a low resolution, and the reliability
-    that one more view would give is computed from them (`evaluation.coverage.gain` has the formula).
+    Nothing is lifted and no image is read. Weights of views are rasterized at a low resolution. They determine the
+    reliability that one more view would give, by the formula in `evaluation.coverage.gain`.
 
     Args:
         min_reliability: R below which a Gaussian is not reliable, in 0..1.
-        device: where to rasterize; None: that of the run.
+        device: device for rasterizing, that of the run if None.
     Raises:
-        ValueError: a run that does not tell which photographs were lifted; photographs that show no Gaussian.
+        ValueError: the run does not record which images were lifted, or the images show no Gaussian.
 
     >>> from normlift_ns import coverage, open_run
     >>> run = open_run(config)
-    >>> found = coverage(run, min_reliability=0.6)
-    >>> all(region.reliability < 0.6 for region in found.regions)
+    >>> result = coverage(run, min_reliability=0.6)
+    >>> all(region.reliability < 0.6 for region in result.regions)
     True
     """
     return coverage_of(run.scene, run.field, min_reliability=min_reliability, device=device or run.device)
@@ -139,73 +140,72 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
 def coverage_of(
     scene: Scene, field: SemanticField, *, min_reliability: float = RELIABLE, device: str = "cpu"
 ) -> Coverage:
-    """`coverage` of a scene and its semantics."""
+    """Compute `coverage` of a scene and its semantics."""
     check_number("min_reliability", min_reliability)
-    photographs = photographs_of(scene, field.manifest)
+    images = photographs_of(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), own_vote(field.manifest)
     gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).map(lambda x: x.to(device))
     drawn = Drawn(gaussians, scene.rasterize_mode, RasterSettings.recorded(field.manifest), power)
-    weights, count = view_weights(drawn, photographs.cameras), len(photographs.cameras)
+    weights, count = view_weights(drawn, images.cameras), len(images.cameras)
     surface = largest(weights)
     if not float(surface.sum()) > 0:
-        raise InputError("no photograph shows a Gaussian; check that cameras and Gaussians are of one scene")
-    split = photographs.lifted
-    lifted, left = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
-    known = known_of_lift(scalars, lifted, surface, beta=vote.beta)
-    reliability = known.expected(known.weight, known.squared)
+        raise InputError("no image shows a Gaussian; check that cameras and Gaussians belong to the same scene")
+    split = images.lifted
+    lifted, unused = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
+    model = known_of_lift(scalars, lifted, surface, beta=vote.beta)
+    reliability = model.expected(model.weight, model.squared)
     lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
     evidenced = Evidenced(gaussians.means, scalars, surface, reliability, views_that_see(lifted, surface), lost)
     regions, parts = weak_regions(evidenced, min_reliability=min_reliability, reach=REACH)
     targets = [region.centre for region in regions]
-    poses = suggest_poses(drawn, photographs.cameras, known, targets, parts)
+    poses = suggest_poses(drawn, images.cameras, model, targets, parts)
     return Coverage(
         reliability=float((surface * reliability).sum() / surface.sum()),
         regions=regions,
-        photographs=_suggested(photographs, known, left, parts),
+        photographs=_suggest_images(images, model, unused, parts),
         poses=poses,
         pictures=[draw_pose(drawn, scene, reliability, pose) for pose in poses],
-        left_out=photographs.left_out,
-        remarks=_remarks(photographs, regions, poses, min_reliability),
+        left_out=images.left_out,
+        remarks=_remarks(images, regions, poses, min_reliability),
     )
 
 
-def _suggested(photographs: Photographs, known: Known, left: SparseRows, parts: Sequence[Tensor]) -> list[Photograph]:
-    names, count = photographs.names[photographs.lifted :], len(photographs.why)
-    seen = shown_shares(left, count, known.surface, parts)
+def _suggest_images(images: Photographs, model: Known, unused: SparseRows, parts: Sequence[Tensor]) -> list[Photograph]:
+    names, count = images.names[images.lifted :], len(images.why)
+    shown = shown_shares(unused, count, model.surface, parts)
     return [
         Photograph(
             names[view],
-            photographs.why[view],
+            images.why[view],
             gain,
-            [i for i, share in enumerate(seen[:, view].tolist(), 1) if share >= SEES],
+            [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= SEES],
         )
-        for view, gain in choose_views(known, left, count, PHOTOGRAPHS)
+        for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
     ]
 
 
-def _columns(weights: SparseRows, some: range, count: int) -> SparseRows:
-    return weights.select_columns(torch.tensor(list(some), dtype=torch.int64, device=weights.weight.device), count)
+def _columns(weights: SparseRows, views: range, count: int) -> SparseRows:
+    return weights.select_columns(torch.tensor(list(views), dtype=torch.int64, device=weights.weight.device), count)
 
 
 def _remarks(
-    photographs: Photographs, regions: Sequence[Region], poses: Sequence[Pose], min_reliability: float
+    images: Photographs, regions: Sequence[Region], poses: Sequence[Pose], min_reliability: float
 ) -> list[str]:
-    found = []
+    remarks = []
     if len(regions) == 0:
-        found.append(
-            f"No region lacks evidence: all that the photographs show has R of at least {min_reliability:g}, but for "
-            "parts smaller than a thousandth of it."
+        remarks.append(
+            f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except "
+            "for parts smaller than a thousandth of it."
         )
     elif len(poses) == 0:
-        found.append(
-            "No new pose was found that sees a region better than the photographs do; it may be hidden from wherever "
-            "a camera could be."
+        remarks.append(
+            "No new pose shows a region better than the images do; it may be hidden from all possible positions."
         )
-    if len(photographs.why) == 0:
-        found.append("No photograph was left out of the lift, so none can be suggested.")
-    total = sum(photographs.left_out.values())
-    if len(photographs.why) < total:
-        found.append(f"Of {total:,} photographs left out, {len(photographs.why)}, evenly spread, were looked at.")
-    if len(photographs.cameras) == 1:
-        found.append("The scene has a single camera; what it does not see cannot be told.")
-    return found
+    if len(images.why) == 0:
+        remarks.append("No image was left out of the lift, so none can be suggested.")
+    total = sum(images.left_out.values())
+    if len(images.why) < total:
+        remarks.append(f"Of {total:,} images left out, only {len(images.why)}, evenly spaced, were examined.")
+    if len(images.cameras) == 1:
+        remarks.append("The scene has a single camera; the study cannot judge what this camera does not show.")
+    return remarks
