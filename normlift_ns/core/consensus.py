@@ -310,7 +310,7 @@ def _shares(
     estimate the sums over all Gaussians.
 
     Returns:
-        p in the views that see a Gaussian, [M, S]; 1 for each of these views, [M, views]; the sums of p by view.
+        p in the views that see a Gaussian [M, S], 1 for each of these views [M, views], and the sums of p by view.
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)
     if total is None:
@@ -359,8 +359,8 @@ def _medians(values: Float64[Tensor, " m"], group: Int64[Tensor, " m"], groups: 
 
 
 _Block = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""sum_j p_js of a block of regions s, over all that a view sees and over its regions only, both [regions, views]; then
-s, t and sum_j p_js p_jt for the regions t of other views with c_st >= `MIN_OVERLAP`."""
+"""Sums for a block of regions s. The first two are sum_j p_js over all that a view sees and over its regions only, both
+[regions, views]. The others are s, t and sum_j p_js p_jt for regions t of other views with c_st >= `MIN_OVERLAP`."""
 
 
 def _inner_products(

@@ -60,8 +60,8 @@ class SemanticField:
     """The refined direction of Gaussian i is that of source[i]; source[i] = i if the vote left i unchanged."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    """Metadata of JSON types: the storage (key `form`), sizes and bounds of all three storage forms (key `forms`), the
-    fingerprint of the means, and the provenance."""
+    """JSON-ready metadata: storage (key `form`), sizes and bounds of all storage forms (key `forms`), fingerprint of
+    the means, and provenance."""
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
 

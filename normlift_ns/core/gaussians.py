@@ -96,8 +96,8 @@ class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
 
     Raises:
-        ValueError: if a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the image
-            is smaller than one pixel.
+        ValueError: if a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the size
+            is below one pixel.
 
     >>> import torch
     >>> from normlift_ns import Camera

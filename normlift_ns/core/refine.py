@@ -182,7 +182,7 @@ def possible(config: RefineConfig, n: int) -> RefineConfig:
         if k < MOST_VOTERS
         else f"at most {MOST_VOTERS:,} can vote"
     )
-    warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbors", stacklevel=2)
+    warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbor{'s' * (k != 1)}", stacklevel=2)
     return replace(config, k=k)
 
 
