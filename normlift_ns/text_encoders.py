@@ -100,7 +100,7 @@ def encoder_of(field: Field, device: str = "cpu", cache: Path | None = None) -> 
         vectors = TextVectors(options.text_vectors)
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
-                f"the vectors in {vectors.file} have dimension {vectors.dimension}, the features of the run "
+                f"the vectors in {vectors.file} have {vectors.dimension} dimensions, but the features of the run have "
                 f"{field.manifest['dimension']}; give a file of text vectors from the encoder of these features "
                 "(--text-vectors)"
             )

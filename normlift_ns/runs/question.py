@@ -130,7 +130,9 @@ def _check_encoder(question: Question, manifest: Mapping[str, Any]) -> None:
     """Raise ValueError if the embeddings are from a different encoder than the field."""
     size, field_encoder = question.vectors.shape[1], encoder_digest(manifest)
     if size != manifest["dimension"]:
-        raise InputError(f"its vectors have dimension {size}, the features of the run {manifest['dimension']}")
+        raise InputError(
+            f"its vectors have {size} dimensions, but the features of the run have {manifest['dimension']}"
+        )
     if question.encoder is not None and field_encoder is not None and question.encoder != field_encoder:
         raise InputError(
             f"its prompts were encoded by another encoder ({question.encoder}) than that of the run ({field_encoder})"

@@ -74,7 +74,7 @@ def test_what_is_no_cloud_is_refused(tmp_path):
         (f"{start}element vertex 1\n{x}{end}1\n", "1 vertices with x"),
         (f"{start}element vertex 99999999999\n{x}{end}1\n", "truncated"),
         (f"{start}element face 0\n{x}{end}", "0 vertices"),
-        (f"{start}element vertex 1\n{lists}{end}1 2 3 1 4\n", "lists"),
+        (f"{start}element vertex 1\n{lists}{end}1 2 3 1 4\n", "list properties"),
         (f"{start}element vertex 2\n{x}{end}1\n", "cannot be read"),
     ):
         (tmp_path / "a.ply").write_text(content)
