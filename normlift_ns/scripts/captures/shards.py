@@ -39,7 +39,7 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     In a Slurm array whose tasks have several ranks (RANK, WORLD_SIZE), each rank of each task has its own part.
 
     Args:
-        word: auto: from the environment; none: the whole list; or i/n: the i-th of n parts, i from 1.
+        word: auto for the part in the environment, none for the whole list, or i/n for the i-th of n parts, i from 1.
         environment: Environment variables.
     Raises:
         InputError: The word is invalid, variables contradict each other, or a Slurm array has gaps.
