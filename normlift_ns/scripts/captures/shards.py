@@ -71,9 +71,8 @@ def _slurm_shard(environment: Mapping[str, str]) -> Shard:
     index, remainder = divmod(task - first, step)
     if remainder != 0 or not 0 <= index < count:
         raise InputError(
-            f"{_TASK_ID} is {task}, which is not one of {count} consecutive tasks from {first} on. Submit an array "
-            "without gaps, such as sbatch -a 0-7; or give --shard none, with which workers claim captures in a shared "
-            "folder."
+            f"{_TASK_ID} is {task}, but expected {count} tasks from {first} on, without gaps. Submit an array without "
+            "gaps, such as sbatch -a 0-7; or give --shard none, with which workers claim captures in a shared folder."
         )
     return Shard(index, count)
 
