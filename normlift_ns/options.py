@@ -57,7 +57,7 @@ class RuleSettings(NamedTuple):
     faintest: float
     """Lower end of the color scale: renders do not distinguish smaller relevancies."""
     present: float | None
-    """Largest relevancy below which a prompt is probably not in the scene; None: depends on the encoder."""
+    """Top relevancy below which a prompt is probably not in the scene; None if that depends on the encoder."""
 
 
 RULES: dict[Rule, RuleSettings] = {
@@ -126,8 +126,8 @@ class SourceOptions:
     Default: 256 for superpixel and grid, 1024 for patches."""
     sam_model: str | None = None
     """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of Meta's first SAM, or a name to
-    download, such as facebook/sam2.1-hiera-large. Default: facebook/sam-vit-huge, as in LangSplat. With --regions
-    sam3: weights of SAM 3, default facebook/sam3."""
+    download (such as facebook/sam2.1-hiera-large). Default: facebook/sam-vit-huge, as in LangSplat. --regions sam3
+    needs weights of SAM 3, by default facebook/sam3."""
     sam_precision: SamPrecision = "auto"
     """Floating-point precision of the SAM network. auto: float16 on a GPU, float32 otherwise."""
     regions_dir: Path | None = None
@@ -138,8 +138,8 @@ class SourceOptions:
     """Resize label maps to the image size by nearest neighbor. False: raise an error if the sizes differ."""
     level: str | None = None
     """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. sam and langsplat: s, m or l
-    (subparts, parts or wholes; l if not given), or default (all of SAM's masks in one map). langsplat also accepts sum
-    (the sum of the vectors of all levels)."""
+    for subparts, parts or wholes (l if not given), or default for all of SAM's masks in one map. langsplat also accepts
+    sum, the sum of the vectors of all levels."""
     features: FeaturesName = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
     as written by LangSplat's preprocessing."""
@@ -182,11 +182,11 @@ class SplatOptions:
     masks: Path | None = None
     """Folder with one mask per image; pixels whose mask value is zero are ignored."""
     world_transform: Path | None = None
-    """File with the similarity transform from camera world to splat world: a 4 x 4 matrix, or the
-    dataparser_transforms.json of the run that exported the PLY file. Default: both worlds are the same."""
+    """File with the similarity transform from camera to splat coordinates: a 4 x 4 matrix, or the
+    dataparser_transforms.json of the run that exported the PLY file. Default: the coordinates are the same."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, as it does by default; the transform is computed again from
-    the COLMAP project. A PLY file counts as normalized only if its images match the splat that way."""
+    the COLMAP project. A PLY file counts as normalized only if the images match the splat that way."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: those that were not held out of training. all: held-out images too."""
     test_every: int | None = None
@@ -310,8 +310,8 @@ class LiftOptions:
     """Number of Gaussians that the consensus samples in every region (all of them in smaller regions); larger values
     are more exact and slower. Needs --consensus True."""
     consensus_least: float = 0.4
-    """Agreement of regions across views, in 0..1, up to which their overlaps count as chance and they keep their
-    features; larger values leave more scenes unchanged. Use 0 if your masks show objects, however badly. Needs
+    """Agreement of regions across views, in 0..1, up to which overlaps count as chance and features stay unchanged;
+    larger values switch the consensus off in more scenes. Use 0 if your masks show objects, however badly. Needs
     --consensus True."""
     refine: bool = True
     """Let neighboring Gaussians vote to repair directions: a Gaussian copies the direction that wins."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
-_REGION_COUNT = 700
+REGION_COUNT = 700
 """Superpixels per view: small enough to separate the green star of a tomato."""
 _ASK_OPTIONS = AskOptions(threshold="auto")
 _COMPILE = "import torch; from normlift_ns.raster.numba import warm; warm(torch.float32).join()"
@@ -68,9 +68,9 @@ class Demo:
         compiling.wait()
 
         CONSOLE.rule("Lifting")
-        flags = ("--encoder", "colour", "--region-count", _REGION_COUNT)
+        flags = ("--encoder", "colour", "--region-count", REGION_COUNT)
         _show("ns-normlift", "--load-config", config, *flags, "--queries", *_PROMPTS)
-        source = SourceOptions(encoder="colour", region_count=_REGION_COUNT)
+        source = SourceOptions(encoder="colour", region_count=REGION_COUNT)
         run = NormLift(config, source=source, queries=_PROMPTS, timestamp="demo", overwrite=True).main()
         assert run is not None  # this is the only process
 

@@ -59,8 +59,8 @@ class Terminated(BaseException):
 def run_command(command: type[Command]) -> None:
     """Parse flags as nerfstudio's commands do (--flag True), run the command, and exit unless it succeeds.
 
-    Exit codes: 1 for wrong flags or files and for a full disk or memory, 70 for internal errors, 130 for Ctrl-C and 143
-    for SIGTERM. Partial files are removed first.
+    The exit code is 1 for user errors and for a full disk or memory, and 70 for internal errors. It is 130 for Ctrl-C
+    and 143 for SIGTERM, after partial files are removed.
     """
     streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
     for stream in streams:

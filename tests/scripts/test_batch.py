@@ -432,7 +432,7 @@ def test_what_the_environment_says_and_cannot_say():
     assert make_shard("3/3", array(1, 5)) == Shard(2, 3)
 
     for word in ("", "1", "0/3", "4/3", "-1/3", "1/3/2", "a/b", "٣/٣", "1/99999999", " 1/2"):
-        with pytest.raises(InputError, match="--shard must be i/n"):
+        with pytest.raises(InputError, match="--shard must be auto, none, or i/n"):
             make_shard(word, {})
     for environment, *facts in (
         ({"RANK": "0"}, "RANK is set", "WORLD_SIZE is not"),

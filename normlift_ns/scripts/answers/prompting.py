@@ -76,11 +76,11 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         ValueError: Some lines failed; the JSON line of each has an `error`.
     """
     stdin: Any = sys.stdin  # None if it is closed
-    lines = (() if stdin is None else stdin.buffer) if lines is None else lines
+    source: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
     if sys.stdout is None:
         raise InputError("standard output is closed; --stdin prints its answers there")
     failed = total = 0
-    for line in lines:
+    for line in source:
         text = line.decode("utf8", "replace").lstrip("\ufeff").strip()  # byte order mark of files from Windows
         if text == "":
             continue

@@ -20,7 +20,7 @@ from normlift_ns.viewer.pictures import picture_names
 if TYPE_CHECKING:
     from normlift_ns.quick import QuickAnswer
 
-_IMAGES_PER_GROUP = 3
+IMAGES_PER_GROUP = 3
 """Number of images per prompt in each group: those with the largest weight, and those that disagree most."""
 _LARGEST_WEIGHT = "weighs most"
 
@@ -49,7 +49,7 @@ def to_json(run: LiftedRun, why: Why | None) -> dict[str, Any] | None:
 
 def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
     """Return the images to show: those with the largest weight, and those that disagree most."""
-    return {_LARGEST_WEIGHT: why.views[:_IMAGES_PER_GROUP], "disagrees most": why.most_different[:_IMAGES_PER_GROUP]}
+    return {_LARGEST_WEIGHT: why.views[:IMAGES_PER_GROUP], "disagrees most": why.most_different[:IMAGES_PER_GROUP]}
 
 
 def save_pictures(

@@ -47,8 +47,8 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
     """Read a capture list, in its order.
 
     Args:
-        path: Text file. A line has the path of a config.yml, a PLY file or a gsplat checkpoint, optionally followed by
-            options of ns-normlift quoted as in a shell; or options alone. Empty lines and lines that start with # are
+        path: Text file. A line has the path of a config.yml, a PLY file or a gsplat checkpoint. Options of ns-normlift,
+            quoted as in a shell, may follow the path or replace it. Empty lines and lines that start with # are
             ignored.
         options: Options of ns-normlift for all captures; those of a line override them.
     Raises:

@@ -39,7 +39,7 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     In a Slurm array whose tasks have several ranks (RANK, WORLD_SIZE), each rank of each task has its own part.
 
     Args:
-        word: auto: from the environment; none: the whole list; or i/n: the i-th of n parts, i from 1.
+        word: auto for the part in the environment, none for the whole list, or i/n for the i-th of n parts, i from 1.
         environment: Environment variables.
     Raises:
         InputError: The word is invalid, variables contradict each other, or a Slurm array has gaps.
@@ -71,9 +71,8 @@ def _slurm_shard(environment: Mapping[str, str]) -> Shard:
     index, remainder = divmod(task - first, step)
     if remainder != 0 or not 0 <= index < count:
         raise InputError(
-            f"{_TASK_ID} is {task}, which is not one of {count} consecutive tasks from {first} on. Submit an array "
-            "without gaps, such as sbatch -a 0-7; or give --shard none, with which workers claim captures in a shared "
-            "folder."
+            f"{_TASK_ID} is {task}, but expected {count} tasks from {first} on, without gaps. Submit an array without "
+            "gaps, such as sbatch -a 0-7; or give --shard none, with which workers claim captures in a shared folder."
         )
     return Shard(index, count)
 
