@@ -184,7 +184,7 @@ def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
         with pytest.warns(UserWarning, match="without changing its size"):
             lifted(source, cache, scene(original=(WIDTH, HEIGHT)))
     mask = torch.ones(HEIGHT, WIDTH + 1, dtype=torch.bool)
-    with pytest.raises(InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera \(18, 24\)"):
+    with pytest.raises(InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera is \(18, 24\)"):
         lifted(files(tmp_path / "maps", FULL), cache, scene(mask=mask))
 
 

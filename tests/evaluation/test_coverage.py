@@ -217,7 +217,7 @@ def test_records_of_what_was_lifted():
     old = {"statistics": {"views": 3, "left_out": 0}, "options": {"max_views": 3}}
     assert lifted_names(scene, old) == ({"0.png", "4.png", "7.png"}, set())
     for facts in ({}, {"statistics": {"views": 6, "left_out": 2}}, {"statistics": {"views": 4, "left_out": 0}}):
-        with pytest.raises(InputError, match="does not tell"):
+        with pytest.raises(InputError, match="does not record"):
             lifted_names(scene, facts)
     with pytest.raises(InputError, match="no longer has"):
         lifted_names(scene, {"views_lifted": ["gone.png"]})

@@ -139,9 +139,9 @@ def test_ids_of_another_list_are_refused_or_warned_of(tmp_path: Path) -> None:
         read_labels(path)
     for labels, message in (
         (np.array([1163, 1165], np.int32), "NYU40"),
-        (np.array([1.5, 2]), "whole numbers"),
-        (np.array([np.nan, 2]), "whole numbers"),
-        (np.array([1e300, 2]), "whole numbers"),
+        (np.array([1.5, 2]), "32-bit integers"),
+        (np.array([np.nan, 2]), "32-bit integers"),
+        (np.array([1e300, 2]), "32-bit integers"),
     ):
         path.write_bytes(ply(labels))
         with pytest.raises(InputError, match=rf"a\.ply.*{message}"):
@@ -157,8 +157,8 @@ def test_masks_are_read_as_carefully_as_label_maps(tmp_path: Path) -> None:
     masks = LabelFiles(tmp_path, what="instance mask", flag="--labels")
     for array, message in (
         (np.zeros((2, 3), np.float32), "instance mask .*a.npy holds float32"),
-        (np.zeros((2, 2, 3), int), r"a\.npy has shape \(2, 2, 3\), its image x/a\.png is 2 x 3"),
-        (np.zeros((3, 2), int), r"a\.npy has shape \(3, 2\), its image x/a\.png is 2 x 3"),
+        (np.zeros((2, 2, 3), int), r"a\.npy has shape \(2, 2, 3\), but its image x/a\.png is 2 x 3"),
+        (np.zeros((3, 2), int), r"a\.npy has shape \(3, 2\), but its image x/a\.png is 2 x 3"),
     ):
         np.save(tmp_path / "a.npy", array)
         with pytest.raises(InputError, match=message):

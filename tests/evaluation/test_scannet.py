@@ -95,5 +95,5 @@ def test_what_cannot_be_scored_is_refused(tmp_path):
         evaluate_scannet([scene], min_opacity=1)
     check_identity("s", 4, np.zeros(4), tmp_path / "labels.ply")
     for count in (3, 5):
-        with pytest.raises(InputError, match=rf"{count} Gaussians, .*labels\.ply 4"):
+        with pytest.raises(InputError, match=rf"{count} Gaussians, .*labels\.ply has 4"):
             check_identity("s", count, np.zeros(4), tmp_path / "labels.ply")
