@@ -55,7 +55,7 @@ def test_auto_takes_the_best_that_is_there(tmp_path, empty_hub):
 
 def test_bad_options_say_what_to_do(tmp_path):
     for options, parts in (
-        ({"regions": "patches"}, ["--regions patches", "'colour'"]),
+        ({"regions": "patches"}, ["--regions patches", "--encoder colour"]),
         ({"regions": "patches", "level": "l"}, ["--level l", '"patches"']),
         ({"regions": "sam", "level": "2"}, ["default, s, m, l", "'2'"]),
         ({"regions": "sam", "regions_dir": Path()}, ["--regions-dir .", '"sam"']),
@@ -68,7 +68,7 @@ def test_bad_options_say_what_to_do(tmp_path):
         ({"level": "l", "regions_dir": Path()}, ["--level", "--regions files", "'l'"]),
         ({"level": "-1", "regions_dir": Path()}, ["--level", "'-1'"]),
         ({"features": "lerf"}, ["none, langsplat", "'lerf'"]),
-        ({"features": "langsplat"}, ["'langsplat'", "--features-dir"]),
+        ({"features": "langsplat"}, ["--features langsplat", "--features-dir"]),
         ({"features_dir": Path("f")}, ["--features-dir f", "--features langsplat"]),
     ):
         refused(lambda options=options: make_source(SourceOptions(**{"encoder": "colour", **options})), *parts)

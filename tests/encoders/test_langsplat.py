@@ -274,7 +274,7 @@ def test_broken_files_are_named_before_the_lift(folder, tmp_path):
     put_map(folder)
     put_map(folder, stem="b")
     (folder / "b_f.npy").write_bytes(npy("<f4", (1, 768), b"\0" * 4 * 768))
-    parts = ("frame_00001_f.npy", "512", "b_f.npy 768")  # of two encoders
+    parts = ("frame_00001_f.npy", "512", "b_f.npy have 768")  # of two encoders
     refused(lambda: source(folder).available([NAME, "b.jpg"]), *parts)
     refused(lambda: source(folder, "xl"), "--level", "default, s, m, l, sum", "'xl'")
     refused(lambda: source(folder, missing="maybe"), "--features-missing", "error, skip", "'maybe'")
