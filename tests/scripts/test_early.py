@@ -185,7 +185,7 @@ def test_a_dataset_that_is_gone_is_refused_early(config, tmp_path, monkeypatch, 
     monkeypatch.chdir("/")
     for entrypoint, flags in ((lift.entrypoint, COLOUR), (query.entrypoint, ("--text", "a"))):
         assert run_entry(monkeypatch, entrypoint, "--load-config", config, *flags) == 1
-        assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "give its path with --data" in shown
+        assert f"{tmp_path / 'room'}" in (shown := said(capsys)) and "where it is with --data" in shown
 
 
 def test_a_cache_that_is_a_file_or_a_folder_that_may_not_be_written_is_refused_early(
