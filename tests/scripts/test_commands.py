@@ -373,7 +373,7 @@ def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, t
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     printed = said(capsys)
     run_dir = tmp_path / "outputs" / "room" / "normlift" / "a"
-    assert "2 of 8 photographs" in printed and "--gsplat-rules" in printed and str(run_dir) in printed
+    assert "2 of 8 images" in printed and "--gsplat-rules" in printed and str(run_dir) in printed
     found = open_run(run_dir / "config.yml").ask_stored()
     assert found is not None and found["red"].peak > 0.8
     asked = ("--load-config", run_dir / "config.yml")
