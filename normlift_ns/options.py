@@ -190,8 +190,8 @@ class SplatOptions:
     views: Literal["train", "all"] = "train"
     """Images to lift. train: those that were not held out of training. all: held-out images too."""
     test_every: int | None = None
-    """Interval of held-out images: training left out every n-th image, starting with the first. 8 for gsplat's trainer,
-    and for Inria's with --eval. Default: no image, or those that transforms.json lists."""
+    """Interval n of held-out images: training left out every n-th image, starting with the first. It is 8 in gsplat's
+    trainer, and in Inria's with --eval. Default: no held-out images, or those that transforms.json lists."""
     holdout: tuple[str, ...] = ()
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1 (the default of ns-train)."""

@@ -179,7 +179,7 @@ def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, c
 def test_ways_to_ask_that_do_not_fit(lifted, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
     for flags, words in (
-        ((), ("no text",)),
+        ((), ("no prompts",)),
         (("--text", "a", "--stdin"), ("--text", "--stdin")),
         (("--stdin", "--interactive", "True"), ("--stdin", "--interactive")),
         (("--stdin", "--json", "a.json"), ("--json", "--text", "--stdin")),

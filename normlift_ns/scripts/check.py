@@ -33,7 +33,7 @@ class NormLiftCheck(NormLift):
     images to estimate the seconds of every stage, memory and disk. The exit code is 1 if there is an error."""
 
     json: Path | None = None
-    """JSON file to which to also write the findings and the plan."""
+    """JSON file for the findings and the plan, in addition to the printed table."""
     dry_run: tyro.conf.Suppress[bool] = True
 
     def main(self) -> None:

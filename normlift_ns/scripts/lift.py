@@ -79,8 +79,7 @@ class NormLift:
     queries: tuple[str, ...] = ()
     """Prompts to store in the run; ns-render and ns-viewer show their relevancy."""
     export_langsplat: Path | None = None
-    """Folder to which to also write the regions and features of lifted images, in the format of LangSplat's
-    preprocessing."""
+    """Folder for a copy of the lifted regions and features, in the format of LangSplat's preprocessing."""
     source: SourceOptions = field(default_factory=SourceOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
 

@@ -310,7 +310,7 @@ def test_defaults_are_those_of_the_kind_of_vote_and_stand_in_the_help():
     for name in VoteNumbers._fields:
         values = {kind: f"{getattr(numbers, name):g}" for kind, numbers in VOTES.items()}
         told = [f"{x} for {kind}" if len(set(values.values())) > 1 else x for kind, x in values.items()]
-        line = re.search(rf'{name}: float \| None = None """.{{1,250}}?By default (.*?)"""', text)
+        line = re.search(rf'{name}: float \| None = None """.{{1,300}}?Default: (.*?)"""', text)
         assert line is not None and all(x in line[1] for x in told), (name, line)
 
 
