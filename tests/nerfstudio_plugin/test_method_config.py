@@ -107,5 +107,5 @@ def test_an_error_of_any_kind_is_told_and_leaves_other_methods(monkeypatch, caps
         raise OSError("libcuda.so: cannot open shared object file")
 
     monkeypatch.setattr(entry, "import_module", broken)
-    assert entry._method("scannet") is None
+    assert entry._load_method("scannet") is None
     assert "scannet cannot be used (OSError: libcuda.so: cannot" in capsys.readouterr().err
