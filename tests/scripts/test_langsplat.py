@@ -88,8 +88,8 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draws", [1, pytest.param(3, marks=pytest.mark.extra)])
-def test_damaged_masks_lift_to_the_right_things(draws, nerfstudio, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("draws", "least"), [(1, 0.9), pytest.param(3, 0.92, marks=pytest.mark.extra)])
+def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_path, monkeypatch):
     """mIoU over the Gaussians of 13 classes, mean of some draws of the damage."""
     from benchmarks.plain_room import plain_room  # noqa: PLC0415
     from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
@@ -126,7 +126,7 @@ def test_damaged_masks_lift_to_the_right_things(draws, nerfstudio, tmp_path, mon
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0
     (sofa,) = json.loads((tmp_path / "a.json").read_text())["queries"]
     before, after = np.mean(list(scores.values()), axis=0)
-    assert after >= 0.92
+    assert after >= least
     assert all(refined > raw for raw, refined in scores.values())
     assert after > before + 0.02
     assert summed[1] >= 0.9
