@@ -43,10 +43,9 @@ from benchmarks.variants import (
 )
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors, refine
-from normlift_ns.core.ablations import Variant, variant_config, variant_source
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.metrics import class_scores, classify, confusion
-from normlift_ns.evaluation.signals import accuracy_bins
+from normlift_ns.evaluation.studies import Variant, accuracy_bins, variant_config, variant_source
 
 SEEDS = 8
 
@@ -97,7 +96,7 @@ class Bench:
         lifted = lift(observed.evidence, observed.features)
         plain = lifted_scores(lifted, self.classes)
         agreed = lift(observed.evidence, consensus(observed.evidence, observed.features).features)
-        voting = replace(agreed, scalars=lifted.scalars)  # with R as regions were seen, as `normlift_ns.lifting` does
+        voting = replace(agreed, scalars=lifted.scalars)  # with R as regions were seen, as `normlift_ns.pipeline` does
         row: dict[str, Any] = {}
         for method in METHODS:
             given = (voting, lifted_scores(agreed, self.classes)) if method in AGREED else (lifted, plain)

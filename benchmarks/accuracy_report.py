@@ -12,8 +12,8 @@ from scipy import stats
 from benchmarks.damage import LADDER
 from benchmarks.report import Report
 from benchmarks.variants import VARIANTS
-from normlift_ns.core.ablations import Variant
 from normlift_ns.core.metrics import spearman
+from normlift_ns.evaluation.studies import Variant
 
 VARIES = 0.05
 """Accuracy varies over bins of reliability if their means span at least this much."""

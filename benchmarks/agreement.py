@@ -31,7 +31,8 @@ from benchmarks.variants import lifted_scores
 from benchmarks.worlds import Words, World, made_words, world_of_room
 from normlift_ns import Evidence, lift, rasterize_evidence, render
 from normlift_ns.core.consensus import consensus
-from normlift_ns.demo import DemoRoom, demo_cameras, demo_room, held_out_cameras
+from normlift_ns.demo.capture import demo_cameras, held_out_cameras
+from normlift_ns.demo.room import DemoRoom, demo_room
 
 SEEDS, GAUSSIANS = 4, 20_000
 SQUARES, SUPERPIXELS = (32, 64, 96), (30, 100, 300)

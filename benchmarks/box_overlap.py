@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from normlift_ns.objects.boxes import OrientedBox
+from normlift_ns.analysis.objects import OrientedBox
 
 
 def half_spaces(box: OrientedBox) -> np.ndarray:

@@ -19,10 +19,10 @@ from benchmarks.box_overlap import box_iou
 from benchmarks.damage import STEPS, Damage, observe
 from benchmarks.worlds import Words, World, real_words, tabletop
 from normlift_ns import RefineConfig, SemanticField, consensus, lift, refine
-from normlift_ns.asking import Answer, answer
-from normlift_ns.objects.boxes import oriented_box
-from normlift_ns.question import Question
-from normlift_ns.runs.splats import instances_of
+from normlift_ns.analysis.objects import oriented_box
+from normlift_ns.exports import answer_instances
+from normlift_ns.query.engine import Answer, run_query
+from normlift_ns.query.question import Query
 
 EXACT = "exact masks"
 DAMAGES: dict[str, Damage] = {EXACT: Damage(noise=0.0), "hard": STEPS["hard"]}
@@ -40,13 +40,13 @@ def asked(world: World, words: Words, damage: Damage, seed: int = 0) -> Answer:
     field = SemanticField.build(lifted, means, source)
     texts = tuple(str(c) for c in range(world.classes))
     vectors = words.classes.double().cpu().numpy()
-    found = answer(field, means, Question(texts, vectors, rule="cosine", threshold=-2.0))
+    found = run_query(field, means, Query(texts, vectors, rule="cosine", threshold=-2.0))
     return replace(found, selected=found.valid[:, None].expand_as(found.relevancy))
 
 
 def box_scores(means: Tensor, truth: Tensor, found: Answer) -> list[float]:
     """IoU of the box of every class: of its true Gaussians, and of the largest connected part that is found."""
-    instances = instances_of(found)
+    instances = answer_instances(found)
     scores = []
     for c in range(len(found.texts)):
         first = next((i for i, of in enumerate(instances.classes, 1) if of == c + 1), None)
@@ -69,7 +69,7 @@ def table(rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> str:
 
 def main() -> None:
     from benchmarks.captures import SHARED  # noqa: PLC0415
-    from normlift_ns.evaluation.instance_masks import read_names  # noqa: PLC0415
+    from normlift_ns.evaluation.protocols import read_names  # noqa: PLC0415
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--views", type=int, help="of an even spread; by default all 44")

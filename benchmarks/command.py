@@ -29,7 +29,7 @@ import torch
 from benchmarks.captures import SHARED
 from benchmarks.overhead import HERE, run, spread
 from benchmarks.report import RESULTS, Metric, Report, hardware
-from normlift_ns.core.disk.arrays import load_arrays
+from normlift_ns.io.arrays import load_arrays
 
 FOX = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
 MODEL = "ViT-B-16"
@@ -49,7 +49,7 @@ torch.save(torch.nn.functional.normalize(rows, dim=1), sys.argv[2] + "/rows.pt")
 """
 LIFT = """
 import json, os
-from normlift_ns.scripts import lift
+from normlift_ns.cli import lift
 shown = lift.summary
 def summary(run, before, total):
     with open(os.environ["SECONDS_FILE"], "w") as file:

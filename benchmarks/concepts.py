@@ -20,7 +20,7 @@ from benchmarks.plain_room import plain_room
 from benchmarks.plots import DOCS
 from benchmarks.worlds import World, demo, made_words
 from normlift_ns import lift, render
-from normlift_ns.colors import RELIABILITY_COLORS
+from normlift_ns.rendering.colors import RELIABILITY_COLORMAP
 
 STEP, SEED, VIEW = "hard", 0, 12
 """The view is one of those lifted."""
@@ -47,7 +47,7 @@ def draw(name: str, panels: Sequence[Panel]) -> None:
     for place in places.flat:
         place.set_axis_off()
     for place, (title, values, number) in zip(places.flat, panels, strict=False):
-        shown = place.imshow(values, **({"cmap": RELIABILITY_COLORS, "vmin": LOW, "vmax": 1} if number else {}))
+        shown = place.imshow(values, **({"cmap": RELIABILITY_COLORMAP, "vmin": LOW, "vmax": 1} if number else {}))
         place.set_title(title)
         scale = shown if number else scale
     if scale is not None:

@@ -36,7 +36,7 @@ from benchmarks.worlds import Words, World, demo, made_words, real_words, tablet
 from normlift_ns import Neighbors, RefineConfig, lift, nearest_neighbors, refine
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.metrics import classify, kendall, spearman
-from normlift_ns.evaluation.signals import accuracy_bins
+from normlift_ns.evaluation.studies import accuracy_bins
 
 SCENES = ("tabletop", "demo", "second")
 DAMAGES = (*HELD_OUT, "group", "arc")

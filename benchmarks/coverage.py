@@ -9,7 +9,7 @@ vote, over all Gaussians whose class is known; the rank of the suggestions is th
 counting half. The study must reach the 75th percentile on average over seeds at the step "noise only"; steps with
 damaged masks are reported. Writes results/coverage.json.
 
-The rule was fixed before any number was looked at: the gain of `evaluation.coverage.gain`. Other rules were compared on
+The rule was fixed before any number was looked at: the gain of `evaluation.coverage`. Other rules were compared on
 20 other seeds (100 to 119) of a room of 20,000 Gaussians: see docs/evaluation.md.
 """
 
@@ -32,7 +32,7 @@ from benchmarks.worlds import Words, World
 from normlift_ns import RasterSettings, lift
 from normlift_ns.core.metrics import class_scores, classify, confusion
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.evaluation.coverage.gain import Drawn, choose_views, known_of_lift, largest, view_weights
+from normlift_ns.evaluation.coverage import RasterInputs, choose_views, max_weights, model_of_lift, view_weights
 
 START, ADDED, DRAWS = 8, 4, 64
 GOAL = 75.0
@@ -87,7 +87,7 @@ def suggested(observed: Observed, weights: SparseRows, first: Sequence[int], lef
         weights.select_columns(torch.tensor(some, device=weights.weight.device), observed.evidence.num_views)
         for some in (first, left)
     )
-    known = known_of_lift(lifted.scalars, chosen, largest(weights), beta=1.0)
+    known = model_of_lift(lifted.scalars, chosen, max_weights(weights), beta=1.0)
     return [left[view] for view, _ in choose_views(known, rest, len(left), ADDED)]
 
 
@@ -140,7 +140,7 @@ def main(arguments: argparse.Namespace) -> None:
     for there, words in worlds(False, arguments.scenes, None):
         world = there.to(device)
         with stopwatch() as watch:
-            drawn = Drawn(world.scene, "classic", RasterSettings(), 1)
+            drawn = RasterInputs(world.scene, "classic", RasterSettings(), 1)
             weights = view_weights(drawn, world.cameras)
         report.add(f"{world.name}.weights_s", watch.seconds, f"s, {len(world.cameras)} views")
         for step in arguments.steps:

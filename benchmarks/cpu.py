@@ -32,10 +32,10 @@ from normlift_ns import (
     refine,
 )
 from normlift_ns.core.sparse import sum_duplicates
-from normlift_ns.raster import numba as compiled
-from normlift_ns.raster.backend import Batch, Job
-from normlift_ns.raster.projection import assign_tiles, project
-from normlift_ns.stages import peak_gib
+from normlift_ns.progress import peak_gib
+from normlift_ns.rasterization import numba as compiled
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.projection import assign_tiles, project
 
 CELL = 60
 """Side of the square regions in pixels: 9 x 16 = 144 regions per view."""
@@ -70,7 +70,7 @@ WARM = """
 import time
 import torch
 start = time.process_time()
-from normlift_ns.raster import numba
+from normlift_ns.rasterization import numba
 print(time.process_time() - start)
 for kernel, signature in numba.kernel_signatures(torch.float32):
     start = time.process_time()
@@ -93,8 +93,8 @@ def warming() -> dict[str, float]:
 
 def stages(scene: GaussianScene, camera: Camera, labels: torch.Tensor) -> tuple[dict[str, float], float]:
     """CPU milliseconds of each stage of one view, and the share of the pairs of `assign_tiles` that is kept."""
-    job = Job(scene, False, RasterSettings(), torch.float32)
-    batch = Batch([camera], [labels], [int(labels.max()) + 1])
+    job = RasterJob(scene, False, RasterSettings(), torch.float32)
+    batch = RasterBatch([camera], [labels], [int(labels.max()) + 1])
     projected = project(job.world, camera, job.settings, job.antialiased)
     tasks: dict[str, Callable[[], Any]] = {
         "project": lambda: project(job.world, camera, job.settings, job.antialiased),

@@ -30,11 +30,10 @@ from benchmarks.damage import LADDER, observe
 from benchmarks.report import RESULTS, Report
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import lift
+from normlift_ns.analysis.objects import connected_components, find_floaters
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.metrics import NO_CLASS
-from normlift_ns.insight.floaters import find_floaters
-from normlift_ns.objects import connected_components
-from normlift_ns.options import FLOATER_LIMIT
+from normlift_ns.options import FLOATER_THRESHOLD
 
 DAMAGES = ("mild", "hard")
 MAY_BE_LOST = 0.01
@@ -94,7 +93,7 @@ def measure(world: World, words: Words, put_in: int, seed: int) -> dict[str, flo
 def main(arguments: argparse.Namespace) -> None:
     torch.set_grad_enabled(False)
     report = Report("floaters")
-    report.add("limit", FLOATER_LIMIT, "doublings")
+    report.add("limit", FLOATER_THRESHOLD, "doublings")
     for name in arguments.scenes:
         if name == "demo":
             plain = demo(15_000, 12, 240) if arguments.quick else demo()

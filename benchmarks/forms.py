@@ -31,10 +31,10 @@ from benchmarks.plain_room import plain_room
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, Evidence, SemanticField, lift, rasterize_evidence
 from normlift_ns.core.consensus import consensus
-from normlift_ns.demo import demo_cameras, view_image, view_labels
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import Superpixels
-from normlift_ns.encoders.source import joint_partition
+from normlift_ns.demo.capture import demo_cameras, view_image, view_labels
+from normlift_ns.encoders.base import joint_partition
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.segmentation.regions import Superpixels
 
 NOISE = (0.0, 0.05, 0.5, 1.5)
 TOLERANCES = (1e-3, 1e-2, 5e-2)
@@ -90,7 +90,7 @@ def clip_cases(some: Sequence[str]) -> Iterator[Case]:
 
 def colour_cases(some: Sequence[str]) -> Iterator[Case]:
     """Mean colours of masks, or of superpixels where there are none."""
-    encoder, room = ColourEncoder(), plain_room()
+    encoder, room = ColorEncoder(), plain_room()
     names = [name.removesuffix("_colour") for name in some if name.endswith("_colour")]
     queries = encoder.text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
     for name in names:

@@ -12,11 +12,10 @@ import torch
 import transformers
 from torch import Tensor
 
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.hub.encoder import HubEncoder
-from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
-from normlift_ns.encoders.sam.network import SamNetwork
+from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.options import SamPrecision
+from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def random_clip(size: Size, folder: Path, device: str) -> OpenClipEncoder:
     return OpenClipEncoder(size.clip, str(folder / "clip.pt"), device=device)
 
 
-def random_siglip2(size: Size, folder: Path, device: str) -> HubEncoder:
+def random_siglip2(size: Size, folder: Path, device: str) -> HuggingFaceEncoder:
     """SigLIP 2 at 224 pixels with patches of 16, written as transformers does, with a tokenizer of two tokens."""
     width, layers, heads, vocabulary = size.siglip
     tower = {
@@ -87,7 +86,7 @@ def random_siglip2(size: Size, folder: Path, device: str) -> HubEncoder:
     tokenizer = transformers.Siglip2Tokenizer(model_input_names=["input_ids"], padding_side="right")
     model.save_pretrained(folder)
     transformers.SiglipProcessor(transformers.SiglipImageProcessor(), tokenizer).save_pretrained(folder)
-    return HubEncoder("siglip2", str(folder), device=device)
+    return HuggingFaceEncoder("siglip2", str(folder), device=device)
 
 
 def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> Tensor:

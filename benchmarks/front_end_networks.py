@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.report import Report
-from normlift_ns.encoders.sam.network import SamNetwork
 from normlift_ns.options import SamPrecision
+from normlift_ns.segmentation.sam import SamNetwork
 
 _REPEATS = 3
 

@@ -15,8 +15,7 @@ from torch import Tensor
 from benchmarks.front_end_inputs import SMALL, Injected, Size
 from benchmarks.front_end_networks import seconds
 from benchmarks.report import Report
-from normlift_ns.encoders.sam.library import Sam2Network
-from normlift_ns.encoders.sam.masks import MaskRules, SamMasks, crop_boxes, point_grid
+from normlift_ns.segmentation.sam import MaskRules, Sam2Network, SamMasks, crop_boxes, point_grid
 
 LARGE = {
     "hidden_size": 144,

@@ -44,16 +44,13 @@ from benchmarks.front_end_inputs import (
 from benchmarks.front_end_networks import Exact, add_networks, decode_all, seconds
 from benchmarks.front_end_sam2 import add_sam2
 from benchmarks.report import RESULTS, Report
-from normlift_ns.encoders import source as source_module
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.sam import masks as sam_module
-from normlift_ns.encoders.sam import network as network_module
-from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, crop_boxes, point_grid
-from normlift_ns.encoders.sam.network import SamNetwork
-from normlift_ns.encoders.sam.rules import Suppression, mask_nms, stack_masks
-from normlift_ns.encoders.sam.small_regions import clean_masks
-from normlift_ns.encoders.source import RegionFeatures
+from normlift_ns.encoders import base as source_module
+from normlift_ns.encoders.base import PatchFeatures, RegionFeatures
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.segmentation import sam as network_module
+from normlift_ns.segmentation import sam as sam_module
+from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, remove_small_regions, stack_masks
+from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamMasks, SamNetwork, crop_boxes, point_grid
 
 
 @contextmanager
@@ -105,12 +102,12 @@ def changed_pixels(found: Tensor, exact: Tensor) -> float:
 @contextmanager
 def plain() -> Iterator[None]:
     """Masks are made before they are measured."""
-    kernels_apply = network_module.kernels_apply
-    network_module.kernels_apply = lambda tensor: False
+    kernels_apply = network_module.can_use_triton
+    network_module.can_use_triton = lambda tensor: False
     try:
         yield
     finally:
-        network_module.kernels_apply = kernels_apply
+        network_module.can_use_triton = kernels_apply
 
 
 def cold(size: Size, device: str) -> None:
@@ -208,7 +205,7 @@ def main(quick: bool, output: Path, device: str, variants: bool) -> None:
     found = sam.masks(image)
     labels_s = seconds(lambda: sam.labels(image, ""), device)
     report.add("sam_labels_s", labels_s, "s/image, four levels of injected masks, rules included")
-    for level in LEVELS:
+    for level in SAM_LEVELS:
         report.add(f"sam_masks_{level}", len(found[level]), "masks")
     report.add("sam_rules_share", (labels_s - sam_s) / sam_s, "of the network's time")
     for step, (owner, name) in STEPS.items():
@@ -224,7 +221,7 @@ def main(quick: bool, output: Path, device: str, variants: bool) -> None:
         masks = injected_masks(count, size, g, device)
         copies, scores = with_copies(masks, g), (0.6 + 0.4 * torch.rand(count, generator=g)).to(device)
         nms_s = seconds(lambda copies=copies, scores=scores: mask_nms(copies, scores), device)
-        clean_s = seconds(lambda copies=copies: clean_masks(copies, MaskRules().region_area), device)
+        clean_s = seconds(lambda copies=copies: remove_small_regions(copies, MaskRules().region_area), device)
         labels = stack_masks(masks)
         encode_s = seconds(lambda labels=labels: encoder.encode(image, labels), device)
         few = labels.where(labels < 8, -1)

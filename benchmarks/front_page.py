@@ -19,11 +19,12 @@ from benchmarks.plots import DOCS
 from benchmarks.variants import Scores, lifted_scores, refined_scores
 from benchmarks.worlds import World, made_words, world_of_room
 from normlift_ns import RefineConfig, lift, nearest_neighbors, render
-from normlift_ns.colors import RELIABILITY_COLORS
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.metrics import mask_iou
-from normlift_ns.demo import demo_cameras, demo_room, held_out_cameras
-from normlift_ns.evaluation.signals import accuracy_bins
+from normlift_ns.demo.capture import demo_cameras, held_out_cameras
+from normlift_ns.demo.room import demo_room
+from normlift_ns.evaluation.studies import accuracy_bins
+from normlift_ns.rendering.colors import RELIABILITY_COLORMAP
 
 STEP, SEED, VIEW = "wrong classes", 0, 3
 ASKED = "tomato red"
@@ -59,7 +60,7 @@ def main() -> None:
     panels[0, 1].imshow(overlay(world, photo, plain, asked))
     panels[0, 1].set_title(f"Lifted, nothing else: IoU {iou(world, plain, asked):.2f}")
     mean = values[..., 0] / alpha.clamp(min=1e-6)
-    scale = panels[1, 0].imshow(mean, cmap=RELIABILITY_COLORS, vmin=LOWEST, vmax=HIGHEST)
+    scale = panels[1, 0].imshow(mean, cmap=RELIABILITY_COLORMAP, vmin=LOWEST, vmax=HIGHEST)
     panels[1, 0].set_title(f"Reliability R: {tenths[0]:.0%} right in its lowest tenth, {tenths[-1]:.0%} in its highest")
     legend = panels[1, 0].inset_axes((0.66, 0.09, 0.3, 0.035))
     figure.colorbar(scale, cax=legend, orientation="horizontal", extend="both", ticks=(LOWEST, 0.7, HIGHEST))

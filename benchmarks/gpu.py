@@ -23,20 +23,12 @@ from benchmarks.gpu_cases import Case, capture_case, room_case, timed
 from benchmarks.gpu_errors import evidence_error, lift_errors, vote_errors
 from benchmarks.gpu_stages import kernel_milliseconds, stage_seconds
 from benchmarks.report import RESULTS, Report
-from normlift_ns import (
-    Lifted,
-    RefineConfig,
-    SemanticField,
-    lift,
-    nearest_neighbors,
-    rasterize_evidence,
-    refine,
-)
-from normlift_ns.core.storage import StoredEvidence
-from normlift_ns.evaluation.dense import dense_sums
-from normlift_ns.raster.backend import Job
-from normlift_ns.raster.gsplat import project_views
-from normlift_ns.raster.settings import RasterSettings
+from normlift_ns import Lifted, RefineConfig, SemanticField, lift, nearest_neighbors, rasterize_evidence, refine
+from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.evaluation.baselines import dense_sums
+from normlift_ns.rasterization.backend import RasterJob
+from normlift_ns.rasterization.gsplat import project_views
+from normlift_ns.rasterization.settings import RasterSettings
 
 DIMENSION, GSPLAT_VIEWS = 512, 6
 
@@ -82,7 +74,7 @@ def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
     def backward() -> None:
         some = case.cameras[:GSPLAT_VIEWS]
         gradient = torch.rand(some[0].height, some[0].width, DIMENSION, device="cuda")  # as large for every view
-        dense_sums(Job(scene, False, RasterSettings(), torch.float32), some, [gradient] * len(some), DIMENSION)
+        dense_sums(RasterJob(scene, False, RasterSettings(), torch.float32), some, [gradient] * len(some), DIMENSION)
 
     return rgb, backward
 
@@ -151,7 +143,7 @@ def measure(report: Report, case: Case) -> None:
         gsplat512_s = timed(backward)[0] * views / min(GSPLAT_VIEWS, views)
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-        job = Job(case.scene, False, RasterSettings(), torch.float32)
+        job = RasterJob(case.scene, False, RasterSettings(), torch.float32)
         intersections = len(project_views(job, case.cameras[:1]).members)
         evidence_s, evidence = timed(case.evidence)
         evidence_gib = torch.cuda.max_memory_allocated() / 2**30
@@ -222,7 +214,7 @@ def agreement(report: Report, cases: Sequence[Case]) -> None:
             weight = ours.rows.weight.double().sum() + ours.unlabeled.weight.double().sum()
             alpha = 0.0
             for camera in some.cameras:
-                job = Job(case.scene, mode == "antialiased", RasterSettings(), torch.float32)
+                job = RasterJob(case.scene, mode == "antialiased", RasterSettings(), torch.float32)
                 seen = project_views(job, [camera])
                 drawing = (seen.means2d, seen.conics, torch.zeros(1, len(case.scene), 1, device="cuda"), seen.opacities)
                 _, alphas = rasterize_to_pixels(*drawing, camera.width, camera.height, 16, seen.offsets, seen.members)

@@ -13,12 +13,7 @@ import torch
 from benchmarks import rooms
 from benchmarks.captures import trained_scene, training_cameras
 from benchmarks.cpu import grid_labels
-from normlift_ns import (
-    Camera,
-    Evidence,
-    GaussianScene,
-    rasterize_evidence,
-)
+from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Evidence
-from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians, seen_weights
+from normlift_ns.core.consensus import apply_consensus, consensus, region_overlaps, sample_gaussians, total_view_weights
 from normlift_ns.core.sparse import SparseRows
 
 GAUSSIANS, VIEWS, REGIONS, THINGS = 1_930_000, 177, 128, 1600
@@ -94,9 +94,9 @@ def main(quick: bool, output: Path) -> None:
     print(errors, flush=True)
     evidence = made_evidence(GAUSSIANS // (100 if quick else 1), VIEWS, device)
     size, features = evidence.num_regions, table(evidence.num_regions).to(device)
-    chosen, chance = sampled_gaussians(evidence.rows, size, 50)
+    chosen, chance = sample_gaussians(evidence.rows, size, 50)
     rows = evidence.rows.select_rows(chosen)
-    total = seen_weights(evidence, chosen)
+    total = total_view_weights(evidence, chosen)
     overlaps = region_overlaps(rows, evidence.region_view, chance, total)
     sampled, whole = (consensus(evidence, features, sample=k) for k in (50, 1000))
     distance = float((1 - (sampled.features * whole.features).sum(1)).mean())
@@ -106,11 +106,11 @@ def main(quick: bool, output: Path) -> None:
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
     tasks = {
-        "sample": lambda: sampled_gaussians(evidence.rows, size, 50),
+        "sample": lambda: sample_gaussians(evidence.rows, size, 50),
         "select": lambda: evidence.rows.select_rows(chosen),
-        "weights": lambda: seen_weights(evidence, chosen),
+        "weights": lambda: total_view_weights(evidence, chosen),
         "overlaps": lambda: region_overlaps(rows, evidence.region_view, chance, total),
-        "sum": partial(agreed, features, overlaps),
+        "sum": partial(apply_consensus, features, overlaps),
         "all": lambda: consensus(evidence, features),
     }
     for name, task in tasks.items():

@@ -9,14 +9,7 @@ import torch
 
 from benchmarks.cpu import relative_difference
 from benchmarks.gpu_cases import Case
-from normlift_ns import (
-    Evidence,
-    Lifted,
-    RefineConfig,
-    lift,
-    rasterize_evidence,
-    refine,
-)
+from normlift_ns import Evidence, Lifted, RefineConfig, lift, rasterize_evidence, refine
 
 SAMPLE = 20_000
 """Gaussians."""

@@ -34,12 +34,12 @@ from benchmarks.command import joined as with_earlier
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, Evidence, GaussianScene, RefineConfig, lift, rasterize_evidence
 from normlift_ns.core.lift import Scalars
-from normlift_ns.core.portions import ALONE, Portion, Team
-from normlift_ns.lifting import vote_together
-from normlift_ns.observing import in_chunks
-from normlift_ns.stages import Stages
-from normlift_ns.team.exchange import Piece, share_evidence
-from normlift_ns.team.launch import joined, start
+from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
+from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.distributed.launch import distributed_context, launch_processes
+from normlift_ns.evidence_collection import chunk_views
+from normlift_ns.pipeline import vote_distributed
+from normlift_ns.progress import StageTimer
 
 DIMENSION, REGIONS, MAPS = 512, 128, 16
 ENTRY = 12
@@ -73,7 +73,7 @@ class Found(NamedTuple):
 class Clock:
     """Seconds from barrier to barrier."""
 
-    def __init__(self, team: Team, device: str) -> None:
+    def __init__(self, team: Communicator, device: str) -> None:
         self.team, self.device, self.seconds = team, device, dict[str, float]()
         self.last = self.now()
 
@@ -88,32 +88,32 @@ class Clock:
         self.seconds[name], self.last = now - self.last, now
 
 
-def core(team: Team, case: Case, folder: Path, device: str) -> Found:
+def core(team: Communicator, case: Case, folder: Path, device: str) -> Found:
     """What the Gaussians of this process become, and the seconds of every step."""
     clock = Clock(team, device)
-    portion = Portion.of(team, case.scene.means)
-    chunks = in_chunks(range(len(case.cameras)), team.size)
-    pieces, whole = dict[int, Piece](), list[Evidence]()
+    portion = Partition.of(team, case.scene.means)
+    chunks = chunk_views(range(len(case.cameras)), team.size)
+    pieces, whole = dict[int, EvidenceShard](), list[Evidence]()
     with team.shares(folder):
         for number in team.chunks(len(chunks)):
             cameras = [case.cameras[v] for v in chunks[number]]
             labels = [case.labels[v % len(case.labels)] for v in chunks[number]]
             found = rasterize_evidence(case.scene, cameras, labels, num_regions=[REGIONS] * len(cameras))
             if team.size > 1:
-                pieces[number] = Piece.of(found, portion)
+                pieces[number] = EvidenceShard.of(found, portion)
             else:
                 whole.append(found)
             del found
         clock.lap("evidence")
-    evidence = Evidence.merge(*whole) if team.size == 1 else share_evidence(pieces, portion, len(chunks))
+    evidence = Evidence.merge(*whole) if team.size == 1 else redistribute_evidence(pieces, portion, len(chunks))
     whole.clear()
     pieces.clear()
     clock.lap("exchange")
     lifted = lift(evidence, case.table)
     clock.lap("lift")
     own = lifted.scalars.own_evidence
-    stages = Stages(lambda stage, done, total: None)
-    copied, _ = vote_together(case.scene.means, lifted, own, RefineConfig(), portion, stages)
+    stages = StageTimer(lambda stage, done, total: None)
+    copied, _ = vote_distributed(case.scene.means, lifted, own, RefineConfig(), portion, stages)
     clock.lap("vote")
     clock.seconds |= {name: stages.seconds[name] for name in ("neighbors",)}
     return Found(lifted.scalars.map(portion.join), portion.join(copied), clock.seconds, evidence)
@@ -133,10 +133,12 @@ def difference(a: Found, b: Found) -> float:
     return max(float((a.copied != b.copied).sum()), *(float((x.double() - y.double()).abs().max()) for x, y in pairs))
 
 
-def compare_core(team: Team, report: Report, name: str, case: Case, folder: Path, device: str, rounds: int) -> None:
+def compare_core(
+    team: Communicator, report: Report, name: str, case: Case, folder: Path, device: str, rounds: int
+) -> None:
     one, two, wrong, entries = list[dict[str, float]](), list[dict[str, float]](), 0.0, 0
     for turn in range(rounds + 1):
-        alone = core(ALONE, case, folder, device) if team.rank == 0 else None
+        alone = core(SINGLE_PROCESS, case, folder, device) if team.rank == 0 else None
         team.add(torch.zeros(1))
         together = core(team, case, folder, device)
         entries = together.evidence.nnz
@@ -163,7 +165,7 @@ def compare_core(team: Team, report: Report, name: str, case: Case, folder: Path
     report.add(f"exchange_gib_s{name}", moved / spent, "GiB/s, sorting what came included")
 
 
-def large(team: Team, report: Report, case: Case, folder: Path, device: str) -> None:
+def large(team: Communicator, report: Report, case: Case, folder: Path, device: str) -> None:
     if device == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -188,10 +190,10 @@ def large(team: Team, report: Report, case: Case, folder: Path, device: str) -> 
     report.add("n100m.copied", changed, "share of Gaussians")
 
 
-def front(team: Team, report: Report, folder: Path, device: str, quick: bool) -> None:
+def front(team: Communicator, report: Report, folder: Path, device: str, quick: bool) -> None:
     """SAM and CLIP over photographs, in chunks."""
     from benchmarks.front_end_inputs import SMALL, Size, injected_sam, random_clip, random_sam  # noqa: PLC0415
-    from normlift_ns.encoders.source import RegionFeatures, each_view  # noqa: PLC0415
+    from normlift_ns.encoders.base import RegionFeatures, iterate_view_features  # noqa: PLC0415
 
     size, count = (SMALL, 6) if quick else (Size(), 48)
     torch.manual_seed(0)
@@ -201,21 +203,21 @@ def front(team: Team, report: Report, folder: Path, device: str, quick: bool) ->
     g = torch.Generator().manual_seed(0)
     images = torch.randint(0, 256, (count, size.height, size.width, 3), generator=g, dtype=torch.uint8)
 
-    def see(some: Team) -> float:
-        clock, chunks = Clock(some, device), in_chunks(range(count), some.size)
+    def see(some: Communicator) -> float:
+        clock, chunks = Clock(some, device), chunk_views(range(count), some.size)
         with some.shares(folder):
             for number in some.chunks(len(chunks)):
-                for _ in each_view(source, ((images[v], str(v)) for v in chunks[number])):
+                for _ in iterate_view_features(source, ((images[v], str(v)) for v in chunks[number])):
                     pass
             clock.lap("all")
         return clock.seconds["all"]
 
-    for _ in each_view(source, ((images[v], str(v)) for v in range(2))):  # compiles
+    for _ in iterate_view_features(source, ((images[v], str(v)) for v in range(2))):  # compiles
         pass
-    one = [see(ALONE)] if team.rank == 0 else []
+    one = [see(SINGLE_PROCESS)] if team.rank == 0 else []
     team.add(torch.zeros(1))
     two = [see(team), see(team)]
-    one += [see(ALONE)] if team.rank == 0 else []
+    one += [see(SINGLE_PROCESS)] if team.rank == 0 else []
     team.add(torch.zeros(1))
     if team.rank == 0:
         unit = f"one GPU over two, {count} images"
@@ -248,7 +250,7 @@ def commands(report: Report, trained: Path, folder: Path, device: str, quick: bo
     flags += [str(word) for word in make_weights(folder, ["fox"])] + (["--max-views", "4"] if quick else [])
 
     def lifted(devices: int, name: str, *more: str) -> float:
-        words = [sys.executable, "-m", "normlift_ns.scripts.lift", *flags, "--num-devices", str(devices)]
+        words = [sys.executable, "-m", "normlift_ns.cli.lift", *flags, "--num-devices", str(devices)]
         words += ["--output-dir", str(folder / name), "--timestamp", "run", *more]
         begin = time.perf_counter()
         done = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -273,7 +275,7 @@ SIZES = (("", 1_930_000, 177), ("_10m", 10_000_000, 20))
 TINY = (("", 20_000, 21), ("_10m", 30_000, 5))
 
 
-def work(team: Team, part: str, report: Report, folder: Path, device: str, quick: bool) -> None:
+def work(team: Communicator, part: str, report: Report, folder: Path, device: str, quick: bool) -> None:
     """What both processes do."""
     make: Callable[[int, int], Case] = partial(Case.of, device=device, **(SMALL_VIEWS if quick else {}))
     if part == "core":
@@ -287,7 +289,7 @@ def work(team: Team, part: str, report: Report, folder: Path, device: str, quick
 
 
 def worker(only: Sequence[str], output: Path, folder: Path, device: str, quick: bool) -> None:
-    with joined(device, print) as team, torch.no_grad():
+    with distributed_context(device, print) as team, torch.no_grad():
         for part in only:
             report = Report("scale")
             work(team, part, report, folder, device, quick)
@@ -299,7 +301,7 @@ def main(only: Sequence[str], output: Path, device: str, quick: bool, trained: P
     words = [sys.executable, "-m", "benchmarks.gpu_scale", "--device", device, "--output", str(output)]
     words += ["--quick"] * quick + ["--only", *(part for part in only if part != "command")]
     with tempfile.TemporaryDirectory() as name:
-        code = start([*words, "--folder", name], 2, print) if set(only) - {"command"} else 0
+        code = launch_processes([*words, "--folder", name], 2, print) if set(only) - {"command"} else 0
         if code == 0 and "command" in only:
             report = Report("scale")
             commands(report, trained.absolute(), Path(name), device, quick)

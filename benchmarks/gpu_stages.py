@@ -12,7 +12,7 @@ from torch._C._autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from normlift_ns import Evidence
-from normlift_ns.raster import triton
+from normlift_ns.rasterization import triton
 
 STAGES = (
     ("projection", triton, "project"),

@@ -28,24 +28,24 @@ from normlift_ns import Lifted, Neighbors, RefineConfig, lift, nearest_neighbors
 from normlift_ns.core import refine as voting
 from normlift_ns.kernels import nearest
 from normlift_ns.kernels import vote as kernel
-from normlift_ns.kernels.vote import Tuning
+from normlift_ns.kernels.vote import LaunchConfig
 
 PRECISIONS = ("tf32x3", "halves", "certified")
 TUNINGS = (
-    Tuning(64, 32, 3, 4, 128),
-    Tuning(64, 32, 3, 4),
-    Tuning(64, 32, 3, 4, 96),
-    Tuning(64, 64, 3, 4, 128),
-    Tuning(64, 32, 2, 4, 128),
-    Tuning(128, 32, 2, 4, 128),
-    Tuning(128, 64, 2, 4, 128),
-    Tuning(128, 32, 2, 4, 96),
-    Tuning(32, 32, 4, 4, 128),
-    Tuning(64, 32, 3, 2),
-    Tuning(32, 32, 3, 2),
-    Tuning(64, 32, 3, 1),
-    Tuning(64, 32, 3, 8),
-    Tuning(128, 64, 2, 8),
+    LaunchConfig(64, 32, 3, 4, 128),
+    LaunchConfig(64, 32, 3, 4),
+    LaunchConfig(64, 32, 3, 4, 96),
+    LaunchConfig(64, 64, 3, 4, 128),
+    LaunchConfig(64, 32, 2, 4, 128),
+    LaunchConfig(128, 32, 2, 4, 128),
+    LaunchConfig(128, 64, 2, 4, 128),
+    LaunchConfig(128, 32, 2, 4, 96),
+    LaunchConfig(32, 32, 4, 4, 128),
+    LaunchConfig(64, 32, 3, 2),
+    LaunchConfig(32, 32, 3, 2),
+    LaunchConfig(64, 32, 3, 1),
+    LaunchConfig(64, 32, 3, 8),
+    LaunchConfig(128, 64, 2, 8),
 )
 BLOCKS = (2**15, 2**16, 2**17, 2**18)
 GAMMAS = (0.1, 0.03, 0.01)
@@ -179,11 +179,11 @@ def variants(room: Room, most: int = 2**17) -> None:
     n = len(room.means)
     voters = voting.spatial_order(room.means)
     voters = voters[n // 3 : n // 3 + most]
-    gaussians = kernel.members(voters, room.neighbors.index, len(room.means))
+    gaussians = kernel.voters_and_neighbors(voters, room.neighbors.index, len(room.means))
     rows = room.lifted.directions(gaussians)
     row_of = torch.zeros(n, dtype=torch.int32, device=rows.device)
     row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=rows.device)
-    halved = kernel.halve(rows)
+    halved = kernel.split_float16(rows)
 
     def cast(config: RefineConfig, precision: Any) -> torch.Tensor:
         source = torch.full((n,), -1, dtype=torch.int32, device=rows.device)
@@ -231,7 +231,7 @@ def trees(room: Room) -> None:
     """Seconds of the tree and of all neighbours by the size of nodes that are sorted each for itself."""
     for most in SORTED:
         with replaced(nearest, "_SORTED_IN_A_BLOCK", most):
-            tree_s = timed(lambda: nearest.build_tree(room.means))[0]
+            tree_s = timed(lambda: nearest.build_kd_tree(room.means))[0]
             all_s, found = timed(lambda: nearest_neighbors(room.means, RefineConfig().k))
         same = all(torch.equal(a, b) for a, b in zip(found, room.neighbors))
         room.add(f"tree.sorted_{most}_s", tree_s, "s")

@@ -12,11 +12,10 @@ from torch import Tensor
 
 from benchmarks.hard_case import Case, Setting
 from normlift_ns import Evidence, Lifted, RefineConfig, lift, nearest_neighbors, refine
-from normlift_ns.core.lowrank import basis_of_rank, half_precision_error, spectral_table
-from normlift_ns.core.portions import ALONE, Portion
-from normlift_ns.core.query import strongest
+from normlift_ns.core.lowrank import basis_of_rank, half_precision_error, spectral_table, store_directions
+from normlift_ns.core.partition import SINGLE_PROCESS, Partition
+from normlift_ns.core.relevancy import best_prompt
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.core.storage import store_directions
 from tests.scenes import generator, unit_rows
 
 _GAPS = (1e-1, 1e-2, 1e-3, 1e-4)
@@ -181,7 +180,7 @@ def _cosine_errors(setting: Setting, table: Tensor, rank: int | None) -> tuple[T
     texts = torch.cat([unit_rows(40, d, 5), exact[:5], -exact[:5]])
     lifted = lift(evidence_of(weights, region_view).to(setting.device), table.to(setting.device))
     basis = None if rank is None else basis_of_rank(lifted, spectral_table(lifted.features), rank)
-    every = Portion(ALONE, torch.arange(n, device=setting.device))
+    every = Partition(SINGLE_PROCESS, torch.arange(n, device=setting.device))
     stored = store_directions(lifted, None if basis is None else basis.rows, every)
     assert stored is not None
     found = stored.products(texts.float().to(setting.device), lifted.scalars).cpu()
@@ -225,7 +224,7 @@ def vote_ties(setting: Setting) -> dict[str, float]:
         found = _sources(setting, points[index], axes[index], [[0.0, 0.5, 0.5][g] for g in index], 2)
         wrong += _wrong([x for x, g in zip(found, index) if g == 0], [x for x, g in zip(expected, index) if g == 0])
     equal = torch.full((2, 4), 0.25, device=setting.device)
-    return {"wrong": wrong + _wrong(strongest(equal, equal > 0).tolist(), [0, 0])}
+    return {"wrong": wrong + _wrong(best_prompt(equal, equal > 0).tolist(), [0, 0])}
 
 
 def vote_underflow(setting: Setting) -> dict[str, float]:

@@ -33,13 +33,12 @@ from benchmarks.worlds import Words, World, demo, real_words, tabletop
 from normlift_ns import nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import lift
-from normlift_ns.demo import demo_cameras, view_image
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import Grid, Superpixels
-from normlift_ns.encoders.source import RegionFeatures
-from normlift_ns.encoders.texts.colours import ColourTexts
-from normlift_ns.insight.histogram import Histogram, histogram, top_limit
-from normlift_ns.options import RefineConfig, Rule
+from normlift_ns.demo.capture import demo_cameras, view_image
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.color import ColorEncoder, ColorTextEncoder
+from normlift_ns.options import RefineConfig, RelevancyRule
+from normlift_ns.query.histogram import Histogram, presence_limit, relevancy_histogram
+from normlift_ns.segmentation.regions import Grid, Superpixels
 
 DAMAGES = ("mild", "hard")
 OTHERS, NEAR = 60, 0.9
@@ -79,7 +78,13 @@ STATISTICS = {
 
 
 def measure(
-    report: Report, name: str, present: np.ndarray, absent: np.ndarray, truth: np.ndarray, rule: Rule, encoder: str
+    report: Report,
+    name: str,
+    present: np.ndarray,
+    absent: np.ndarray,
+    truth: np.ndarray,
+    rule: RelevancyRule,
+    encoder: str,
 ) -> None:
     """Adds the rows of one rule.
 
@@ -87,10 +92,10 @@ def measure(
         present: relevancies [N, K] of the classes, of Gaussians with a direction; absent: [N, M] of other words.
         truth: [N] class, -1 where it is not known.
     """
-    limit, valid = top_limit(rule, encoder), np.ones(len(truth), bool)
+    limit, valid = presence_limit(rule, encoder), np.ones(len(truth), bool)
 
     def of(values: np.ndarray) -> list[Histogram]:
-        found = [histogram(x, valid, threshold=0.5, limit=limit) for x in values.T]
+        found = [relevancy_histogram(x, valid, threshold=0.5, limit=limit) for x in values.T]
         return [h for h in found if h is not None]
 
     there, elsewhere, known = of(present), of(absent), truth >= 0
@@ -148,12 +153,12 @@ def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:
     """Rows of the plain room, seen by the colour encoder."""
     from matplotlib.colors import XKCD_COLORS  # noqa: PLC0415 (the names)
 
-    room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColourTexts()
+    room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColorTextEncoder()
     names = [name.removeprefix("xkcd:") for name in XKCD_COLORS if "/" not in name]
     classes, survey = texts.text(room.names), texts.text(names)
     others = survey[(survey @ classes.T).amax(1) < NOT_A_COLOUR]
     for cut, regions in (("superpixels", Superpixels(256)), ("squares", Grid(192))):
-        source = RegionFeatures(regions, ColourEncoder())
+        source = RegionFeatures(regions, ColorEncoder())
         seen = [source.view(view_image(room, camera), f"{i}.png") for i, camera in enumerate(cameras)]
         counts = [len(view.features) for view in seen]
         evidence = rasterize_evidence(room.scene, cameras, [view.labels for view in seen], num_regions=counts)

@@ -27,18 +27,18 @@ from benchmarks.cpu import clip_like_table, grid_labels
 from benchmarks.panel import add_fox_panel
 from benchmarks.report import RESULTS, Report
 from benchmarks.view import add_fox_view
-from normlift_ns import Camera, SemanticField, asking, lift, rasterize_evidence
-from normlift_ns.core.query import relevancy
+from normlift_ns import Camera, SemanticField, lift, rasterize_evidence
+from normlift_ns.core.relevancy import relevancy
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
-from normlift_ns.nerfstudio_plugin.said import drawable, found_table, said
+from normlift_ns.nerfstudio_plugin.panel_view import prompt_table, status_mdx, visible_mask
 from normlift_ns.options import CANONICAL_NEGATIVES, Storage
-from normlift_ns.question import Question
+from normlift_ns.query import engine
+from normlift_ns.query.question import Query
+from normlift_ns.rendering.figures import make_display
 from normlift_ns.session import actions
-from normlift_ns.session.history import History
-from normlift_ns.session.prompts import prompts_of
-from normlift_ns.session.space import Space
-from normlift_ns.session.state import State
-from normlift_ns.viewer.display import make_display
+from normlift_ns.session.prompts import prompts_of_query
+from normlift_ns.session.selection import SelectionContext
+from normlift_ns.session.state import History, State
 
 REPEATS, CLASSES, SAMPLE = 20, 32, 20_000
 
@@ -56,13 +56,13 @@ def least(device: str, repeats: int, action: Callable[[], object]) -> float:
     return 1e3 * min(seconds[1:])
 
 
-def questions() -> Question:
+def questions() -> Query:
     """A prompt that a class of the features has, against four others."""
     names = np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float32)
-    return Question(("thing",), names[:1], CANONICAL_NEGATIVES, names[10:14], "lerf")
+    return Query(("thing",), names[:1], CANONICAL_NEGATIVES, names[10:14], "lerf")
 
 
-def true_relevancy(exact_directions: torch.Tensor, question: Question) -> torch.Tensor:
+def true_relevancy(exact_directions: torch.Tensor, question: Query) -> torch.Tensor:
     """[M, 1] in float64, from directions in float64."""
     positive, negative = (
         exact_directions @ torch.nn.functional.normalize(torch.from_numpy(vectors).to(exact_directions), dim=1).T
@@ -106,27 +106,34 @@ def measure(
     device, question = model.device.type, questions()
     model.attach(field)
     means = model.means.detach()
-    answer = asking.answer(field, means, question)
+    answer = engine.run_query(field, means, question)
     error = (answer.relevancy[some].double() - exact).abs().max()
 
     def posed() -> State:
-        return actions.ask(State(Space(field, means)), prompts_of(question), question)  # nothing is remembered
+        return actions.ask(
+            State(SelectionContext(field, means)), prompts_of_query(question), question
+        )  # nothing is remembered
 
     def told(state: State) -> None:
-        said(state, "", "", drawn)
-        found_table(state)
+        status_mdx(state, "", "", drawn)
+        prompt_table(state)
 
     def whole() -> None:
         state = posed()
         cast(Any, model.normlift)._show(History.of(state))
         told(state)
 
-    drawn, state = drawable(model.splats()[0]["opacities"]), posed()
+    drawn, state = visible_mask(model.splats()[0]["opacities"]), posed()
     told(state)
     report.add(
-        f"fox_{name}_relevancy_ms", least(device, repeats, lambda: asking.answer(field, means, question)), "ms", error
+        f"fox_{name}_relevancy_ms",
+        least(device, repeats, lambda: engine.run_query(field, means, question)),
+        "ms",
+        error,
     )
-    report.add(f"fox_{name}_threshold_ms", least(device, repeats, lambda: asking.reselect(answer, 0.55, 0.1)), "ms")
+    report.add(
+        f"fox_{name}_threshold_ms", least(device, repeats, lambda: engine.apply_threshold(answer, 0.55, 0.1)), "ms"
+    )
     report.add(f"fox_{name}_display_ms", least(device, repeats, lambda: make_display(field, answer)), "ms")
     report.add(f"fox_{name}_status_ms", least(device, repeats, lambda: told(state)), "ms")
     report.add(f"fox_{name}_answer_ms", least(device, repeats, whole), "ms", error)

@@ -13,8 +13,17 @@ import torch
 from numpy.typing import NDArray
 
 from normlift_ns import Camera, GaussianScene
-from normlift_ns.demo import DemoRoom
-from normlift_ns.demo.shapes import ON_SURFACE, Array, Distance, cover, length, points_near, projected, union
+from normlift_ns.demo.room import DemoRoom
+from normlift_ns.demo.shapes import (
+    ON_SURFACE,
+    Array,
+    Distance,
+    fit_surfels,
+    project_to_surface,
+    row_lengths,
+    sample_near_surface,
+    union,
+)
 
 POINTS_PER_GAUSSIAN = 12
 STRAYS, FLOATERS = 0.08, 0.03
@@ -53,7 +62,7 @@ def built(plan: Plan, num_gaussians: int) -> DemoRoom:
     half = np.array([plan.length, plan.width]) / 2
     floating = rng.uniform((-half[0], -half[1], 0.1), (half[0], half[1], plan.height), (floaters, 3))
     turned = rng.normal(size=(floaters, 3))
-    turned /= length(turned)[:, None]
+    turned /= row_lengths(turned)[:, None]
     means = np.concatenate([means, beside, floating])
     normals = np.concatenate([normals, normals[chosen], turned])
     scales = np.concatenate([scales, scales[chosen], rng.uniform(0.006, 0.05, (floaters, 3))])
@@ -63,7 +72,7 @@ def built(plan: Plan, num_gaussians: int) -> DemoRoom:
     labels = np.concatenate([labels, of_stray, np.full(floaters, -1)])
     upper = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)
-    quats /= length(quats)[:, None]
+    quats /= row_lengths(quats)[:, None]
     scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
     names = tuple(name for name, *_ in all_parts)
     return DemoRoom(scene, torch.from_numpy(colors).float(), torch.from_numpy(labels), names)
@@ -76,15 +85,15 @@ def _surface(plan: Plan, count: int, rng: np.random.Generator) -> tuple[Array, A
     area = 2 * plan.height * sides.sum() + 4 * sides.prod() + 60  # about, each part times its density
     samples = []
     for i, (_, _, dense, shape) in enumerate(all_parts):
-        near = points_near(shape, low, high, POINTS_PER_GAUSSIAN * count * dense / area, rng)
-        points = projected(shape, near, low, high)
+        near = sample_near_surface(shape, low, high, POINTS_PER_GAUSSIAN * count * dense / area, rng)
+        points = project_to_surface(shape, near, low, high)
         others = union(*(other for j, (*_, other) in enumerate(all_parts) if j != i))
         samples.append(points[others(points) > ON_SURFACE])
     bounds = np.cumsum([len(points) for points in samples])
     counts = np.diff(np.rint(bounds / bounds[-1] * count).astype(int), prepend=0)
     with np.errstate(invalid="ignore"):  # both sides of a thin board in one patch
         covers = [
-            cover(shape, points, rng.choice(len(points), n, replace=False))
+            fit_surfels(shape, points, rng.choice(len(points), n, replace=False))
             for (*_, shape), points, n in zip(all_parts, samples, counts)
         ]
     means, normals, radii, thickness = (np.concatenate(values) for values in zip(*covers))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from benchmarks.captures import SHARED
 from normlift_ns import open_scene
-from normlift_ns.scenes.match import focal_psnrs
+from normlift_ns.data.alignment import focal_psnrs
 
 FACTORS = (1.0, 1.01, 1.02, 1.05)
 

@@ -57,7 +57,7 @@ def run(
         environment: what is added to that of this process.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), *_paths()]), **environment}
-    program = program or f"from normlift_ns.scripts.{command} import main; main()"
+    program = program or f"from normlift_ns.cli.{command} import main; main()"
     words = [sys.executable, "-P", "-c", program] if sys.version_info >= (3, 11) else [sys.executable, "-c", program]
     with tempfile.TemporaryFile() as log:
         start = time.perf_counter()
@@ -99,7 +99,7 @@ def spread(values: list[float]) -> float:
 def demo(folder: Path, gaussians: int) -> Path:
     """config.yml of a trained plain room."""
     from benchmarks.plain_room import plain_room  # noqa: PLC0415 (nerfstudio)
-    from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415 (nerfstudio)
+    from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415 (nerfstudio)
 
     room = plain_room(gaussians)
     write_capture(room, folder / "room", views=12, held_out=2, width=320, height=240)

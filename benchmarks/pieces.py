@@ -26,8 +26,8 @@ from benchmarks.features import (
 )
 from benchmarks.worlds import Words, World
 from normlift_ns import Evidence, rasterize_evidence
-from normlift_ns.encoders.patches import patch_grid
-from normlift_ns.encoders.regions import Grid, Superpixels, resample_nearest
+from normlift_ns.encoders.base import patch_grid
+from normlift_ns.segmentation.regions import Grid, Superpixels, resample_nearest
 
 KINDS = ("superpixels", "grid", "patches")
 COUNT = {"superpixels": 256, "grid": 256, "patches": 1024}

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from normlift_ns.demo.build import HALF_WIDTH, HEIGHT, DemoRoom, Part, Surface, built
-from normlift_ns.demo.light import contact, visibility
-from normlift_ns.demo.shapes import Array, box, capsule, cavity, cone, length, place, sphere, torus, union
+from normlift_ns.demo.room import HALF_WIDTH, HEIGHT, DemoRoom, Part, Surface, build_room, contact_shadow, visibility
+from normlift_ns.demo.shapes import Array, box, capsule, cavity, cone, place, row_lengths, sphere, torus, union
 
 _LAMP = np.array([0.5, -0.7, 2.6])
 _EXPOSURE = 0.7
@@ -67,7 +66,7 @@ def plain_room(num_gaussians: int = 40_000, seed: int = 0) -> DemoRoom:
     Raises:
         ValueError: too few Gaussians.
     """
-    return built(_parts(), _painted, _DETAILED_AREA, num_gaussians, seed)
+    return build_room(_parts(), _painted, _DETAILED_AREA, num_gaussians, seed)
 
 
 def _painted(parts: Sequence[Part], surface: Surface, rng: np.random.Generator) -> Array:
@@ -87,11 +86,11 @@ def _shade(parts: Sequence[Part], points: Array, normals: Array) -> tuple[Array,
     """Brightness [n], 0.4 (a dark corner) to 1.03, and gloss [n], at most 0.12: color * brightness + gloss."""
     scene = union(*(part.shape for part in parts))
     to_lamp = _LAMP - points
-    distance = length(to_lamp)
+    distance = row_lengths(to_lamp)
     to_lamp /= distance[:, None]
     lit = visibility(scene, points + 0.01 * normals, to_lamp, distance)
     facing = (normals * to_lamp).sum(axis=1)
-    brightness = (0.78 + 0.05 * facing) * (1 - contact(scene, points, normals)) + 0.2 * facing.clip(0) * lit
+    brightness = (0.78 + 0.05 * facing) * (1 - contact_shadow(scene, points, normals)) + 0.2 * facing.clip(0) * lit
     halfway = to_lamp + np.array([0, 0, 1])
-    halfway /= length(halfway)[:, None]
+    halfway /= row_lengths(halfway)[:, None]
     return brightness, 0.12 * lit * (normals * halfway).sum(axis=1).clip(0) ** 32

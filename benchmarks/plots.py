@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.documents import PRESETS, TITLES, Document, Documents, steps
 from benchmarks.signals import STEP
-from normlift_ns.evaluation.plots import plot_signals, plot_sweeps
-from normlift_ns.evaluation.votes import default_of
+from normlift_ns.evaluation.studies import default_value, plot_signals, plot_sweeps
 
 DOCS = Path(__file__).parents[1] / "docs"
 FLOOR = 1e-4
@@ -26,7 +25,7 @@ def plots(found: Documents, folder: Path) -> Iterator[Path]:
     yield plot_drift(signals, folder / "drift.svg")
     curves = ((key.split(".", 2)[1:], value) for key, value in fit.values.items() if key.startswith("curve."))
     rows = [
-        {"parameter": name, "value": float(at), "miou": value, "default": float(at) == default_of(name, "paper")}
+        {"parameter": name, "value": float(at), "miou": value, "default": float(at) == default_value(name, "paper")}
         for (name, at), value in curves
     ]
     plot_sweeps(rows, "miou", "mIoU on held-out damage, points", folder / "sensitivity.svg", overwrite=True)

@@ -24,7 +24,7 @@ from benchmarks.captures import SHARED
 from benchmarks.gpu_cases import Case, capture_case, timed
 from benchmarks.report import RESULTS, Report
 from normlift_ns import Camera, RefineConfig, SemanticField, lift, nearest_neighbors, refine
-from normlift_ns.core.portions import spatial_order
+from normlift_ns.core.partition import spatial_order
 from normlift_ns.core.refine import decay_width
 from normlift_ns.kernels.vote import vote
 

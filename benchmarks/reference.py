@@ -15,16 +15,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import docstring_parser
 
-from normlift_ns.ranges import RANGES
-from normlift_ns.scripts.batch import NormLiftBatch
-from normlift_ns.scripts.check import NormLiftCheck
-from normlift_ns.scripts.evaluate import NormLiftEval
-from normlift_ns.scripts.export import NormLiftExport
-from normlift_ns.scripts.lift import NormLift
-from normlift_ns.scripts.query import NormLiftQuery
-from normlift_ns.scripts.shared import summary
-from normlift_ns.scripts.terminal import FLAGS
-from normlift_ns.scripts.view import NormLiftView
+from normlift_ns.cli.batch import NormLiftBatch
+from normlift_ns.cli.check import NormLiftCheck
+from normlift_ns.cli.common import OUTPUT_FLAGS_HELP, first_paragraph
+from normlift_ns.cli.evaluate import NormLiftEval
+from normlift_ns.cli.export import NormLiftExport
+from normlift_ns.cli.lift import NormLift
+from normlift_ns.cli.query import NormLiftQuery
+from normlift_ns.cli.view import NormLiftView
+from normlift_ns.options import OPTION_RANGES
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 COMMANDS: dict[str, type] = {
@@ -53,7 +52,9 @@ _KINDS = {Path: "a path", str: "a text", bool: "`True`, `False`"}
 
 def page() -> str:
     """The whole page."""
-    return HEAD.format(flags=_text(FLAGS)) + "".join(section(name, command) for name, command in COMMANDS.items())
+    return HEAD.format(flags=_text(OUTPUT_FLAGS_HELP)) + "".join(
+        section(name, command) for name, command in COMMANDS.items()
+    )
 
 
 def section(name: str, command: type) -> str:
@@ -63,7 +64,7 @@ def section(name: str, command: type) -> str:
     fields = [f for f in dataclasses.fields(command) if not (inherits and f.name in inherited)]
     hints = get_type_hints(command, include_extras=True)
     groups = [f.name for f in fields if dataclasses.is_dataclass(_bare(hints[f.name]))]
-    told = f"\n## {name}\n\n{_text(summary(command))}\n"
+    told = f"\n## {name}\n\n{_text(first_paragraph(command))}\n"
     if inherits:
         told += "\nIt takes all options of [ns-normlift](#ns-normlift), and this one:\n"
     told += _TABLE + "".join(_rows(command, [f.name for f in fields if f.name not in groups]))
@@ -75,7 +76,7 @@ def _group(command: str, options: Any) -> str:
     hints = get_type_hints(options, include_extras=True)
     names = [field.name for field in dataclasses.fields(options)]
     inner = [name for name in names if dataclasses.is_dataclass(_bare(hints[name]))]
-    told = f"\n### {command}: {title}\n\n{_text(summary(options))}\n" + _TABLE
+    told = f"\n### {command}: {title}\n\n{_text(first_paragraph(options))}\n" + _TABLE
     told += "".join(_rows(options, [name for name in names if name not in inner]))
     return told + "".join(_group(command, _bare(hints[name])) for name in inner)
 
@@ -124,7 +125,7 @@ def _values(name: str, hint: Any) -> str:
         inner = _values(name, parts[0])
         return {"a text": "texts", "a path": "paths"}.get(inner, f"any of {inner}")
     if hint in (int, float):
-        words = RANGES[name].words
+        words = OPTION_RANGES[name].words
         return words if words.startswith("a ") else f"a {'whole ' if hint is int else ''}number, {words}"
     return _KINDS[hint]
 

@@ -25,10 +25,9 @@ from torch.nn import Conv2d, ConvTranspose2d, Embedding, Linear
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits
 
 from benchmarks.report import RESULTS, Report
-from normlift_ns.encoders.sam.masks import LEVELS, Level, MaskRules, SamMasks, crop_boxes, point_grid
-from normlift_ns.encoders.sam.network import SamNetwork
-from normlift_ns.encoders.sam.rules import Suppression, stack_masks
 from normlift_ns.options import SamPrecision
+from normlift_ns.segmentation.mask_filtering import Suppression, stack_masks
+from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamLevel, SamMasks, SamNetwork, crop_boxes, point_grid
 
 PRECISIONS: tuple[SamPrecision, ...] = ("float16", "bfloat16")
 NOISE = 6.0
@@ -199,7 +198,7 @@ class Cut(NamedTuple):
 
     raw: Tensor
     """[K, y, x], masks of all prompts on the whole picture."""
-    levels: dict[Level, Tensor]
+    levels: dict[SamLevel, Tensor]
     """What survives the rules."""
 
 
@@ -230,7 +229,7 @@ def compare(found: Cut, exact: Cut, made: Pictures, which: int) -> dict[str, flo
     """Of one picture."""
     both, either = (op(found.raw, exact.raw).flatten(1).sum(dim=1) for op in (torch.logical_and, torch.logical_or))
     changed, every = 0, 0
-    for level in LEVELS:
+    for level in SAM_LEVELS:
         here, there = found.levels[level], exact.levels[level]
         every += len(here) + len(there)
         if len(here) == 0 or len(there) == 0:

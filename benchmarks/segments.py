@@ -40,8 +40,8 @@ from benchmarks.second_room import second
 from benchmarks.third_room import third
 from benchmarks.worlds import World, demo
 from normlift_ns import Camera, GaussianScene
-from normlift_ns.raster.rasterize import render
-from normlift_ns.segmenting import SHARE, MaskEvidence, mask_evidence
+from normlift_ns.query.sam3_query import MIN_MASK_FRACTION, MaskEvidence, mask_evidence
+from normlift_ns.rasterization.rasterize import render
 
 SEEDS = tuple(range(8))
 WIDER = 3
@@ -151,7 +151,7 @@ def by_votes(held: Tensor, total: Tensor) -> Tensor:
 
 def by_sum(held: Tensor, total: Tensor) -> Tensor:
     """More than half of a Gaussian's weight in all views is in the masks."""
-    return share(*(part.sum(0, dtype=torch.float64) for part in (held, total))) > SHARE
+    return share(*(part.sum(0, dtype=torch.float64) for part in (held, total))) > MIN_MASK_FRACTION
 
 
 def by_sum_where_found(held: Tensor, total: Tensor) -> Tensor:
@@ -162,7 +162,7 @@ def by_sum_where_found(held: Tensor, total: Tensor) -> Tensor:
 
 def by_majority(held: Tensor, total: Tensor) -> Tensor:
     """Hard majority: more than half of the views that see a Gaussian have more than half of it in their mask."""
-    return 2 * (share(held, total) > SHARE).sum(0) > (total > 0).sum(0)
+    return 2 * (share(held, total) > MIN_MASK_FRACTION).sum(0) > (total > 0).sum(0)
 
 
 RULES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -204,7 +204,7 @@ def measure(place: Place, damage: Damage, seed: int) -> tuple[dict[str, np.ndarr
         near = held.any(0).nonzero()[:, 0]  # no rule selects a Gaussian that no mask touches
         held, total = held[:, near], place.total[:, near]
         chosen = torch.stack([rule(held, total) for rule in RULES.values()])
-        alone = (share(held, total) > SHARE)[place.appears[text]]
+        alone = (share(held, total) > MIN_MASK_FRACTION)[place.appears[text]]
         found = ious(torch.cat([chosen, alone]), truth[near], of_all[near], float(truth.sum()))
         single = found[len(RULES) :]
         values = dict(zip(RULES, found))
@@ -222,7 +222,7 @@ def in_own_views(place: Place, selected: Sequence[Tensor]) -> list[tuple[float, 
     whose = [place.damaged(Damage(), seed) for seed in range(len(selected))]
     for view, (labels, camera) in enumerate(zip(place.maps, place.cameras)):
         values, alpha = render(place.scene, camera, torch.cat(list(selected)).T.float())
-        pictures = (values > SHARE * alpha[..., None]).unflatten(2, (len(selected), -1))
+        pictures = (values > MIN_MASK_FRACTION * alpha[..., None]).unflatten(2, (len(selected), -1))
         for seed in range(len(selected)):
             for text in place.appears[:, view].nonzero()[:, 0].tolist():
                 exact, picture = labels == text, pictures[:, :, seed, text]

@@ -27,9 +27,8 @@ from benchmarks.report import RESULTS, Report
 from benchmarks.variants import lifted_scores, refined_scores
 from benchmarks.worlds import Words, World
 from normlift_ns import RefineConfig, lift, nearest_neighbors
-from normlift_ns.core.ablations import Variant
 from normlift_ns.core.metrics import classify
-from normlift_ns.evaluation.signals import SceneSignals, signals
+from normlift_ns.evaluation.studies import SceneSignals, Variant, signal_statistics
 
 STEP = "hard"
 """Step of the ladder whose signals are shown."""
@@ -54,7 +53,7 @@ def evidence_table(world: World, words: Words, report: Report) -> None:
             if step == STEP:
                 voted = refined_scores("paper", world.scene.means, lifted, scores, neighbors)
                 answers = {"unrefined": answer, "refined": classify(voted.cosine, voted.valid)}
-                shown = signals(SceneSignals(lifted.scalars, world.scene.opacities, world.truth, answers))
+                shown = signal_statistics(SceneSignals(lifted.scalars, world.scene.opacities, world.truth, answers))
             found.append(shown | mistakes(lifted.scalars.reliability, world.truth, answer))
         for key in found[0]:
             report.add(f"{world.name}.{step}.{key}", float(np.mean([one[key] for one in found])), "of 1")

@@ -19,7 +19,7 @@ from benchmarks.second_room import second
 from benchmarks.third_room import third
 from benchmarks.worlds import Words, World, demo, made_words, real_words, tabletop, with_floaters
 from normlift_ns import Evidence, lift, nearest_neighbors
-from normlift_ns.core.consensus import agreed, region_overlaps, sampled_gaussians, seen_weights
+from normlift_ns.core.consensus import apply_consensus, region_overlaps, sample_gaussians, total_view_weights
 
 NEIGHBORS = 36
 SAMPLE = 50
@@ -108,7 +108,7 @@ class Site:
         tables = agreed_tables(observed.evidence, observed.features, [p for p in by_table if p is not None])
         found: dict[str, Result] = {}
         seen = lift(observed.evidence, observed.features)
-        for power, some in by_table.items():  # R as regions were seen, as `normlift_ns.lifting` has it
+        for power, some in by_table.items():  # R as regions were seen, as `normlift_ns.pipeline` has it
             lifted = seen if power is None else replace(lift(observed.evidence, tables[power]), scalars=seen.scalars)
             found |= results(some, lifted, self.voters, classes.to(observed.features.device))
         return {one.name: found[one.name] for one in candidates}
@@ -118,10 +118,10 @@ def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float])
     """F' of every power; the overlaps of regions are computed once."""
     if len(powers) == 0:
         return {}
-    chosen, chance = sampled_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
-    rows, total = evidence.rows.select_rows(chosen), seen_weights(evidence, chosen)
+    chosen, chance = sample_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
+    rows, total = evidence.rows.select_rows(chosen), total_view_weights(evidence, chosen)
     overlaps = region_overlaps(rows, evidence.region_view, chance, total)
-    return {power: agreed(features, overlaps, power) for power in powers}
+    return {power: apply_consensus(features, overlaps, power) for power in powers}
 
 
 @lru_cache(maxsize=1)

@@ -16,9 +16,9 @@ from torch import Tensor
 from benchmarks.damage import Observed
 from benchmarks.worlds import World
 from normlift_ns import Evidence, Lifted, Neighbors, RefineConfig, rasterize_evidence
-from normlift_ns.core.ablations import Variant, variant_config, variant_reliability, variant_source
 from normlift_ns.core.refine import decay_width, voting_weights
 from normlift_ns.evaluation import baselines
+from normlift_ns.evaluation.studies import Variant, variant_config, variant_reliability, variant_source
 
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
@@ -82,7 +82,7 @@ def _average(reliability: Tensor, scores: Scores, neighbors: Neighbors, config: 
 
 def centre_evidence(world: World) -> Evidence:
     """The idea of Occam's LGS on the cells of a world."""
-    return baselines.centre_evidence(world.scene.means, world.cameras, list(world.cells.of_pixel), world.evidence)
+    return baselines.center_evidence(world.scene.means, world.cameras, list(world.cells.of_pixel), world.evidence)
 
 
 def top_evidence(world: World, top: int = baselines.TOP) -> Evidence:

@@ -29,12 +29,12 @@ from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.captures import SHARED
 from benchmarks.report import RESULTS, Report
-from normlift_ns.viewer.records import BYTES
+from normlift_ns.viewer.shared import BYTES
 
 PATIENCE = 180
 """Seconds."""
 COLOURS = ("orange", "crimson", "teal", "purple", "dark green", "sky blue", "yellow", "brown", "grey")
-_PROGRAM = "from normlift_ns.scripts.view import main; main()"
+_PROGRAM = "from normlift_ns.cli.view import main; main()"
 _FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 _CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "fov": 1.0, "aspect": 1.0,
@@ -183,8 +183,8 @@ def add_view(report: Report, config: Path, prompts: Sequence[str] = COLOURS, *, 
 
 def fox_run(folder: Path) -> Path:
     """config.yml of the fox capture, lifted from some of its views at half their size, by colours."""
+    from normlift_ns.cli.lift import NormLift  # noqa: PLC0415
     from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
-    from normlift_ns.scripts.lift import NormLift  # noqa: PLC0415
 
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     options, colour = LiftOptions(max_views=12, lift_downscale=2), SourceOptions(encoder="colour")

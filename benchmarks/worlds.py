@@ -23,8 +23,9 @@ from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
 from normlift_ns.core.evidence import MASKED
 from normlift_ns.core.metrics import NO_CLASS
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.demo import DemoRoom, demo_cameras, held_out_cameras, view_labels
-from normlift_ns.encoders.source import joint_partition
+from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_labels
+from normlift_ns.demo.room import DemoRoom
+from normlift_ns.encoders.base import joint_partition
 
 BLOCKS = 40
 """Blocks across an image."""

@@ -7,9 +7,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from normlift_ns.asking import Answer as Answer
-    from normlift_ns.asking import Finding as Finding
-    from normlift_ns.core.ablations import refine_variant as refine_variant
+    from normlift_ns.analysis.explain import Why as Why
+    from normlift_ns.analysis.objects import Floaters as Floaters
+    from normlift_ns.api import lift_run as lift_run
+    from normlift_ns.api import open_run as open_run
+    from normlift_ns.api import open_scene as open_scene
     from normlift_ns.core.consensus import Consensus as Consensus
     from normlift_ns.core.consensus import consensus as consensus
     from normlift_ns.core.evidence import Evidence as Evidence
@@ -21,20 +23,16 @@ if TYPE_CHECKING:
     from normlift_ns.core.lift import lift as lift
     from normlift_ns.core.neighbors import Neighbors as Neighbors
     from normlift_ns.core.neighbors import nearest_neighbors as nearest_neighbors
-    from normlift_ns.core.query import relevancy as relevancy
     from normlift_ns.core.refine import refine as refine
     from normlift_ns.core.refine import unsupported as unsupported
+    from normlift_ns.core.relevancy import relevancy as relevancy
     from normlift_ns.core.scene import Scene as Scene
     from normlift_ns.core.scene import View as View
+    from normlift_ns.data.open_splat import open_splat as open_splat
     from normlift_ns.errors import InputError as InputError
-    from normlift_ns.evaluation.coverage.study import Coverage as Coverage
-    from normlift_ns.evaluation.coverage.study import coverage as coverage
-    from normlift_ns.front_door import lift_run as lift_run
-    from normlift_ns.front_door import open_run as open_run
-    from normlift_ns.front_door import open_scene as open_scene
-    from normlift_ns.insight.floaters import Floaters as Floaters
-    from normlift_ns.insight.histogram import Histogram as Histogram
-    from normlift_ns.insight.why import Why as Why
+    from normlift_ns.evaluation.coverage import Coverage as Coverage
+    from normlift_ns.evaluation.coverage import coverage as coverage
+    from normlift_ns.evaluation.studies import refine_variant as refine_variant
     from normlift_ns.lifted_run import LiftedRun as LiftedRun
     from normlift_ns.options import BACKGROUND_WORDS as BACKGROUND_WORDS
     from normlift_ns.options import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
@@ -42,35 +40,63 @@ if TYPE_CHECKING:
     from normlift_ns.options import RefineConfig as RefineConfig
     from normlift_ns.options import SourceOptions as SourceOptions
     from normlift_ns.options import SplatOptions as SplatOptions
-    from normlift_ns.raster.contributors import Contributors as Contributors
-    from normlift_ns.raster.contributors import contributors as contributors
-    from normlift_ns.raster.rasterize import rasterize_evidence as rasterize_evidence
-    from normlift_ns.raster.rasterize import render as render
-    from normlift_ns.raster.settings import RasterSettings as RasterSettings
-    from normlift_ns.scenes.opening import open_splat as open_splat
+    from normlift_ns.query.engine import Answer as Answer
+    from normlift_ns.query.engine import Finding as Finding
+    from normlift_ns.query.histogram import Histogram as Histogram
+    from normlift_ns.rasterization.rasterize import Contributors as Contributors
+    from normlift_ns.rasterization.rasterize import contributors as contributors
+    from normlift_ns.rasterization.rasterize import rasterize_evidence as rasterize_evidence
+    from normlift_ns.rasterization.rasterize import render as render
+    from normlift_ns.rasterization.settings import RasterSettings as RasterSettings
+
 
 __version__ = "0.2.0"
 
 _HOMES = {
-    "asking": ("Answer", "Finding"),
-    "core.ablations": ("refine_variant",),
-    "core.consensus": ("Consensus", "consensus"),
-    "core.evidence": ("Evidence",),
-    "core.field": ("SemanticField",),
-    "core.gaussians": ("Camera", "GaussianScene"),
-    "core.lift": ("Lifted", "Scalars", "lift"),
-    "core.neighbors": ("Neighbors", "nearest_neighbors"),
-    "core.query": ("relevancy",),
-    "core.refine": ("refine", "unsupported"),
-    "core.scene": ("Scene", "View"),
-    "errors": ("InputError",),
-    "evaluation.coverage.study": ("Coverage", "coverage"),
-    "front_door": ("lift_run", "open_run", "open_scene"),
-    "insight.floaters": ("Floaters",),
-    "insight.histogram": ("Histogram",),
-    "insight.why": ("Why",),
-    "lifted_run": ("LiftedRun",),
-    "options": (
+    "normlift_ns.analysis.explain": ("Why",),
+    "normlift_ns.analysis.objects": ("Floaters",),
+    "normlift_ns.api": (
+        "lift_run",
+        "open_run",
+        "open_scene",
+    ),
+    "normlift_ns.core.consensus": (
+        "Consensus",
+        "consensus",
+    ),
+    "normlift_ns.core.evidence": ("Evidence",),
+    "normlift_ns.core.field": ("SemanticField",),
+    "normlift_ns.core.gaussians": (
+        "Camera",
+        "GaussianScene",
+    ),
+    "normlift_ns.core.lift": (
+        "Lifted",
+        "Scalars",
+        "lift",
+    ),
+    "normlift_ns.core.neighbors": (
+        "Neighbors",
+        "nearest_neighbors",
+    ),
+    "normlift_ns.core.refine": (
+        "refine",
+        "unsupported",
+    ),
+    "normlift_ns.core.relevancy": ("relevancy",),
+    "normlift_ns.core.scene": (
+        "Scene",
+        "View",
+    ),
+    "normlift_ns.data.open_splat": ("open_splat",),
+    "normlift_ns.errors": ("InputError",),
+    "normlift_ns.evaluation.coverage": (
+        "Coverage",
+        "coverage",
+    ),
+    "normlift_ns.evaluation.studies": ("refine_variant",),
+    "normlift_ns.lifted_run": ("LiftedRun",),
+    "normlift_ns.options": (
         "BACKGROUND_WORDS",
         "CANONICAL_NEGATIVES",
         "LiftOptions",
@@ -78,10 +104,18 @@ _HOMES = {
         "SourceOptions",
         "SplatOptions",
     ),
-    "raster.contributors": ("Contributors", "contributors"),
-    "raster.rasterize": ("rasterize_evidence", "render"),
-    "raster.settings": ("RasterSettings",),
-    "scenes.opening": ("open_splat",),
+    "normlift_ns.query.engine": (
+        "Answer",
+        "Finding",
+    ),
+    "normlift_ns.query.histogram": ("Histogram",),
+    "normlift_ns.rasterization.rasterize": (
+        "Contributors",
+        "contributors",
+        "rasterize_evidence",
+        "render",
+    ),
+    "normlift_ns.rasterization.settings": ("RasterSettings",),
 }
 """Public names by the module that defines them."""
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
@@ -92,7 +126,7 @@ __all__ = list(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'normlift_ns' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"normlift_ns.{_HOME[name]}"), name)
+    value = globals()[name] = getattr(import_module(_HOME[name]), name)
     return value
 
 

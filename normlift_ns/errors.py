@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import secrets
+import sys
+import tempfile
+import time
+import traceback
+from contextlib import suppress
+from pathlib import Path
+
 
 class InputError(ValueError):
     """Error for an invalid file or argument.
@@ -22,14 +32,14 @@ class OutputError(Exception):
     """Failed write to standard output. Not an OSError, which loaders would attribute to the file that they read."""
 
 
-def visible(text: str, keep: str = "") -> str:
+def escape_unprintable(text: str, keep: str = "") -> str:
     r"""Escape unprintable characters, which could move the cursor, hide text or reverse it.
 
     Args:
         text: Text from outside, such as a prompt or a path.
         keep: Unprintable characters to keep, for example a line break.
 
-    >>> print(visible("red\x1b[31m mug\n"))
+    >>> print(escape_unprintable("red\x1b[31m mug\n"))
     red\x1b[31m mug\n
     """
     return "".join(
@@ -37,10 +47,95 @@ def visible(text: str, keep: str = "") -> str:
     )
 
 
-def shortened(text: str, most: int = 40) -> str:
+def truncate_text(text: str, most: int = 40) -> str:
     """Cut a text to at most `most` characters.
 
-    >>> shortened("a red bowl", 8)
+    >>> truncate_text("a red bowl", 8)
     'a red b…'
     """
     return text if len(text) <= most else text[: most - 1] + "…"
+
+
+# User-facing messages and exit codes of exceptions; internal errors also get a log file.
+
+
+EXIT_USER_ERROR, EXIT_INTERNAL_ERROR = 1, 70
+"""Exit codes of user errors and internal errors; 70 is EX_SOFTWARE of sysexits.h."""
+_MAX_LINE = 300
+"""Largest number of characters of a foreign message."""
+
+
+def describe_error(error: BaseException) -> tuple[str, int]:
+    """Return the message for the user and the exit code of a command that fails with this error.
+
+    Unexpected errors also get a log file with their traceback.
+
+    >>> describe_error(InputError("beta must be positive, got -1"))
+    ('beta must be positive, got -1', 1)
+    """
+    if isinstance(error, InputError):
+        return str(error), EXIT_USER_ERROR
+    if isinstance(error, OSError):
+        named = error.filename is not None and error.strerror is not None
+        return (f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)), EXIT_USER_ERROR
+    if isinstance(error, MemoryError):
+        return str(
+            error
+        ) or "the memory is full; lift fewer or smaller views: --max-views, --lift-downscale", EXIT_USER_ERROR
+    if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
+        return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu", EXIT_USER_ERROR
+    if isinstance(error, RuntimeError) and "Numpy is not available" in str(error):
+        return (
+            "this torch was built for NumPy 1, but NumPy 2 is installed; type: pip install 'numpy<2'",
+            EXIT_USER_ERROR,
+        )
+    return _report_bug(error), EXIT_INTERNAL_ERROR
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).strip().splitlines()), "")[:_MAX_LINE]
+
+
+def _report_bug(error: BaseException) -> str:
+    """Log the traceback, or print it if no log file can be written; return the message for the user."""
+    summary = f"{type(error).__name__}: {_first_line(error)}".removesuffix(": ")
+    log = log_traceback(error)
+    if log is None:
+        traceback.print_exception(error)
+    location = "printed above" if log is None else f"in {log}"
+    return (
+        f"This is a bug in normlift_ns: {summary}. The details are {location}; please include them in a report to the "
+        "project's issue tracker."
+    )
+
+
+def log_traceback(error: BaseException) -> Path | None:
+    """Write a traceback to a new file that only the user can read; return None if no folder is writable."""
+    text = "".join(traceback.format_exception(error))
+    header = f"Python {platform.python_version()}, {platform.platform()}\n{escape_unprintable(' '.join(sys.argv))}\n\n"
+    name = f"{time.strftime('%Y-%m-%d_%H%M%S')}_{os.getpid()}_{secrets.token_hex(4)}.log"
+    for folder in _log_folders():
+        with suppress(OSError, ValueError):
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / name
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "w", encoding="utf8", errors="backslashreplace") as file:
+                file.write(header + text)
+            return path
+    return None
+
+
+def _log_folders() -> list[Path]:
+    """Return possible folders of log files in order of preference."""
+    folders = [folder] if (folder := user_state_folder()) is not None else []
+    with suppress(OSError):  # no folder for temporary files
+        folders.append(Path(tempfile.gettempdir()))
+    return folders
+
+
+def user_state_folder() -> Path | None:
+    """Return the user's folder for program state, which may not exist yet; None for users without a home folder."""
+    state = Path(os.environ.get("XDG_STATE_HOME", ""))
+    with suppress(RuntimeError):
+        return (state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns"
+    return None

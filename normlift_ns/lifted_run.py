@@ -15,30 +15,44 @@ from jaxtyping import Bool, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from normlift_ns.asking import Answer, Finding, answer
+from normlift_ns.analysis.catalogue import Catalogue, SimilarityTransform, make_catalogue
+from normlift_ns.analysis.explain import Why
+from normlift_ns.analysis.objects import Floaters, Instances, find_floaters, find_instances
+from normlift_ns.analysis.vote_records import RecordedVotes
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.files import refuse_run_files
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import Scene
+from normlift_ns.data.transforms import capture_transforms
+from normlift_ns.encoders.registry import LazyTextEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.insight.floaters import Floaters, find_floaters
-from normlift_ns.insight.why import Why
-from normlift_ns.objects.catalogue import Catalogue, Similarity, make_catalogue
-from normlift_ns.objects.instances import Instances, find_instances
-from normlift_ns.options import FLOATER_LIMIT, MIN_SIZE, REACH, TRANSFER_DISTANCE, Rule
-from normlift_ns.question import Question, make_question
-from normlift_ns.ranges import check_bool, check_number, check_path
-from normlift_ns.raster.rasterize import render, render_picture
-from normlift_ns.raster.settings import RasterSettings
-from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, texts_cache
-from normlift_ns.runs.question import load_question, save_question
-from normlift_ns.runs.splats import drawn_rows, export_files, instances_of, semantic_columns, write_splats
-from normlift_ns.runs.transfer import Labelled, label_cloud, read_cloud
-from normlift_ns.runs.votes import Votes
-from normlift_ns.scenes.similarity import capture_worlds
-from normlift_ns.text_encoders import Texts, encoder_of
-from normlift_ns.viewer.display import draw, make_display
-from normlift_ns.viewer.pictures import write_masks
+from normlift_ns.exports import (
+    LabelTransfer,
+    answer_instances,
+    export_paths,
+    label_cloud,
+    read_cloud,
+    semantic_columns,
+    visible_rows,
+    write_splat_ply,
+)
+from normlift_ns.io.atomic import refuse_run_files
+from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder, text_cache_folder
+from normlift_ns.options import (
+    FLOATER_THRESHOLD,
+    MAX_TRANSFER_DISTANCE,
+    OBJECT_MAX_GAP,
+    OBJECT_MIN_GAUSSIANS,
+    RelevancyRule,
+    check_bool,
+    check_number,
+    check_path,
+)
+from normlift_ns.query.engine import Answer, Finding, run_query
+from normlift_ns.query.question import Query, load_query, make_query, save_query
+from normlift_ns.query.text_encoder import text_encoder_for
+from normlift_ns.rasterization.rasterize import render, render_image
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,19 +86,19 @@ class LiftedRun:
         return self.folder / "config.yml"
 
     @cached_property
-    def texts(self) -> Texts:
+    def texts(self) -> LazyTextEncoder:
         """Text encoder that fits the field. It loads its network on first use.
 
         Raises:
-            ValueError, FileNotFoundError: as `encoder_of`.
+            ValueError, FileNotFoundError: as `text_encoder_for`.
         """
-        return encoder_of(self.field, self.device, texts_cache(self.folder))
+        return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
     def ask(
         self,
         *texts: str,
         negatives: Sequence[str] | None = None,
-        rule: Rule | Literal["auto"] = "auto",
+        rule: RelevancyRule | Literal["auto"] = "auto",
         threshold: float | Literal["auto"] | None = None,
         min_reliability: float = 0.0,
         refined: bool = True,
@@ -105,7 +119,7 @@ class LiftedRun:
         """
         if not all(isinstance(text, str) for text in texts):
             raise InputError(f'ask takes each prompt as its own argument, as in ask("red", "blue"); got {texts!r}')
-        question = make_question(
+        question = make_query(
             self.field,
             self.texts.rows,
             texts,
@@ -115,28 +129,28 @@ class LiftedRun:
             min_reliability=min_reliability,
             refined=refined,
         )
-        return answer(self.field, self.scene.gaussians.means, question)
+        return run_query(self.field, self.scene.gaussians.means, question)
 
     def ask_stored(self) -> Answer | None:
         """Return the answer to the question stored in the run; None if there is none."""
-        question = load_question(self.folder / FIELD_FOLDER)
-        return None if question is None else answer(self.field, self.scene.gaussians.means, question)
+        question = load_query(self.folder / FIELD_FOLDER)
+        return None if question is None else run_query(self.field, self.scene.gaussians.means, question)
 
-    def save(self, question: Question | Answer) -> Path:
+    def save(self, question: Query | Answer) -> Path:
         """Store a question in the run, replacing an earlier one. ns-render and ns-viewer draw its answer.
 
         Raises:
             ValueError: the vectors have another length than the field's directions.
         """
         question = question.question if isinstance(question, Answer) else question
-        if not isinstance(question, Question):
+        if not isinstance(question, Query):
             raise InputError(f"save takes an answer from this run or its question, got {type(question).__name__}")
         if question.vectors.shape[1] != self.field.dimension:
             raise InputError(
                 f"the question has vectors of {question.vectors.shape[1]} numbers, but the features of {self.folder} "
                 f"have {self.field.dimension}; ask this run, then save its answer"
             )
-        return save_question(self.folder / FIELD_FOLDER, question)
+        return save_query(self.folder / FIELD_FOLDER, question)
 
     def export(
         self,
@@ -145,8 +159,8 @@ class LiftedRun:
         *,
         answer: Answer | None = None,
         objects: Mapping[str, Any] | None = None,
-        reach: float = REACH,
-        min_size: int = MIN_SIZE,
+        reach: float = OBJECT_MAX_GAP,
+        min_size: int = OBJECT_MIN_GAUSSIANS,
         overwrite: bool = False,
     ) -> Int64[ndarray, " m"]:
         """Write Gaussians to a PLY file, and their row indices in the scene to <stem>_rows.npy next to it.
@@ -175,15 +189,15 @@ class LiftedRun:
             raise InputError(f"{path} is not a valid file name; give one such as splat.ply")
         if answer is not None and not isinstance(answer, Answer):
             raise InputError(f"answer must be an answer from this run, got {type(answer).__name__}")
-        refuse_run_files(*export_files(path), instead="name")
+        refuse_run_files(*export_paths(path), instead="name")
         answer = _answer_of(part) if answer is None else answer
-        ply, rows, names, table = export_files(path)
+        ply, rows, names, table = export_paths(path)
         for file, written in ((ply, True), (rows, True), (names, answer is not None), (table, objects is not None)):
             if written and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists; give another name, or overwrite=True")
-        instances = None if answer is None else instances_of(answer, reach=reach, min_size=min_size)
+        instances = None if answer is None else answer_instances(answer, reach=reach, min_size=min_size)
         keep = torch.ones(len(self.field), dtype=torch.bool) if part is None else self._mask(part)
-        return write_splats(
+        return write_splat_ply(
             path,
             self.scene.parameters,
             self.field,
@@ -233,10 +247,10 @@ class LiftedRun:
         path: str | Path,
         part: Answer | Finding,
         *,
-        transfer_distance: float = TRANSFER_DISTANCE,
+        transfer_distance: float = MAX_TRANSFER_DISTANCE,
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
-    ) -> Labelled:
+    ) -> LabelTransfer:
         """Label a point cloud or mesh from the nearest Gaussians, and write it to a new PLY file.
 
         Each point gets the relevancies, class_id and instance_id of its Gaussian.
@@ -273,7 +287,7 @@ class LiftedRun:
             read_cloud(check_path("cloud", cloud)),
             path,
             answer,
-            instances_of(answer),
+            answer_instances(answer),
             distance=transfer_distance,
             coordinates=coordinates,
             overwrite=overwrite,
@@ -289,9 +303,9 @@ class LiftedRun:
         distance: float,
         coordinates: Literal["capture", "scene"],
         overwrite: bool,
-    ) -> Labelled:
+    ) -> LabelTransfer:
         """Run `transfer` with a cloud that has been read and objects that have been found."""
-        rows = drawn_rows(self.scene.parameters, spherical_harmonics=self.scene.has_harmonics)
+        rows = visible_rows(self.scene.parameters, spherical_harmonics=self.scene.has_harmonics)
         means = self.scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()
         means = self.to_capture.points(means) if coordinates == "capture" else means
         columns = semantic_columns(self.field, answer, instances)
@@ -299,12 +313,12 @@ class LiftedRun:
         return label_cloud(cloud, path, means, columns, distance, overwrite=overwrite)
 
     @cached_property
-    def votes(self) -> Votes:
+    def votes(self) -> RecordedVotes:
         """Evidence of the lift by training image.
 
         `votes.pictures(why.views[:3])` draws that of the three images with the largest share.
         """
-        return Votes(self.scene, self.field, cache_folder(self.folder))
+        return RecordedVotes(self.scene, self.field, cache_folder(self.folder))
 
     def why(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Why:
         """Explain a selection: which images and regions voted for it, and how far they agree.
@@ -362,7 +376,7 @@ class LiftedRun:
         )
 
     @property
-    def to_capture(self) -> Similarity:
+    def to_capture(self) -> SimilarityTransform:
         """Transform from the coordinates of the Gaussians to those of the capture.
 
         It inverts the transform of the training.
@@ -370,20 +384,20 @@ class LiftedRun:
         Raises:
             FileNotFoundError, ValueError: as `catalogue`.
         """
-        transform = Similarity.identity()
-        for world in capture_worlds(self.folder, self.scene.identity):
-            transform = Similarity.undoing(world.transform, world.scale).then(transform)
+        transform = SimilarityTransform.identity()
+        for world in capture_transforms(self.folder, self.scene.identity):
+            transform = SimilarityTransform.undoing(world.transform, world.scale).then(transform)
         return transform
 
     def _instances(self, part: Answer | Finding | Bool[Tensor, " n"]) -> Instances:
         """Return the classes and objects of a part."""
         if isinstance(part, Answer):
-            return instances_of(part)
+            return answer_instances(part)
         text, mask = part.text if isinstance(part, Finding) else "", self._mask(part)[:, None]
         return find_instances((text,), self.scene.gaussians.means, mask.float(), mask)
 
-    def floaters(self, limit: float = FLOATER_LIMIT) -> Floaters:
-        """Find Gaussians that likely belong to no surface, see `insight.floaters`.
+    def floaters(self, limit: float = FLOATER_THRESHOLD) -> Floaters:
+        """Find Gaussians that likely belong to no surface, see `analysis.objects`.
 
         `run.export(path, ~floaters.mask)` writes the scene without them.
 
@@ -450,7 +464,7 @@ class LiftedRun:
         """
         camera = view if isinstance(view, Camera) else self.camera(view)
         settings = RasterSettings.recorded(self.field.manifest)
-        image = render_picture(self.scene, camera, settings=settings)
+        image = render_image(self.scene, camera, settings=settings)
         if found is None:
             return image
         if not isinstance(found, Answer | Finding):
@@ -459,7 +473,7 @@ class LiftedRun:
         display = make_display(self.field, answer, shown=shown)
         mode = self.scene.rasterize_mode
         values, alpha = render(self.scene.gaussians, camera, display.values, rasterize_mode=mode, settings=settings)
-        overlay = draw(display, image.float() / 255, values, alpha)["overlay"]
+        overlay = render_outputs(display, image.float() / 255, values, alpha)["overlay"]
         return (overlay.clamp(0, 1) * 255).round().to(torch.uint8)
 
 

@@ -1,40 +1,324 @@
-"""User options as plain dataclasses. Imports no heavy package, to keep --help fast.
+"""Validation of options: one table of ranges, and the declared types. Imports no heavy package.
 
-The docstring under a field is the help text of its flag.
+Options are dataclasses that call `check_options` in `__post_init__`. Wrong values are therefore reported before
+anything is loaded, in the commands, in `ns-train normlift` and in Python.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+import re
+import types
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
+from functools import cache
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Union, cast, get_args, get_origin, get_type_hints
 
-from normlift_ns.ranges import check_options, check_texts
+from normlift_ns.errors import InputError
+
+_MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
+"""Default bounds of integers and floats: larger numbers overflow in int32 and float32."""
+_MIN_DIVISOR = 1e-6
+"""Smallest value of options that the code divides by."""
+MAX_PROMPT_LENGTH = 10_000
+"""Largest number of characters in a prompt. CLIP reads about 70 words of it."""
+_MAX_SHOWN = 60
+"""Largest number of characters of a value in a message."""
+
+
+@dataclass(frozen=True)
+class OptionRange:
+    """Smallest and largest value of an option, and their description in messages."""
+
+    low: float
+    high: float
+    words: str
+
+
+def _at_least(low: int, high: int = _MAX_INT) -> OptionRange:
+    return OptionRange(low, high, f"at least {low}" if high == _MAX_INT else f"in {low}..{high}")
+
+
+_POSITIVE = OptionRange(_MIN_DIVISOR, _MAX_FLOAT, f"positive, at least {_MIN_DIVISOR:g}")
+_NOT_NEGATIVE = OptionRange(0.0, _MAX_FLOAT, "not negative")
+_FRACTION = OptionRange(0.0, 1.0, "in 0..1")
+_FINITE = OptionRange(-_MAX_FLOAT, _MAX_FLOAT, "finite")
+
+OPTION_RANGES: dict[str, OptionRange] = {
+    # the vote
+    "k": _at_least(1),
+    "num_devices": _at_least(1, 4096),
+    "sigma_d": _POSITIVE,
+    "tau": OptionRange(-1.0, 1.0, "in -1..1"),
+    "gamma": _POSITIVE,
+    "delta": _NOT_NEGATIVE,
+    "prior": _NOT_NEGATIVE,
+    # the lift
+    "max_views": _at_least(1),
+    "lift_downscale": _at_least(1),
+    "beta": _NOT_NEGATIVE,
+    "consensus_power": _NOT_NEGATIVE,
+    "consensus_sample": _at_least(1),
+    "consensus_least": _FRACTION,
+    "tolerance": OptionRange(1e-9, _MAX_FLOAT, "positive, at least 1e-09"),
+    "load_step": _at_least(0),
+    # 2D features
+    "region_count": _at_least(1, 2**20),
+    "regions_background": OptionRange(-_MAX_INT, _MAX_INT, "a 32-bit integer"),
+    "test_every": _at_least(2),
+    # queries
+    "threshold": _FINITE,
+    "min_reliability": _FRACTION,
+    "segment_views": _at_least(1),
+    # objects
+    "reach": _POSITIVE,
+    "min_size": _at_least(1),
+    "floater_limit": _FINITE,
+    "metres_per_unit": _POSITIVE,
+    "transfer_distance": _POSITIVE,
+    # evaluation
+    "min_opacity": _FRACTION,
+    "margin": _FINITE,
+    "purity": _FRACTION,
+    "min_weight": _NOT_NEGATIVE,
+    # the viewer
+    "port": OptionRange(1, 65535, "a port number, 1..65535"),
+    "most_drawn": _at_least(1, 10**7),
+    # batches
+    "patience": OptionRange(1.0, 86400.0, "in 1..86400"),
+    # the demo
+    "num_gaussians": _at_least(2000, 10**8),
+    "views": _at_least(3, 10**5),
+}
+"""Range of every numeric option, by name. No range contains nan or infinity."""
+
+_show_flags: ContextVar[bool] = ContextVar("flags", default=False)
+
+
+@contextmanager
+def named_as_flags() -> Iterator[None]:
+    """Let messages name options as flags (--sigma-d) instead of fields (sigma_d)."""
+    token = _show_flags.set(True)
+    try:
+        yield
+    finally:
+        _show_flags.reset(token)
+
+
+def option_name(name: str) -> str:
+    """Return the name of an option for a message.
+
+    >>> option_name("sigma_d")
+    'sigma_d'
+    >>> with named_as_flags():
+    ...     option_name("sigma_d")
+    '--sigma-d'
+    """
+    return f"--{name.replace('_', '-')}" if _show_flags.get() else name
+
+
+def check_options(options: Any) -> None:
+    """Check every field of an options dataclass against its declared type and its range.
+
+    Lists become tuples, strings become paths and integers become floats if the field declares that type.
+
+    Raises:
+        InputError: A value has the wrong type or is out of range.
+    """
+    for name, hint in _hints(type(options)).items():
+        object.__setattr__(options, name, _convert(name, getattr(options, name), hint))
+
+
+def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -> Any:
+    """Return the value of a numeric option in `OPTION_RANGES` as int or float.
+
+    Raises:
+        InputError: The value is not a number, not finite, or out of range.
+
+    >>> check_number("min_size", 20, int), check_number("reach", 4)
+    (20, 4.0)
+    """
+    integer = kind is int
+    if isinstance(value, bool) or not isinstance(value, Integral if integer else Real):
+        raise _error(name, f"a {'whole ' if integer else ''}number", value)
+    bounds, number = OPTION_RANGES[name], cast(Any, value)
+    if not bounds.low <= number <= bounds.high:  # also true for nan
+        too_large = number > bounds.high and not bounds.words.startswith("in ")
+        limit = "finite" if number == math.inf else f"at most {bounds.high:{',' if integer else 'g'}}"
+        raise _error(name, limit if too_large else bounds.words, value)
+    return kind(number)
+
+
+def check_bool(name: str, value: object) -> None:
+    """Raise InputError unless the value is True or False; the string "False" would be truthy."""
+    if not isinstance(value, bool):
+        raise _error(name, "True or False", value)
+
+
+def check_device(device: Any) -> str:
+    """Return the name of a device: auto, cpu, cuda, or cuda:1 for the second GPU.
+
+    Raises:
+        InputError: The device has another name.
+
+    >>> check_device("cuda:0")
+    'cuda:0'
+    """
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", str(device), re.ASCII):
+        raise InputError(f"--device must be auto, cpu or cuda, got {short_repr(str(device))}")
+    return str(device)
+
+
+def check_prompt_list(name: str, texts: Sequence[str]) -> None:
+    """Check a list of prompts.
+
+    Args:
+        name: Name of the option.
+        texts: The prompts.
+    Raises:
+        InputError: A prompt is empty, repeated, too long, or contains an invalid character.
+    """
+    if isinstance(texts, str):
+        raise InputError(f"{option_name(name)} must be a list of prompts, got the single prompt {short_repr(texts)}")
+    previous: set[str] = set()
+    for number, text in enumerate(texts, start=1):
+        label = f"prompt {number} of {len(texts)} in {option_name(name)}"
+        if not isinstance(text, str):
+            raise InputError(f"{label} must be a string, got {short_repr(text)}")
+        if text.strip() == "":
+            raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write what to search for")
+        if len(text) > MAX_PROMPT_LENGTH:
+            raise InputError(f"{label} has {len(text):,} characters; give at most {MAX_PROMPT_LENGTH:,}")
+        if "\0" in text or not _is_unicode(text):
+            raise InputError(f"{label} contains an invalid character ({short_repr(text)}); remove it")
+        if text in previous:
+            raise InputError(f"{label}, {short_repr(text)}, is a duplicate; give every prompt once")
+        previous.add(text)
+
+
+def short_repr(value: object) -> str:
+    """Return a short description of a value for a message, even if its repr fails.
+
+    >>> short_repr("x" * 100)[-5:], short_repr(10**5000)
+    ('xxx …', 'a number of type int')
+    """
+    try:
+        text = repr(value)
+    except Exception:  # the repr of unknown objects, or of integers with thousands of digits
+        return f"a number of type {type(value).__name__}" if isinstance(value, Real) else type(value).__name__
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]} …"
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _error(name: str, expected: str, value: object) -> InputError:
+    return InputError(f"{option_name(name)} must be {expected}, got {short_repr(value)}")
+
+
+def _convert(name: str, value: Any, hint: Any) -> Any:
+    """Return the value in the declared type of the field."""
+    origin, choices = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in choices:
+            return None
+        kinds = [choice for choice in choices if choice is not type(None)]
+        words = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
+        others = [kind for kind in kinds if get_origin(kind) is not Literal]
+        if len(others) == 0:  # Rule | Literal["auto"]
+            return _check_choice(name, value, words)
+        return value if isinstance(value, str) and value in words else _convert(name, value, others[0])
+    if origin is Literal:
+        return _check_choice(name, value, choices)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise _error(name, "a list", value)
+        return tuple(_convert(name, item, choices[0]) for item in value)
+    return _convert_scalar(name, value, hint)
+
+
+def _convert_scalar(name: str, value: Any, hint: type) -> Any:
+    if hint in (int, float):
+        return check_number(name, value, hint)
+    if hint is Path:
+        return check_path(name, value)
+    if not isinstance(value, hint):
+        raise _error(name, {bool: "True or False", str: "a string"}.get(hint, f"of type {hint.__name__}"), value)
+    if hint is str and ("\0" in value or not _is_unicode(value)):
+        raise InputError(f"{option_name(name)} contains an invalid character ({short_repr(value)}); remove it")
+    return value
+
+
+def _check_choice(name: str, value: object, choices: Sequence[Any]) -> Any:
+    for choice in choices:
+        if type(value) is type(choice) and value == choice:
+            return choice
+    raise InputError(f"{option_name(name)} must be one of {', '.join(map(str, choices))}; got {short_repr(value)}")
+
+
+def check_path(name: str, value: object) -> Path:
+    """Return a string or a path as a path.
+
+    Args:
+        name: Name of the option.
+        value: The string or path.
+    Raises:
+        InputError: The value is neither, or contains a NUL character.
+
+    >>> check_path("data", "fox").name
+    'fox'
+    """
+    if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
+        raise _error(name, "a path", value)
+    if "\0" in os.fspath(value):
+        raise InputError(
+            f"{option_name(name)} is not a valid path: it contains a NUL character ({short_repr(os.fspath(value))})"
+        )
+    return Path(value)
+
+
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+# User options as plain dataclasses. Imports no heavy package, to keep --help fast.
+#
+# The docstring under a field is the help text of its flag.
+
 
 RasterizeMode = Literal["classic", "antialiased"]
 """Rasterization mode that a scene was trained with: splatfacto's `rasterize_mode`."""
 BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
 """Rasterization backend; see `normlift_ns.rasterize_evidence`."""
-KNOWN_RULES = ("1.4", "1.5", "1.6")
+GSPLAT_VERSIONS = ("1.4", "1.5", "1.6")
 """gsplat versions that rasterize differently."""
-GsplatRules = Literal["auto", "1.4", "1.5", "1.6", "installed"]
+GsplatVersion = Literal["auto", "1.4", "1.5", "1.6", "installed"]
 """gsplat version whose rasterization a scene needs."""
 Background = Literal["black", "white"]
 """Background color behind a splat without a nerfstudio run."""
 Storage = Literal["evidence", "float16", "low_rank"]
 """Storage of directions: the evidence itself (exact), float16, or float16 coordinates in a basis."""
-Rule = Literal["cosine", "lerf", "margin"]
+RelevancyRule = Literal["cosine", "lerf", "margin"]
 """Formula for the relevancy of a prompt from its cosines; see `normlift_ns.relevancy`."""
-Unlabeled = Literal["ignore", "dilute"]
+UnlabeledMode = Literal["ignore", "dilute"]
 """Meaning of a pixel without a region: ignored, or an observation of the zero vector."""
 
-RegionsName = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
-FeaturesName = Literal["none", "langsplat"]
+RegionKind = Literal["auto", "sam", "sam3", "patches", "superpixel", "grid", "files"]
+FeatureKind = Literal["none", "langsplat"]
 SamPrecision = Literal["auto", "float32", "float16", "bfloat16"]
-Fill = Literal["black", "white"]
-Missing = Literal["error", "skip"]
+CropFill = Literal["black", "white"]
+MissingFeatures = Literal["error", "skip"]
 
 DEFAULT_MODEL, DEFAULT_PRETRAINED = "ViT-B-16", "laion2b_s34b_b88k"
 """OpenCLIP architecture and pretrained weights."""
@@ -46,7 +330,7 @@ BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things"
 
 
 class RuleSettings(NamedTuple):
-    """Constants of a relevancy rule; its formula is in `core.query` for torch and in `quick` for numpy."""
+    """Constants of a relevancy rule; its formula is in `core.relevancy` for torch and in `quick` for numpy."""
 
     threshold: float
     """Relevancy above which a Gaussian is selected."""
@@ -60,7 +344,7 @@ class RuleSettings(NamedTuple):
     """Top relevancy below which a prompt is probably not in the scene; None if that depends on the encoder."""
 
 
-RULES: dict[Rule, RuleSettings] = {
+RELEVANCY_RULES: dict[RelevancyRule, RuleSettings] = {
     # The threshold suits the color encoder, and queries without further information: see `question.make_question`.
     "cosine": RuleSettings(0.5, compares=False, least=0.0, faintest=0.0, present=None),
     # At the threshold, prompt and negative are equally similar.
@@ -72,16 +356,16 @@ VoteKind = Literal["paper", "posterior"]
 """Weighting of a Gaussian's own evidence against its neighbors in a vote; see `normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class of a Gaussian without a direction in a score: none, or the first."""
-REACH, MIN_SIZE = 4.0, 20
+OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS = 4.0, 20
 """Largest gap between Gaussians of one object, in units of the selection's median spacing, and its smallest size."""
-ARRAY_FILES = ("coord.npy", "segment.npy", "instance.npy", "names.json")
+LABEL_ARRAY_FILES = ("coord.npy", "segment.npy", "instance.npy", "names.json")
 """Files of exported label arrays."""
-TRANSFER_DISTANCE = 6.0
+MAX_TRANSFER_DISTANCE = 6.0
 """Largest distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
-OBJECT_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
+CATALOG_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
 """Files of an object catalog: everything, its table, and its boxes in capture and in scene coordinates."""
-FLOATER_LIMIT = 1.9
-"""Score above which a Gaussian is a likely floater, see `insight.floaters`."""
+FLOATER_THRESHOLD = 1.9
+"""Score above which a Gaussian is a likely floater, see `analysis.objects`."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +392,12 @@ class SourceOptions:
     facebook/metaclip-2-worldwide-huge-quickgelu."""
     encoder_pretrained: str = DEFAULT_PRETRAINED
     """open_clip: pretrained weights, as a tag to download or a local file of the same architecture."""
-    crop_fill: Fill = "black"
+    crop_fill: CropFill = "black"
     """Color that replaces everything outside the region in a crop."""
     text_template: str = "{}"
     """Template of the text that the network encodes; {} stands for the prompt, as in "a photo of a {}". ensemble: the
     mean over seven OpenCLIP templates. {} alone is the bare prompt."""
-    regions: RegionsName = "auto"
+    regions: RegionKind = "auto"
     """Image regions that get one feature each. sam: SAM's masks. sam3: SAM 3's masks for the prompts of --queries.
     patches: the patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, sam with --sam-model. Otherwise, auto depends on the encoder. A
@@ -140,19 +424,19 @@ class SourceOptions:
     """Region level to use. files: index of the map in NPY files of shape [levels, H, W]. sam and langsplat: s, m or l
     for subparts, parts or wholes (l if not given), or default for all of SAM's masks in one map. langsplat also accepts
     sum, the sum of the vectors of all levels."""
-    features: FeaturesName = "none"
+    features: FeatureKind = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: the files in --features-dir,
     as written by LangSplat's preprocessing."""
     features_dir: Path | None = None
     """Folder with the precomputed features of --features."""
-    features_missing: Missing = "error"
+    features_missing: MissingFeatures = "error"
     """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
     text_vectors: Path | None = None
     """NPZ file with one vector per prompt, used instead of encoding prompts. For precomputed features."""
 
     def __post_init__(self) -> None:
         check_options(self)
-        check_texts("region_texts", self.region_texts)
+        check_prompt_list("region_texts", self.region_texts)
 
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
         """Return options whose sam3 prompts are filled in from `queries` if none are set."""
@@ -206,7 +490,7 @@ class SplatOptions:
         check_options(self)
 
 
-class VoteNumbers(NamedTuple):
+class VoteParameters(NamedTuple):
     """Vote parameters whose defaults depend on the kind of vote."""
 
     sigma_d: float
@@ -215,9 +499,9 @@ class VoteNumbers(NamedTuple):
     delta: float
 
 
-VOTES: dict[VoteKind, VoteNumbers] = {
-    "posterior": VoteNumbers(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
-    "paper": VoteNumbers(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
+VOTE_DEFAULTS: dict[VoteKind, VoteParameters] = {
+    "posterior": VoteParameters(sigma_d=2.0, tau=0.9, gamma=0.05, delta=0.0),
+    "paper": VoteParameters(sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0),
 }
 """Defaults of each kind of vote; the help texts of `RefineConfig` repeat them."""
 
@@ -267,10 +551,10 @@ class RefineConfig:
         vars(self).update({"vote": "paper", **state})
 
     @property
-    def numbers(self) -> VoteNumbers:
+    def numbers(self) -> VoteParameters:
         """Vote parameters, with the defaults of this kind of vote in place of None."""
-        values = {name: getattr(self, name) for name in VoteNumbers._fields}
-        return VOTES[self.vote]._replace(**{name: value for name, value in values.items() if value is not None})
+        values = {name: getattr(self, name) for name in VoteParameters._fields}
+        return VOTE_DEFAULTS[self.vote]._replace(**{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True)
@@ -295,7 +579,7 @@ class LiftOptions:
     beta: float = 1.0
     """Strength of the prior in the reliability, in virtual views, >= 0; larger values lower the reliability of
     Gaussians that few views see."""
-    unlabeled: Unlabeled = "ignore"
+    unlabeled: UnlabeledMode = "ignore"
     """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
     vector."""
     weight_power: Literal[1, 2] = 1
@@ -327,7 +611,7 @@ class LiftOptions:
     backend: BackendName = "auto"
     """Rasterization backend. triton: our own kernels, on a GPU. gsplat: gsplat's compiled kernels, on a GPU. numba:
     compiled code for the CPU. torch: any device, slow. auto: the fastest for the device and the precision."""
-    gsplat_rules: GsplatRules = "auto"
+    gsplat_rules: GsplatVersion = "auto"
     """gsplat version whose rasterization to reproduce, because it decides the weights that a scene was trained with.
     installed: the gsplat version on this machine. auto: the version recorded with the scene, else 1.4. Version 1.6 is
     not released yet and may still change."""
@@ -354,7 +638,7 @@ class AskOptions:
     negatives: tuple[str, ...] | None = None
     """Negative prompts to compare with. Default: set by the encoder. Networks use LERF's (object, things, stuff,
     texture), colour uses none."""
-    rule: Rule | Literal["auto"] = "auto"
+    rule: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. cosine: the cosine itself. lerf: the softmax against each negative, at its minimum. margin:
     the cosine minus that of the best negative. auto: set by the encoder, which is lerf with negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
@@ -373,7 +657,7 @@ class AskOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
-        check_texts("negatives", self.negatives or ())
+        check_prompt_list("negatives", self.negatives or ())
 
     def rules(self) -> dict[str, Any]:
         """Return the keyword arguments of `LiftedRun.ask`: all options except those that encode prompts."""

@@ -26,7 +26,7 @@ from filelock import FileLock  # noqa: E402
 from tests.examples import register_profile  # noqa: E402
 
 if TYPE_CHECKING:
-    from normlift_ns.demo import DemoRoom
+    from normlift_ns.demo.room import DemoRoom
 
 # CI tries the same examples every time, so that only a change makes a test fail.
 register_profile("tests", derandomize="CI" in os.environ)
@@ -171,7 +171,7 @@ def trained(room: DemoRoom, made_once: Any) -> Path:
 
     def make(folder: Path) -> None:
         import_nerfstudio()
-        from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+        from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
 
         write_capture(room, folder / "room", views=12, held_out=2, width=160, height=120)
         write_splatfacto_run(room, folder / "room", folder / "outputs")
@@ -185,7 +185,7 @@ def lifted(trained: Path, made_once: Any) -> Path:
 
     def make(folder: Path) -> None:
         import_nerfstudio()
-        from normlift_ns.scripts import lift  # noqa: PLC0415
+        from normlift_ns.cli import lift  # noqa: PLC0415
         from tests.scripts.conftest import QUICK, run_entry  # noqa: PLC0415
 
         with pytest.MonkeyPatch.context() as patch:

@@ -14,13 +14,18 @@ import pytest
 import torch
 
 from normlift_ns import SemanticField
-from normlift_ns.core.disk.digests import file_digest
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.texts.files import TextVectors
-from normlift_ns.encoders.texts.kept import KeptTexts
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.text_files import CachedTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import file_digest
 from normlift_ns.options import DEFAULT_MODEL, SourceOptions
-from normlift_ns.text_encoders import ENCODER_KEYS, encoder_of, encoder_settings, given_settings, with_texts
+from normlift_ns.query.text_encoder import (
+    ENCODER_KEYS,
+    encoder_settings,
+    precomputed_settings,
+    text_encoder_for,
+    with_text_source,
+)
 from tests.core.test_digests import example
 
 
@@ -48,28 +53,28 @@ def lifted(kind: str, tmp_path: Path) -> SemanticField:
 @pytest.mark.parametrize("kind", ["regions", "patches", "langsplat", "version 0.1"])
 def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
     path, field = tmp_path / "w.pt", lifted(kind, tmp_path)
-    encoder = encoder_of(field, cache=tmp_path / "texts")
-    assert isinstance(encoder, KeptTexts)
+    encoder = text_encoder_for(field, cache=tmp_path / "texts")
+    assert isinstance(encoder, CachedTextEncoder)
     content = bytearray(path.read_bytes())
     content[77] ^= 1
     stamps = path.stat()
     path.write_bytes(content)
     os.utime(path, ns=(stamps.st_atime_ns, stamps.st_mtime_ns))  # as old and as large as before
     with pytest.raises(InputError) as caught:
-        encoder_of(field, cache=tmp_path / "texts")
+        text_encoder_for(field, cache=tmp_path / "texts")
     expected = field.manifest["features"].get("encoder", field.manifest["features"].get("texts"))["pretrained"]
     for part in (str(path), file_digest(path, like=expected), expected, "--text-vectors", "lift again"):
         assert part in str(caught.value)
     assert "--encoder-pretrained" not in str(caught.value)  # ns-normlift-query has no such flag
-    template = with_texts(field, template="a {}")
+    template = with_text_source(field, template="a {}")
     with pytest.raises(InputError, match="lifted with"):
-        encoder_of(template)
+        text_encoder_for(template)
     path.unlink()
     with pytest.raises(FileNotFoundError, match=rf"{path}.* --text-vectors") as missing:
-        encoder_of(field)
+        text_encoder_for(field)
     assert "--encoder-pretrained" not in str(missing.value)
     np.savez(tmp_path / "own.npz", fox=np.ones(12, np.float32))  # the user's choice needs no weights
-    assert isinstance(encoder_of(with_texts(field, vectors=tmp_path / "own.npz")), TextVectors)
+    assert isinstance(text_encoder_for(with_text_source(field, vectors=tmp_path / "own.npz")), TextEmbeddingFile)
 
 
 def test_relative_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,42 +95,44 @@ def test_a_relative_path_of_version_0_1_finds_the_same_file_or_none(tmp_path, mo
         (tmp_path / name).mkdir()
         (tmp_path / name / "w.pt").write_bytes(text)
     monkeypatch.chdir(tmp_path / "a")
-    encoder_of(field)
+    text_encoder_for(field)
     monkeypatch.chdir(tmp_path / "b")
     with pytest.raises(InputError, match=re.escape(content)):
-        encoder_of(field)
+        text_encoder_for(field)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"weight file w\.pt"):
-        encoder_of(field)
+        text_encoder_for(field)
 
 
 def test_a_file_that_is_called_like_the_tag_is_not_taken_for_it(tmp_path, monkeypatch) -> None:
     tag = SourceOptions().encoder_pretrained
     field = field_with(encoder_settings(SourceOptions()), {"encoder": {"kind": "open_clip", "pretrained": tag}})
-    encoder_of(field)
+    text_encoder_for(field)
     monkeypatch.chdir(tmp_path)
     Path(tag).write_bytes(b"weights")
     with pytest.raises(InputError, match=f"expected {tag}"):
-        encoder_of(field)
+        text_encoder_for(field)
 
 
 def test_replaced_text_vectors_are_refused_unless_they_are_chosen(tmp_path: Path) -> None:
     path = tmp_path / "t.npz"
     np.savez(path, fox=np.ones(12, np.float32))
     settings = encoder_settings(SourceOptions(features="langsplat", text_vectors=path))
-    field = field_with(settings, {"kind": "langsplat", "level": "l", "texts": TextVectors(path).identity})
-    assert torch.is_tensor(encoder_of(field).text(["fox"]))
+    field = field_with(settings, {"kind": "langsplat", "level": "l", "texts": TextEmbeddingFile(path).identity})
+    assert torch.is_tensor(text_encoder_for(field).text(["fox"]))
     np.savez(path, fox=np.arange(12, dtype=np.float32))
     with pytest.raises(InputError, match=rf"{path} .*--text-vectors"):
-        encoder_of(field)
-    assert torch.is_tensor(encoder_of(with_texts(field, vectors=path)).text(["fox"]))
+        text_encoder_for(field)
+    assert torch.is_tensor(text_encoder_for(with_text_source(field, vectors=path)).text(["fox"]))
     path.unlink()
     with pytest.raises(FileNotFoundError, match=str(path)):
-        encoder_of(field)
+        text_encoder_for(field)
 
 
 def test_features_of_version_0_1_may_say_nothing_of_the_encoder(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", fox=np.ones(12, np.float32))
     for features in ({}, {"kind": "given", "content": "0"}, {"encoder": 3}, {"encoder": {"pretrained": None}}):
-        assert isinstance(encoder_of(field_with(given_settings(str(tmp_path / "t.npz")), features)), TextVectors)
-        encoder_of(field_with(encoder_settings(SourceOptions()), features))
+        assert isinstance(
+            text_encoder_for(field_with(precomputed_settings(str(tmp_path / "t.npz")), features)), TextEmbeddingFile
+        )
+        text_encoder_for(field_with(encoder_settings(SourceOptions()), features))

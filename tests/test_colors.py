@@ -5,7 +5,7 @@ import colorsys
 import pytest
 import torch
 
-from normlift_ns.colors import COLORMAPS, colors_of, heat, named_color, prompt_colors
+from normlift_ns.rendering.colors import COLORMAPS, apply_colormap, colormap_rgb, named_color, prompt_colors
 
 DEUTERANOPE = torch.tensor([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
 """Linear RGB as people without green cones see it (Machado, Oliveira and Fernandes, 2009)."""
@@ -20,24 +20,24 @@ def lightness(colors: torch.Tensor) -> torch.Tensor:
 
 def test_colours_are_those_of_matplotlib() -> None:
     ends = torch.tensor([[0.267, 0.005, 0.329], [0.993, 0.906, 0.144]])
-    torch.testing.assert_close(colors_of("viridis")[[0, 255]], ends, atol=1e-3, rtol=0)
+    torch.testing.assert_close(colormap_rgb("viridis")[[0, 255]], ends, atol=1e-3, rtol=0)
 
 
 def test_the_default_maps_become_lighter_evenly_for_every_eye() -> None:
     for name in ("viridis", "cividis"):
         for eye in (torch.eye(3), DEUTERANOPE):
-            steps = lightness((colors_of(name).double() @ eye.double().T).clamp(0, 1)).diff()
+            steps = lightness((colormap_rgb(name).double() @ eye.double().T).clamp(0, 1)).diff()
             assert float(steps.min()) > 0
             assert float(steps.std() / steps.mean()) < 0.35
     assert COLORMAPS[0] == "viridis"
-    assert float(lightness(colors_of("turbo").double()).diff().min()) < 0  # the measure finds what is uneven
+    assert float(lightness(colormap_rgb("turbo").double()).diff().min()) < 0  # the measure finds what is uneven
 
 
 def test_opacity_grows_with_relevancy() -> None:
-    opacity = heat(torch.linspace(-1, 2, 301), (0.0, 1.0), colors_of("viridis"))[1]
+    opacity = apply_colormap(torch.linspace(-1, 2, 301), (0.0, 1.0), colormap_rgb("viridis"))[1]
     assert float(opacity.diff().min()) >= 0
     assert (float(opacity[0]), float(opacity[-1])) == pytest.approx((0.35, 0.9))
-    assert float(heat(torch.zeros(1), (0.0, 1.0), colors_of("viridis"), faint=0.0)[1]) == 0
+    assert float(apply_colormap(torch.zeros(1), (0.0, 1.0), colormap_rgb("viridis"), faint=0.0)[1]) == 0
 
 
 def test_a_prompt_has_the_color_that_it_names_or_some_other() -> None:

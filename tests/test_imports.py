@@ -124,7 +124,7 @@ def check(stage, names):
 import normlift_ns
 normlift_ns.__version__
 check("version", HEAVY)
-from normlift_ns.scripts import batch, check as _, demo, evaluate, export, lift, query, view
+from normlift_ns.cli import batch, check as _, demo, evaluate, export, lift, query, view
 check("scripts", HEAVY)
 missing = ["--load-config", "nowhere/config.yml"]
 mistakes = [
@@ -145,7 +145,7 @@ for command, words in mistakes:
     check(words, HEAVY)
 normlift_ns.lift, normlift_ns.render
 check("functions", HEAVY - {"torch", "numpy", "scipy"})
-import normlift_ns.front_door, normlift_ns.encoders.build as build
+import normlift_ns.api, normlift_ns.encoders.build as build
 build.make_source(normlift_ns.SourceOptions(encoder="colour")).text(["red"])
 check("colours", {"nerfstudio", "open_clip", "gsplat", "torchvision", "sympy", "torch._dynamo", "scipy.stats", "viser"})
 """

@@ -15,13 +15,13 @@ from PIL import Image
 from plyfile import PlyData
 
 import normlift_ns as nl
-from normlift_ns.demo import DemoRoom
+from normlift_ns.cli import query
+from normlift_ns.demo.room import DemoRoom
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.question import Question
-from normlift_ns.raster import rasterize
-from normlift_ns.raster.backend import Job
-from normlift_ns.raster.backends import choose_backend
-from normlift_ns.scripts import query
+from normlift_ns.query.question import Query
+from normlift_ns.rasterization import rasterize
+from normlift_ns.rasterization.backend import RasterJob
+from normlift_ns.rasterization.rasterize import choose_backend
 from tests.scripts.conftest import run_entry, said
 
 
@@ -256,7 +256,7 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="got str"):
         run.render(0, "red")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r" 3 .* 343"):
-        run.save(Question(("a",), torch.ones(1, 3)))
+        run.save(Query(("a",), torch.ones(1, 3)))
     stored = run.ask_stored()
     assert stored is not None
     assert run.save(stored).name == "queries.safetensors"  # other tests expect it as it was
@@ -268,7 +268,7 @@ def test_everything_is_drawn_by_the_rules_of_the_lift(trained: Path, tmp_path: P
     """Check, evidence, pictures, scores and another lift of the lifted run."""
     drawn: list[nl.RasterSettings] = []
 
-    def recording(backend: str, job: Job, **how: Any) -> Any:
+    def recording(backend: str, job: RasterJob, **how: Any) -> Any:
         drawn.append(job.settings)
         return choose_backend(backend, job, **how)
 

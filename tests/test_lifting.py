@@ -24,24 +24,23 @@ from normlift_ns import (
     LiftOptions,
     RasterSettings,
     RefineConfig,
-    lifting,
-    observing,
-    rehearsal,
+    evidence_collection,
+    pipeline,
 )
 from normlift_ns.core.consensus import consensus
-from normlift_ns.encoders import LangSplat, RegionFeatures
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import LabelFiles
-from normlift_ns.encoders.source import FeatureSource, ViewFeatures
+from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.images import ImageViews
+from normlift_ns.encoders.base import FeatureSource, RegionFeatures, ViewFeatures
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.langsplat import LangSplat
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth, run_lerf
-from normlift_ns.evaluation.votes import voting_scalars
-from normlift_ns.lifting import lift_scene
-from normlift_ns.scenes.frames import Frame, Intrinsics
-from normlift_ns.scenes.photographs import PhotographViews
-from normlift_ns.stages import cost
-from normlift_ns.team.seen import Export
-from normlift_ns.viewer.pictures import picture_names, training_cameras
+from normlift_ns.evaluation.studies import voting_scalars
+from normlift_ns.evidence_collection import FeatureExport
+from normlift_ns.pipeline import lift_scene
+from normlift_ns.progress import lift_cost
+from normlift_ns.rendering.figures import training_cameras, unique_file_names
+from normlift_ns.segmentation.regions import LabelFiles
 from tests.scenes import Photographs, generator, made_scene
 
 WIDTH, HEIGHT, N = 24, 18, 30
@@ -72,7 +71,7 @@ def files(folder: Path, array: np.ndarray, *stems: str, **options: Any) -> Regio
     for stem in stems or ("a",):
         (folder / stem).parent.mkdir(parents=True, exist_ok=True)
         np.save(folder / f"{stem}.npy", array)
-    return RegionFeatures(LabelFiles(folder, **options), ColourEncoder())
+    return RegionFeatures(LabelFiles(folder, **options), ColorEncoder())
 
 
 FULL = np.ones((HEIGHT, WIDTH), int)
@@ -110,7 +109,7 @@ def test_images_that_share_a_label_map_or_exported_files_are_refused(tmp_path: P
         lifted(source, tmp_path / "cache", made)
     made, source = scene("a/0.left.png", "b/0.right.png"), files(tmp_path / "maps", FULL, "a/0.left", "b/0.right")
     with pytest.raises(InputError, match=r"a/0\.left\.png and b/0\.right\.png .*0_s\.npy"):
-        lifted(source, tmp_path / "cache", made, export=Export(tmp_path / "out", True))
+        lifted(source, tmp_path / "cache", made, export=FeatureExport(tmp_path / "out", True))
     assert not (tmp_path / "out").exists()
 
 
@@ -130,7 +129,7 @@ def test_images_that_share_an_instance_mask_or_a_frame_are_refused(tmp_path: Pat
     with pytest.raises(InputError, match=r"0000\.json .*a/0000\.png and b/0000\.png"):
         run_lerf([run], [tmp_path], LerfOptions())
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))
-    run = EvaluatedRun(scene("a/0000.png"), None, ColourEncoder(), True)  # type: ignore[arg-type]
+    run = EvaluatedRun(scene("a/0000.png"), None, ColorEncoder(), True)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="have no objects"):
         run_lerf([run], [tmp_path], LerfOptions())
 
@@ -139,7 +138,7 @@ def langsplat(folder: Path, height: int, width: int, **options: Any) -> LangSpla
     folder.mkdir(exist_ok=True)
     np.save(folder / "a_s.npy", np.zeros((4, height, width), np.float32))
     np.save(folder / "a_f.npy", np.eye(20, dtype=np.float32)[:1])
-    return LangSplat(folder, ColourEncoder(), "l", **options)
+    return LangSplat(folder, ColorEncoder(), "l", **options)
 
 
 RAW = (WIDTH + 1, HEIGHT + 1)
@@ -167,7 +166,7 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
     Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
     for k1, original, size in ((0.0, None, (40, 30)), (0.01, (40, 30), (39, 29))):
         intrinsics = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30, k1)
-        view = PhotographViews([Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], intrinsics)], torch.zeros(3))[0]
+        view = ImageViews([Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], intrinsics)], torch.zeros(3))[0]
         assert view.original == original
         assert (view.camera.width, view.camera.height) == size
 
@@ -198,7 +197,7 @@ def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:
         (["a/X.png", "b/x.png"], ["a_X", "b_x"]),
         (["/data/a/0.png", "../b/0.png"], ["_data_a_0", ".._b_0"]),
     ):
-        assert picture_names(images) == expected
+        assert unique_file_names(images) == expected
     made = scene("a/0000.png", "b/0000.png", "b/0001.png")
     assert list(training_cameras(made)) == ["a_0000", "b_0000", "0001"]
     for name in ("b_0000", "b/0000", "b/0000.png"):
@@ -218,22 +217,22 @@ def test_costs_are_seconds_their_sum_and_the_memory_of_this_process(monkeypatch)
         (line,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
         return int(line) / 2**20
 
-    before, found, after = peak(), cost({"a": 1.0, "b": 0.5}, "cpu"), peak()
+    before, found, after = peak(), lift_cost({"a": 1.0, "b": 0.5}, "cpu"), peak()
     assert before <= found.pop("memory_gib") <= after
     assert found == {"a_s": 1.0, "b_s": 0.5, "total_s": 1.5}
 
 
 def test_a_rehearsal_rasterizes_all_its_regions(monkeypatch):
     seen: list[torch.Tensor] = []
-    rasterize = rehearsal.rasterize_evidence
+    rasterize = pipeline.rasterize_evidence
 
     def watched(scene: Any, cameras: Any, labels: list[torch.Tensor], **how: Any) -> Any:
         seen.extend(labels)
         return rasterize(scene, cameras, labels, **how)
 
-    monkeypatch.setattr(rehearsal, "rasterize_evidence", watched)
+    monkeypatch.setattr(pipeline, "rasterize_evidence", watched)
     how = {"rasterize_mode": "classic", "settings": RasterSettings(), "backend": "numba", "dtype": torch.float32}
-    rehearsal.rehearse(scene("a.png").gaussians, CAMERA, LiftOptions(), **how).join()
+    pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, LiftOptions(), **how).join()
     assert seen[0].shape == (HEIGHT, WIDTH)
     assert torch.bincount(seen[0].flatten()).tolist() == [HEIGHT * WIDTH // 4] * 4
 
@@ -281,7 +280,7 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
         given = LiftOptions(refine=False, consensus=on, consensus_sample=7, storage="evidence")
         how: Any = {"encoder": {}, "report": lambda stage, *_: told.append(stage)}
         results.append(lift_scene(scene(*THREE), source, given, tmp_path / "cache", **how))
-        monkeypatch.setattr(observing, "rasterize_evidence", None)
+        monkeypatch.setattr(evidence_collection, "rasterize_evidence", None)
     assert "consensus" in told
     _, on, off = results
     assert "consensus" not in off.seconds and "consensus" not in off.field.manifest["statistics"]
@@ -305,8 +304,8 @@ def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyP
 def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """R and own evidence are those of the lift without consensus, directions those with it; voting again on the stored
     run takes the same numbers."""
-    source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=lifting.refine)
-    monkeypatch.setattr(lifting, "refine", watched)
+    source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=pipeline.refine)
+    monkeypatch.setattr(pipeline, "refine", watched)
     fields = []
     for on in (False, True):
         options = LiftOptions(consensus=on, beta=0.7, vote=RefineConfig(vote="posterior", k=3))

@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns import Evidence, LiftOptions, RasterSettings, observing
+from normlift_ns import Evidence, LiftOptions, RasterSettings, evidence_collection
 from normlift_ns.core.field import SemanticField
-from normlift_ns.encoders import RegionFeatures
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import Superpixels
-from normlift_ns.lifting import lift_scene
-from normlift_ns.observing import Block, block_evidence
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.evidence_collection import ViewBatch, batch_evidence
 from normlift_ns.options import BackendName
+from normlift_ns.pipeline import lift_scene
+from normlift_ns.segmentation.regions import Superpixels
 from tests.scenes import Photographs, made_scene, orbit_camera, random_scene
 
 ALL = tuple(range(11))
@@ -30,7 +30,7 @@ OLD = (0, 2, 3, 5, 6, 7, 9, 10)
 def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """How many views were cut, encoded and rasterized."""
     counts = dict.fromkeys(("cut", "encoded", "rasterized"), 0)
-    cut, encode, rasterize = Superpixels.labels, ColourEncoder.encode_each, observing.rasterize_evidence
+    cut, encode, rasterize = Superpixels.labels, ColorEncoder.encode_each, evidence_collection.rasterize_evidence
 
     def count(what: str, number: int, given: Any) -> Any:
         counts[what] += number
@@ -39,13 +39,13 @@ def worked(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     def rasterizing(gaussians: Any, cameras: Any, *more: Any, **options: Any) -> Any:
         return rasterize(gaussians, count("rasterized", len(cameras), cameras), *more, **options)
 
-    def encoding(self: ColourEncoder, views: Any) -> Any:
+    def encoding(self: ColorEncoder, views: Any) -> Any:
         return encode(self, (count("encoded", 1, view) for view in views))
 
     monkeypatch.setattr(Superpixels, "labels", lambda self, image, name: cut(self, count("cut", 1, image), name))
-    monkeypatch.setattr(ColourEncoder, "encode_each", encoding)
-    monkeypatch.setattr(observing, "rasterize_evidence", rasterizing)
-    monkeypatch.setattr(observing, "_MAX_CHUNK", 4)
+    monkeypatch.setattr(ColorEncoder, "encode_each", encoding)
+    monkeypatch.setattr(evidence_collection, "rasterize_evidence", rasterizing)
+    monkeypatch.setattr(evidence_collection, "_MAX_CHUNK", 4)
     return counts
 
 
@@ -54,7 +54,7 @@ def lifted(numbers: Sequence[int], cache: Path, mode: str = "classic") -> Semant
     views = Photographs([f"{number:02}.png" for number in numbers], cameras, seeds=numbers)
     scene = made_scene(random_scene(60, dtype=torch.float32), views, rasterize_mode=mode)
     options = LiftOptions(refine=False, storage="evidence", consensus=False)
-    source = RegionFeatures(Superpixels(9), ColourEncoder())
+    source = RegionFeatures(Superpixels(9), ColorEncoder())
     return lift_scene(scene, source, options, cache, encoder={}).field
 
 
@@ -101,8 +101,8 @@ def evidence_of(shift: int, folder: Path, rules: str = "1.4", backend: BackendNa
     """Of one view of two regions, whose border is somewhere else for every shift."""
     camera, done = orbit_camera(0.0), []
     labels = (torch.arange(camera.width) >= 18 + shift).int().expand(camera.height, camera.width)
-    block = Block([camera], [labels], [torch.arange(2).int()[None]], [torch.eye(2)])
-    found = block_evidence(
+    block = ViewBatch([camera], [labels], [torch.arange(2).int()[None]], [torch.eye(2)])
+    found = batch_evidence(
         random_scene(30, dtype=torch.float32), block, folder, rasterize_mode="classic",
         settings=RasterSettings.of_gsplat(rules), backend=backend, weight_power=1, dtype=torch.float32, reuse=True,
         done=lambda: done.append(1),

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.box_overlap import box_iou, half_spaces
 from normlift_ns import InputError
-from normlift_ns.objects import connected_components, find_objects
-from normlift_ns.objects.boxes import OrientedBox, oriented_box
+from normlift_ns.analysis.objects import OrientedBox, connected_components, find_objects, oriented_box
 from tests.examples import examples
 from tests.scenes import generator
 

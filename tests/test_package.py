@@ -119,7 +119,7 @@ def test_the_wheel_works_in_a_clean_environment(built, tmp_path):
     python = tmp_path / "clean" / "bin" / "python"
     run(sys.executable, "-m", "uv", "pip", "install", "--python", python, built[0], cwd=tmp_path)
     check_installed(python, tmp_path)
-    run(python, "-m", "normlift_ns.scripts.demo", "--num-gaussians", 3000, "--views", 6, cwd=tmp_path)
+    run(python, "-m", "normlift_ns.cli.demo", "--num-gaussians", 3000, "--views", 6, cwd=tmp_path)
     answers = json.loads((tmp_path / "demo" / "answers.json").read_text())
     assert {"tomato red", "pumpkin"} <= {query["text"] for query in answers["queries"]}
     code = "from importlib.metadata import entry_points as e; [p.load() for p in e(group='nerfstudio.method_configs')]"

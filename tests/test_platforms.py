@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from normlift_ns import open_scene
-from normlift_ns.scenes.splat import Splat
+from normlift_ns.data.splat import SplatParameters
 from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import SMALL
 
@@ -71,7 +71,7 @@ def test_a_short_list_of_packages_suffices_without_nerfstudio(trained, tmp_path)
     python = tmp_path / "v" / "bin" / "python"
     code = "import importlib.util as u; print([n for n in ('nerfstudio', 'viser') if u.find_spec(n)])"
     assert typed(tmp_path, python, "-c", code).strip() == "[]"
-    write_ply(tmp_path / "scene.ply", ply_columns(Splat(**open_scene(trained).parameters)))
+    write_ply(tmp_path / "scene.ply", ply_columns(SplatParameters(**open_scene(trained).parameters)))
     room, world = trained.parents[4] / "room", trained.parent / "dataparser_transforms.json"
     places = ("--load-ply", "scene.ply", "--transforms", room / "transforms.json", "--world-transform", world)
     lift = python.with_name("ns-normlift")

@@ -23,13 +23,14 @@ from prompt_toolkit.application import create_app_session
 from prompt_toolkit.input import create_pipe_input
 from prompt_toolkit.output import DummyOutput
 
-from normlift_ns import InputError, SemanticField, asking, open_run, quick
-from normlift_ns.core.disk.field_file import read_field
-from normlift_ns.core.query import FORMULAS
-from normlift_ns.options import RULES, Rule
-from normlift_ns.question import Question
-from normlift_ns.scripts import query
-from normlift_ns.scripts.answers.prompting import answer_lines, converse
+from normlift_ns import InputError, SemanticField, open_run
+from normlift_ns.cli import query
+from normlift_ns.cli.repl import answer_lines, run_repl
+from normlift_ns.core.relevancy import RELEVANCY_FORMULAS
+from normlift_ns.io.field import read_field
+from normlift_ns.options import RELEVANCY_RULES, RelevancyRule
+from normlift_ns.query import arrays, engine
+from normlift_ns.query.question import Query
 from tests.core.test_field import FORMS, D, example
 from tests.examples import examples
 from tests.scenes import unit_rows
@@ -40,7 +41,7 @@ from tests.scripts.conftest import run_entry, said
 @given(
     seed=st.integers(0, 50),
     form=st.sampled_from(FORMS),
-    rule=st.sampled_from(get_args(Rule)),
+    rule=st.sampled_from(get_args(RelevancyRule)),
     refined=st.booleans(),
     min_reliability=st.sampled_from([0.0, 0.2, 0.9]),
 )
@@ -48,19 +49,19 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
     lifted, means, source = example(seed)
     field = SemanticField.build(lifted, means, source, storage=form, tolerance=2e-3)
     vectors, negatives = (100 * unit_rows(count, D, seed + 7).float().numpy() for count in (3, 2))
-    question = Question(
+    question = Query(
         ("a", "b", "c"), vectors, ("d", "e"), negatives, rule, 0.1, min_reliability=min_reliability, refined=refined
     )
-    expected = asking.answer(field, means, question)
+    expected = engine.run_query(field, means, question)
     with tempfile.TemporaryDirectory() as folder:
         field.save(folder)
-        found = quick.answer(read_field(Path(folder)), question)
+        found = arrays.query_arrays(read_field(Path(folder)), question)
     np.testing.assert_allclose(found.relevancy, expected.relevancy.numpy(), rtol=0, atol=2e-6)
     assert np.array_equal(found.valid, expected.valid.numpy())
     near = np.abs(expected.relevancy.numpy() - 0.1) < 2e-6
     assert np.array_equal(found.selected | near, expected.selected.numpy() | near)
     if not near.any():
-        for ours, theirs in zip(found.summarize(), asking.summarize(expected), strict=True):
+        for ours, theirs in zip(found.summarize(), engine.summarize_result(expected), strict=True):
             assert set(ours) == set(theirs)
             bins, same = ours.pop("histogram"), theirs["histogram"]
             assert (bins is None) == (same is None)
@@ -71,11 +72,11 @@ def test_answers_are_those_of_torch(seed, form, rule, refined, min_reliability):
 
 
 def test_every_rule_has_both_formulas_and_vectors_of_another_encoder_are_refused(tmp_path):
-    assert set(FORMULAS) == set(quick.FORMULAS) == set(RULES) == set(get_args(Rule))
+    assert set(RELEVANCY_FORMULAS) == set(arrays.NUMPY_FORMULAS) == set(RELEVANCY_RULES) == set(get_args(RelevancyRule))
     lifted, means, source = example()
     SemanticField.build(lifted, means, source).save(tmp_path)
     with pytest.raises(InputError, match=rf"must be \[Q, {D}\].*got \(1, 3\)"):
-        quick.answer(read_field(tmp_path), Question(("a",), np.ones((1, 3), np.float32)))
+        arrays.query_arrays(read_field(tmp_path), Query(("a",), np.ones((1, 3), np.float32)))
 
 
 BLOCK = """
@@ -87,7 +88,7 @@ class Blocked:
             raise AssertionError(f"{name} is imported")
 
 sys.meta_path.insert(0, Blocked())
-from normlift_ns.scripts.query import entrypoint
+from normlift_ns.cli.query import entrypoint
 entrypoint()
 """
 
@@ -106,7 +107,7 @@ def test_answers_need_neither_torch_nor_nerfstudio(lifted, tmp_path):
     rows = json.loads((tmp_path / "a.json").read_text())["queries"]
     run = open_run(lifted)
     expected = run.ask("red", "sky blue")
-    for row, other in zip(rows, asking.summarize(expected), strict=True):
+    for row, other in zip(rows, engine.summarize_result(expected), strict=True):
         bins, same = row.pop("histogram"), other.pop("histogram")
         assert sum(bins.pop("counts")) == sum(same.pop("counts"))
         assert bins == pytest.approx(same, abs=1e-5)
@@ -132,7 +133,7 @@ def test_lines_become_lines_of_json(lifted, monkeypatch, capsys):
 
 
 def test_lines_are_answered_as_they_come_also_those_of_windows(lifted, monkeypatch):
-    run, shown = quick.open_quick(lifted), io.StringIO()
+    run, shown = arrays.open_quick(lifted), io.StringIO()
     monkeypatch.setattr(sys, "stdout", shown)
 
     def lines():
@@ -156,11 +157,11 @@ def test_lines_are_answered_as_they_come_also_those_of_windows(lifted, monkeypat
 
 def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    run = quick.open_quick(lifted)
+    run = arrays.open_quick(lifted)
     assert run is not None
     with create_pipe_input() as typed, create_app_session(input=typed, output=DummyOutput()):
         typed.send_text("red\nwooden\n \nsky blue\n\x04")
-        converse(run, {}, keep_history=True)
+        run_repl(run, {}, keep_history=True)
         shown = said(capsys)
         assert "red" in shown and "sky blue" in shown and "wooden" in shown
         history = tmp_path / "normlift_ns" / "history"
@@ -168,12 +169,12 @@ def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, c
         before = history.read_text()
         assert "+wooden" in before
         typed.send_text("yellow\n\x04")
-        converse(run, {}, keep_history=False)
+        run_repl(run, {}, keep_history=False)
         assert history.read_text() == before
         (tmp_path / "file").write_text("")
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
         typed.send_text("yellow\n\x04")
-        converse(run, {}, keep_history=True)  # no place for it
+        run_repl(run, {}, keep_history=True)  # no place for it
 
 
 def test_ways_to_ask_that_do_not_fit(lifted, monkeypatch, capsys):
@@ -194,10 +195,10 @@ def test_ways_to_ask_that_do_not_fit(lifted, monkeypatch, capsys):
 def test_a_run_with_another_checkpoint_is_opened_whole(lifted, tmp_path):
     """Its own files do not tell then which one the scene is."""
     copy = shutil.copytree(lifted.parent, tmp_path / "run")
-    assert quick.open_quick(copy / "config.yml") is not None
+    assert arrays.open_quick(copy / "config.yml") is not None
     (checkpoint,) = (copy / "nerfstudio_models").iterdir()
     os.link(checkpoint, copy / "nerfstudio_models" / "step-000099999.ckpt")
-    assert quick.open_quick(copy / "config.yml") is None
+    assert arrays.open_quick(copy / "config.yml") is None
     means = torch.zeros(3, 3).numpy()
-    opened = quick.open_quick(copy / "config.yml", means=means)
+    opened = arrays.open_quick(copy / "config.yml", means=means)
     assert opened is not None and opened.field.arrays["means"] is means

@@ -17,19 +17,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import InputError, nearest_neighbors, refine
-from normlift_ns.core.refine import MOST_VOTERS, possible
+from normlift_ns.analysis.objects import connected_components
+from normlift_ns.cli.batch import NormLiftBatch
+from normlift_ns.cli.check import NormLiftCheck
+from normlift_ns.cli.demo import Demo
+from normlift_ns.cli.evaluate import NormLiftEval
+from normlift_ns.cli.export import NormLiftExport
+from normlift_ns.cli.lift import NormLift
+from normlift_ns.cli.query import NormLiftQuery
+from normlift_ns.cli.view import NormLiftView
+from normlift_ns.core.refine import MAX_VOTERS, clamp_k
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions
-from normlift_ns.objects import connected_components
-from normlift_ns.options import AskOptions, LiftOptions, RefineConfig, SourceOptions, SplatOptions
-from normlift_ns.ranges import LONGEST_TEXT, RANGES, check_device, check_number, check_texts, named_as_flags
-from normlift_ns.scripts.batch import NormLiftBatch
-from normlift_ns.scripts.check import NormLiftCheck
-from normlift_ns.scripts.demo import Demo
-from normlift_ns.scripts.evaluate import NormLiftEval
-from normlift_ns.scripts.export import NormLiftExport
-from normlift_ns.scripts.lift import NormLift
-from normlift_ns.scripts.query import NormLiftQuery
-from normlift_ns.scripts.view import NormLiftView
+from normlift_ns.options import (
+    MAX_PROMPT_LENGTH,
+    OPTION_RANGES,
+    AskOptions,
+    LiftOptions,
+    RefineConfig,
+    SourceOptions,
+    SplatOptions,
+    check_device,
+    check_number,
+    check_prompt_list,
+    named_as_flags,
+)
 from tests.examples import examples
 
 OPTIONS: dict[type, dict[str, Any]] = {
@@ -56,7 +67,7 @@ HOSTILE = [math.nan, math.inf, -math.inf, 10**400, -(10**400), 10**5000, True, F
 
 def test_every_number_has_a_range_and_defaults_are_in_it():
     named = {(cls, name) for cls, name, _ in NUMBERS}
-    assert {name for _, name in named} == set(RANGES)
+    assert {name for _, name in named} == set(OPTION_RANGES)
     for cls, given_ in OPTIONS.items():
         made = cls(**given_)
         for one in fields(cls):
@@ -73,7 +84,7 @@ def refused(cls: type, name: str, value: Any, words: str = "") -> None:
 
 def test_what_is_no_number_or_in_no_range_is_refused_and_the_ends_of_the_range_are_not():
     for cls, name, kind in NUMBERS:
-        bounds = RANGES[name]
+        bounds = OPTION_RANGES[name]
         ends = [bounds.low - 1 - abs(bounds.low), bounds.high * 2 + 1]
         if int in kind:
             ends += [bounds.low - 1, bounds.high + 1]
@@ -134,15 +145,15 @@ def test_texts_and_devices_that_can_and_that_cannot_be():
         (["a", "b", "a"], "prompt 3 of 3 in queries, 'a'"),
         (["a\0"], "character"),
         (["\udc80"], "character"),
-        (["x" * (LONGEST_TEXT + 1)], f"10,001 characters; give at most {LONGEST_TEXT:,}"),
+        (["x" * (MAX_PROMPT_LENGTH + 1)], f"10,001 characters; give at most {MAX_PROMPT_LENGTH:,}"),
         ("red", "list"),
         ([3], "got 3"),
     ):
         with pytest.raises(InputError) as told:
-            check_texts("queries", texts)
+            check_prompt_list("queries", texts)
         assert fact in str(told.value) and len(str(told.value)) < 300
-    fine = ["x" * LONGEST_TEXT, "[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left"]
-    check_texts("text", fine)
+    fine = ["x" * MAX_PROMPT_LENGTH, "[/red]", ":smile:", "$\\frac{$", "two\nlines", "\x1b[31m", "\u202eright to left"]
+    check_prompt_list("text", fine)
 
     assert [check_device(name) for name in ("auto", "cpu", "cuda", "cuda:3")] == ["auto", "cpu", "cuda", "cuda:3"]
     for name in ("gpu", "cuda:x:", "cuda:-1", "cuda:", "cuda:99999", "cudax", "cpu:0", "", "CPU", None, "cuda:٣"):
@@ -156,11 +167,11 @@ def test_more_neighbours_than_there_are_and_a_reach_that_cannot_be():
     with pytest.warns(UserWarning, match=r"k is 100,000.* 5 "):
         many = refine(means, u, r, RefineConfig(vote="paper", k=100_000, delta=0.0))
     assert torch.equal(many, refine(means, u, r, RefineConfig(vote="paper", k=5, delta=0.0)))
-    with pytest.warns(UserWarning, match=f"k is 100,000.* {MOST_VOTERS} "):
-        assert possible(RefineConfig(k=100_000), 6000).k == MOST_VOTERS
+    with pytest.warns(UserWarning, match=f"k is 100,000.* {MAX_VOTERS} "):
+        assert clamp_k(RefineConfig(k=100_000), 6000).k == MAX_VOTERS
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        kept = possible(RefineConfig(), 6000)
+        kept = clamp_k(RefineConfig(), 6000)
         assert kept == replace(RefineConfig(), **kept.numbers._asdict())  # the defaults in numbers
     with pytest.raises(InputError, match="k must be at most 1,024, got 100,000"):
         nearest_neighbors(means, 100_000)

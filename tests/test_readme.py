@@ -19,7 +19,7 @@ import torch
 import normlift_ns
 from benchmarks.reference import COMMANDS, PAGE
 from benchmarks.reference import page as reference
-from normlift_ns.scripts.lift import NormLift
+from normlift_ns.cli.lift import NormLift
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(normlift_ns.__file__).parent
@@ -51,7 +51,7 @@ def flags(options: Any) -> set[str]:
 
 @pytest.mark.slow
 def test_the_python_script_runs_on_the_demo(tmp_path, monkeypatch, capsys):
-    from normlift_ns.scripts.demo import Demo  # noqa: PLC0415 (nerfstudio takes 20 s)
+    from normlift_ns.cli.demo import Demo  # noqa: PLC0415 (nerfstudio takes 20 s)
 
     monkeypatch.chdir(tmp_path)
     means = Demo().main()

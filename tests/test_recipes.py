@@ -43,7 +43,7 @@ def python(extended: Path, *words: object, code: int = 0) -> str:
 RULE = """
 import sys, numpy as np, normlift_ns as nl
 from pathlib import Path
-from normlift_ns.quick import open_quick
+from normlift_ns.query.arrays import open_quick
 how = {"rule": "mean", "negatives": ["blue", "yellow"]}
 run = nl.open_run(sys.argv[1])
 ours = run.ask("red", **how).relevancy.numpy()
@@ -81,11 +81,11 @@ def test_a_rule_an_output_and_a_scene_source(extended: Path, lifted: Path, tmp_p
     python(extended, "-c", SOURCE, lifted, tmp_path)
     python(extended, "-c", RULE, lifted)
     asked = ("--load-config", lifted, "--text", "red", "--rule", "mean", "--negatives", "blue")
-    python(extended, "-m", "normlift_ns.scripts.query", *asked, "--json", tmp_path / "a.json")
+    python(extended, "-m", "normlift_ns.cli.query", *asked, "--json", tmp_path / "a.json")
     document = json.loads((tmp_path / "a.json").read_text())
     assert document["relevancy"] == "mean" and 0 < document["queries"][0]["fraction"] < 1
     table = tmp_path / "table.csv"
-    words = ("-m", "normlift_ns.scripts.export", "--load-config", lifted, "--output-dir", tmp_path, "--table", table)
+    words = ("-m", "normlift_ns.cli.export", "--load-config", lifted, "--output-dir", tmp_path, "--table", table)
     python(extended, *words, "--text", "red", "--threshold", "0.9")
     with table.open() as file:
         rows = list(csv.DictReader(file))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from normlift_ns import Camera, GaussianScene, rasterize_evidence
-from normlift_ns.segmenting import mask_evidence
+from normlift_ns.query.sam3_query import mask_evidence
 from tests.scenes import dense, orbit_camera, random_scene
 
 

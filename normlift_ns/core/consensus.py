@@ -19,7 +19,7 @@ The factor c_ts limits the influence of a region t that covers several objects. 
 cells of an arbitrary partition, whose overlaps only average neighboring cells. For example, a square of one grid and
 the best match in a randomly shifted copy of that grid share 9/16 of their area on average, which is J = 0.39.
 
-Directions come from the lift of F'. R stays that of the lift of F (see `seen_reliability`), because it measures how
+Directions come from the lift of F'. R stays that of the lift of F (see `with_original_reliability`), because it measures how
 far the regions disagreed before the consensus. It ranks the answers of F' better than the R of F' does.
 """
 
@@ -33,23 +33,23 @@ import torch
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
-from normlift_ns.core.checks import check_tensors, check_unit_rows
+from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.gpu import kernels_apply
 from normlift_ns.core.lift import Scalars
-from normlift_ns.core.portions import ALONE, Portion, Team, join_sparse
+from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition, all_gather_sparse
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
+from normlift_ns.core.validation import check_tensors, check_unit_rows
 from normlift_ns.errors import InputError
 
 MIN_OVERLAP = 0.1
 """Smaller overlaps, both one-sided (c) and symmetric (J), count as 0."""
 MIN_VISIBILITY = 0.5
 """Smallest weight with which a view sees a Gaussian, as a share of the median over the Gaussians in its regions."""
-CHANCE, RISE = 0.4, 0.1
+CHANCE_AGREEMENT, AGREEMENT_RAMP = 0.4, 0.1
 """Largest B of regions that overlap by chance, and the rise of B above it at which all regions count as objects."""
 MIN_SHARE = 0.02
 """Smallest share of a Gaussian's weight in a view for which a region of that view counts."""
-SEED = 0
+SAMPLING_SEED = 0
 """Seed of the order in which Gaussians are sampled."""
 _MEDIAN_SAMPLE = 2**16
 """Approximate number of weights from which medians are computed."""
@@ -96,8 +96,8 @@ def consensus(
     level: Int[Tensor, " s"] | None = None,
     power: float = 1.0,
     sample: int = 50,
-    least: float = CHANCE,
-    portion: Portion | None = None,
+    least: float = CHANCE_AGREEMENT,
+    portion: Partition | None = None,
 ) -> Consensus:
     """Compute F' of every region with the formulas at the top of this file.
 
@@ -137,7 +137,7 @@ def consensus(
         raise InputError(f"least must be a number in 0..1, got {least!r}")
     check_unit_rows(features, "feature rows", "normalize them, or set those without a feature to 0", allow_zeros=True)
     device = evidence.rows.weight.device
-    chosen, probability = sampled_gaussians(evidence.rows, size, sample, portion)
+    chosen, probability = sample_gaussians(evidence.rows, size, sample, portion)
     sampled = evidence.select_gaussians(chosen)
     level = torch.zeros(size, dtype=torch.int64) if level is None else level
     out, agreement = features.to(device, copy=True), []
@@ -147,12 +147,12 @@ def consensus(
         if portion.team.rank > 0:
             return Consensus(portion.team.spread(out), portion.team.tell(None), len(probability))
     rows = sampled.rows
-    total = seen_weights(sampled, torch.arange(len(rows), device=device), max(1, len(levels)))
+    total = total_view_weights(sampled, torch.arange(len(rows), device=device), max(1, len(levels)))
     for number in levels:
         columns = (level == number).nonzero().squeeze(1).to(device)
         part = rows if len(columns) == size else rows.select_columns(columns, size)
         overlaps = region_overlaps(part, evidence.region_view[columns], probability, total)
-        out[columns] = agreed(out[columns], overlaps, power, least)
+        out[columns] = apply_consensus(out[columns], overlaps, power, least)
         agreement.append(overlaps.agreement)
     if portion is not None:
         out, agreement = portion.team.spread(out), portion.team.tell(agreement)
@@ -160,15 +160,15 @@ def consensus(
 
 
 def _gather_sampled(
-    sampled: Evidence, gaussians: Int64[Tensor, " m"], probability: Float64[Tensor, " m"], team: Team
+    sampled: Evidence, gaussians: Int64[Tensor, " m"], probability: Float64[Tensor, " m"], team: Communicator
 ) -> tuple[Evidence, Float64[Tensor, " all"]]:
     """Gather the sampled Gaussians of all processes and their sampling probabilities, ordered by index."""
     order = team.join(gaussians).argsort()
-    rows, unlabeled = (join_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
+    rows, unlabeled = (all_gather_sparse(team, part).select_rows(order) for part in (sampled.rows, sampled.unlabeled))
     return replace(sampled, rows=rows, unlabeled=unlabeled), team.join(probability)[order]
 
 
-def seen_reliability(scalars: Scalars, original: Scalars) -> Scalars:
+def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
     """Return the scalars of the lift of F' with the R of the lift of F, or R = 0 if F' gives no direction.
 
     Args:
@@ -178,11 +178,11 @@ def seen_reliability(scalars: Scalars, original: Scalars) -> Scalars:
     return replace(scalars, reliability=torch.where(scalars.norm > 0, original.reliability, 0.0))
 
 
-def agreed(
-    features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE
+def apply_consensus(
+    features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE_AGREEMENT
 ) -> Float[Tensor, "s d"]:
     """Return F' of the regions of one level. Regions without overlaps keep their rows unchanged."""
-    strength = min(1.0, max(0.0, (overlaps.agreement - least) / RISE))
+    strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features
     table = features.to(torch.promote_types(features.dtype, torch.float32))
@@ -194,8 +194,8 @@ def agreed(
     return torch.where(alone, features, (total / length).to(features.dtype))
 
 
-def sampled_gaussians(
-    rows: SparseRows, num_columns: int, least: int, portion: Portion | None = None
+def sample_gaussians(
+    rows: SparseRows, num_columns: int, least: int, portion: Partition | None = None
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, " m"]]:
     """Sample Gaussians until every region has at least `least` of them, or all that it contains.
 
@@ -207,7 +207,7 @@ def sampled_gaussians(
     Returns:
         The sampled rows, and the sampling probability of each.
     """
-    add = ALONE.add if portion is None else portion.team.add
+    add = SINGLE_PROCESS.add if portion is None else portion.team.add
     count = add(torch.bincount(rows.column, minlength=num_columns))
     share = ((least + 3 * least**0.5) / count.double().clamp(min=1)).clamp(max=1)
     index = torch.arange(len(rows), device=rows.offsets.device) if portion is None else portion.gaussians
@@ -222,7 +222,7 @@ def sampled_gaussians(
         share = torch.where(lacking, (2 * share).clamp(max=1), share)
 
 
-def seen_weights(evidence: Evidence, gaussians: Int64[Tensor, " m"], levels: int = 1) -> SparseRows:
+def total_view_weights(evidence: Evidence, gaussians: Int64[Tensor, " m"], levels: int = 1) -> SparseRows:
     """Return W_jv of some Gaussians, [M, views], including pixels without a region.
 
     Args:
@@ -275,7 +275,7 @@ def region_overlaps(
 
 def _hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
     """Return a well-mixed number in [0, 1) for every index, computed by the last step of MurmurHash3."""
-    x = index + SEED
+    x = index + SAMPLING_SEED
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
     return (x ^ (x >> 16)).double() / 2**32
@@ -283,8 +283,8 @@ def _hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
 
 def _largest_share(rows: SparseRows, share: Float64[Tensor, " s"]) -> Float64[Tensor, " n"]:
     """Return the largest share among the columns of every row, 0 for an empty row."""
-    if kernels_apply(share):
-        from normlift_ns.kernels.overlaps import row_max  # noqa: PLC0415 (needs triton)
+    if can_use_triton(share):
+        from normlift_ns.kernels.sparse import row_max  # noqa: PLC0415 (needs triton)
 
         return row_max(rows.offsets, rows.column, share)
     return torch.segment_reduce(share[rows.column.long()], "max", offsets=rows.offsets, initial=0.0)
@@ -370,7 +370,7 @@ def _inner_products(
     order = shares.column.argsort(stable=True)
     row, weight = shares.row_index()[order].int(), shares.weight[order]
     by_region = SparseRows(row_offsets(shares.column, len(view)), row, weight)  # the transpose
-    if kernels_apply(view):
+    if can_use_triton(view):
         step = max(1, _MAX_DENSE // max(1, len(view)))
         for first in range(0, len(view), step):
             last = min(len(view), first + step)
@@ -391,10 +391,10 @@ def _dense_block(
     first: int,
     last: int,
 ) -> _Block:
-    from normlift_ns.kernels.overlaps import products  # noqa: PLC0415 (needs triton)
+    from normlift_ns.kernels.sparse import multiply_rows  # noqa: PLC0415 (needs triton)
 
-    area, in_regions = (products(by_region, x, views, first, last) for x in (visible, labeled))
-    inner = products(by_region, shares, len(view), first, last)
+    area, in_regions = (multiply_rows(by_region, x, views, first, last) for x in (visible, labeled))
+    inner = multiply_rows(by_region, shares, len(view), first, last)
     row, column = ((inner >= (MIN_OVERLAP * area)[:, view]) & (inner > 0) & (view[first:last, None] != view)).nonzero(
         as_tuple=True
     )

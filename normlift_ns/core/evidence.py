@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.disk.field_file import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
-from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.core.sparse import SparseRows, row_offsets, segment_sum
 from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.field import EVIDENCE_COUNTS, EVIDENCE_FORMAT, EvidenceArrays, read_evidence
 
 UNLABELED, MASKED = -1, -2
 """Labels of pixels that have no region, and of pixels that do not count as observations."""

@@ -16,28 +16,23 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 
-from normlift_ns.core.disk.field_file import EVIDENCE_FILE, FIELD_FILE, SCALARS, read_field
-from normlift_ns.core.disk.manifest import (
-    MANIFEST,
-    REMEDY,
-    SCHEMA_VERSION,
-    write_manifest,
-)
-from normlift_ns.core.disk.tensors import save_tensors
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted, Scalars
-from normlift_ns.core.lowrank import smallest_basis
-from normlift_ns.core.portions import ALONE, Portion
-from normlift_ns.core.query import relevancy
-from normlift_ns.core.storage import (
+from normlift_ns.core.lowrank import (
     StoredDirections,
     StoredEvidence,
     sizes_and_bounds,
+    smallest_basis,
     store_directions,
     store_evidence,
 )
+from normlift_ns.core.partition import SINGLE_PROCESS, Partition
+from normlift_ns.core.relevancy import relevancy
 from normlift_ns.errors import InputError
-from normlift_ns.options import RULES, Rule, Storage
+from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
+from normlift_ns.io.manifest import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
+from normlift_ns.options import RELEVANCY_RULES, RelevancyRule, Storage
 
 
 @dataclass(frozen=True)
@@ -107,7 +102,7 @@ class SemanticField:
                 f"{None if source is None else len(source)}"
             )
         options = {"tolerance": tolerance, "storage": storage, "provenance": provenance}
-        result = SemanticField.build_together(lifted, means, source, Portion.of(ALONE, means), **options)
+        result = SemanticField.build_together(lifted, means, source, Partition.of(SINGLE_PROCESS, means), **options)
         assert result is not None
         return result
 
@@ -116,7 +111,7 @@ class SemanticField:
         lifted: Lifted,
         means: Float[Tensor, "n 3"],
         source: Int[Tensor, " m"] | None,
-        portion: Portion,
+        portion: Partition,
         *,
         tolerance: float,
         storage: Storage | Literal["auto"],
@@ -200,7 +195,7 @@ class SemanticField:
         text_vectors: Float[Tensor, "q d"],
         negatives: Float[Tensor, "b d"] | None = None,
         *,
-        rule: Rule = "cosine",
+        rule: RelevancyRule = "cosine",
         refined: bool = True,
     ) -> Float[Tensor, "n q"]:
         """Return the relevancy of every Gaussian to Q text vectors: `query` followed by `relevancy`.
@@ -215,7 +210,7 @@ class SemanticField:
             text_vectors if negatives is None else torch.cat([text_vectors, negatives]), refined=refined
         )
         values = relevancy(cosine[:, :count], cosine[:, count:], rule=rule)
-        return torch.where(self.valid(refined=refined)[:, None], values, RULES[rule].least)
+        return torch.where(self.valid(refined=refined)[:, None], values, RELEVANCY_RULES[rule].least)
 
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
         """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
@@ -237,11 +232,13 @@ class SemanticField:
             OSError: if a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
-        if (folder / MANIFEST).exists() and not overwrite:
+        if (folder / MANIFEST_FILE).exists() and not overwrite:
             raise FileExistsError(
                 f"{folder} already holds a semantic field; choose another folder or allow overwriting"
             )
-        (folder / MANIFEST).unlink(missing_ok=True)  # a folder without a manifest is incomplete and may be overwritten
+        (folder / MANIFEST_FILE).unlink(
+            missing_ok=True
+        )  # a folder without a manifest is incomplete and may be overwritten
         digests = {FIELD_FILE: save_tensors(folder / FIELD_FILE, dict(_tensors(self)), overwrite=True)}
         if isinstance(self.store, StoredEvidence):
             digests[EVIDENCE_FILE] = self.store.evidence.save(folder / EVIDENCE_FILE)
@@ -268,7 +265,7 @@ class SemanticField:
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         if means is not None:
             _check_belongs(manifest, tensors.get("means"), means, folder, checkpoint)
-        scalars = Scalars(**{name: tensors[name] for name in SCALARS})
+        scalars = Scalars(**{name: tensors[name] for name in SCALAR_NAMES})
         if evidence is not None:
             store = StoredEvidence(Evidence.of_arrays(evidence), tensors["features"])
         else:
@@ -307,7 +304,7 @@ def _check_belongs(
     if manifest["num_gaussians"] != len(means):
         raise InputError(
             f"the semantic field in {folder} has {manifest['num_gaussians']} Gaussians, but {checkpoint} has "
-            f"{len(means)}; {REMEDY}"
+            f"{len(means)}; {LIFT_AGAIN}"
         )
     if stored is None:
         same = manifest["means_fingerprint"] == fingerprint(means)
@@ -316,5 +313,5 @@ def _check_belongs(
     if not same:
         raise InputError(
             f"the semantic field in {folder} was lifted from other Gaussians than those of {checkpoint} (same "
-            f"number, other means); {REMEDY}"
+            f"number, other means); {LIFT_AGAIN}"
         )

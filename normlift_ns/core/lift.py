@@ -21,12 +21,12 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from normlift_ns.core.checks import check_tensors, check_unit_rows
+from normlift_ns.core.device import can_use_triton
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.gpu import kernels_apply
-from normlift_ns.core.sparse import CANCELLED, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
+from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
+from normlift_ns.core.validation import check_tensors, check_unit_rows
 from normlift_ns.errors import InputError
-from normlift_ns.options import Unlabeled
+from normlift_ns.options import UnlabeledMode
 
 _MIN_WEIGHT, _MAX_WEIGHT = 1e-15, 1e15
 """Smallest W_j that counts as evidence, and largest valid E_js; squares of sums then fit into float32. Weights of a
@@ -130,10 +130,10 @@ class Lifted:
     def _directions(self, gaussians: Tensor, dtype: torch.dtype) -> Tensor:
         rows, table = self.evidence.rows, self.features
         if _has_kernel(table):
-            from normlift_ns.kernels.sums import unit_sums  # noqa: PLC0415 (needs triton)
+            from normlift_ns.kernels.sparse import unit_sums  # noqa: PLC0415 (needs triton)
 
             arrays = (rows.offsets, rows.column, rows.weight, table, self.scalars.norm)
-            return unit_sums(gaussians.long(), *arrays, dtype, CANCELLED, MANY_ENTRIES)
+            return unit_sums(gaussians.long(), *arrays, dtype, CANCELLATION_RATIO, MANY_ENTRIES)
         sums = rows.select_rows(gaussians).sums_of_unit_rows(table)
         length = torch.linalg.vector_norm(sums, dim=1, keepdim=True)
         return torch.where((self.scalars.norm[gaussians] > 0)[:, None], sums / length, 0.0).to(dtype)
@@ -154,7 +154,7 @@ class _Sums(NamedTuple):
 
 
 def lift(
-    evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: Unlabeled = "ignore"
+    evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: UnlabeledMode = "ignore"
 ) -> Lifted:
     """Compute directions u_j and reliability R_j of all Gaussians.
 
@@ -225,11 +225,13 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
 
 def _sums(evidence: Evidence, table: Tensor) -> _Sums:
     if _has_kernel(table):
-        from normlift_ns.kernels.sums import row_norms  # noqa: PLC0415 (needs triton)
+        from normlift_ns.kernels.sparse import row_norms  # noqa: PLC0415 (needs triton)
 
         rows = evidence.rows
         return _Sums(
-            *row_norms(rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLED, MANY_ENTRIES)
+            *row_norms(
+                rows.offsets, rows.column, rows.weight, evidence.region_view, table, CANCELLATION_RATIO, MANY_ENTRIES
+            )
         )
     total, by_view = _row_norms(evidence.rows, table), _sum_of_view_norms(evidence, table)
     return _Sums(total, by_view, *_weights(evidence.view_weights()))
@@ -263,7 +265,7 @@ def _sum_of_view_norms(evidence: Evidence, table: Tensor) -> Tensor:
 
 
 def _has_kernel(table: Tensor) -> bool:
-    return kernels_apply(table) and table.dtype == torch.float32
+    return can_use_triton(table) and table.dtype == torch.float32
 
 
 def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.gpu import kernels_apply
-from normlift_ns.core.portions import ALONE, Team
+from normlift_ns.core.device import can_use_triton
+from normlift_ns.core.partition import SINGLE_PROCESS, Communicator
 from normlift_ns.errors import InputError
-from normlift_ns.ranges import check_number
+from normlift_ns.options import check_number
 
-MOST_NEIGHBORS = 1024
+MAX_NEIGHBORS = 1024
 """Largest K. Memory grows with K times the number of Gaussians, and a vote compares all pairs of neighbors."""
 _MAX_UNCERTAIN = 1000
 """Largest number of Gaussians for which the GPU compares all distances; for more, the CPU's k-d tree is faster."""
@@ -54,7 +54,7 @@ def nearest_neighbors(
     *,
     of: Int64[Tensor, " m"] | None = None,
     progress: Progress | None = None,
-    team: Team = ALONE,
+    team: Communicator = SINGLE_PROCESS,
 ) -> Neighbors:
     """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
 
@@ -68,7 +68,7 @@ def nearest_neighbors(
         progress: called after every block of Gaussians with (Gaussians done, Gaussians).
         team: processes that call this function together, each for a part of the same Gaussians, and share the work.
     Raises:
-        ValueError: if `k` is less than 1 or more than `MOST_NEIGHBORS`.
+        ValueError: if `k` is less than 1 or more than `MAX_NEIGHBORS`.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors
@@ -76,9 +76,9 @@ def nearest_neighbors(
     >>> neighbors.index.tolist(), neighbors.distance.tolist()
     ([[1], [0], [1]], [[1.0], [1.0], [2.0]])
     """
-    if check_number("k", k, int) > MOST_NEIGHBORS:
-        raise InputError(f"k must be at most {MOST_NEIGHBORS:,}, got {k:,}: all neighbors are held in memory")
-    neighbors = _on_gpu(means.detach(), k, of, progress, team) if kernels_apply(means) else None
+    if check_number("k", k, int) > MAX_NEIGHBORS:
+        raise InputError(f"k must be at most {MAX_NEIGHBORS:,}, got {k:,}: all neighbors are held in memory")
+    neighbors = _on_gpu(means.detach(), k, of, progress, team) if can_use_triton(means) else None
     neighbors = _on_cpu(means, k, of, progress) if neighbors is None else neighbors
     if progress is not None:
         progress(len(neighbors.index), len(neighbors.index))
@@ -86,13 +86,13 @@ def nearest_neighbors(
 
 
 def _on_gpu(
-    means: Float[Tensor, "n 3"], k: int, of: Int64[Tensor, " m"] | None, progress: Progress | None, team: Team
+    means: Float[Tensor, "n 3"], k: int, of: Int64[Tensor, " m"] | None, progress: Progress | None, team: Communicator
 ) -> Neighbors | None:
     """Find neighbors on the GPU; return None if the kernel does not apply or cannot certify its result."""
     from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
 
     finite = means.isfinite().all(dim=1)
-    if means.dtype != torch.float32 or k > nearest.MOST_NEIGHBORS or not bool(finite.any()):
+    if means.dtype != torch.float32 or k > nearest.MAX_TREE_NEIGHBORS or not bool(finite.any()):
         return None
     all_finite = bool(finite.all())
     points, queries = means if all_finite else means[finite], of
@@ -106,13 +106,13 @@ def _on_gpu(
         if progress is not None and done < rows:
             progress(done, rows)
 
-    result = nearest.nearest(points, k, of=queries, done=None if progress is None else report, team=team)
+    result = nearest.find_nearest(points, k, of=queries, done=None if progress is None else report, team=team)
     uncertain = (~result.certain).nonzero().squeeze(1)
     if uncertain.numel() > _MAX_UNCERTAIN:
         return None
     if uncertain.numel() > 0:
         uncertain_points = uncertain if queries is None else queries[uncertain]
-        for array, exact in zip(result, nearest.nearest_of_rows(points, uncertain_points, k)):
+        for array, exact in zip(result, nearest.brute_force_nearest(points, uncertain_points, k)):
             array[uncertain] = exact
     if all_finite or of is None:
         return Neighbors(result.index, result.distance, result.spacing)

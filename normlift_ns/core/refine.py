@@ -10,18 +10,18 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.core.checks import check_not_negative, check_tensors, check_unit_rows
-from normlift_ns.core.gpu import in_parts, kernels_apply
+from normlift_ns.core.device import can_use_triton, retry_in_halves
 from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
-from normlift_ns.core.portions import GRAIN, spatial_order
+from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
+from normlift_ns.core.validation import check_not_negative, check_tensors, check_unit_rows
 from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
 """Elements of the largest tensor of a vote in torch, on the CPU (bounded by its caches) and on the GPU."""
-_BLOCK = (2 * GRAIN, 16 * GRAIN)
+_BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
 """Number of Gaussians whose directions and neighbors' directions are in memory at a time, on CPU and GPU."""
-MOST_VOTERS = 256
+MAX_VOTERS = 256
 """Largest K of a vote. Its time grows with the square of K, because it compares all pairs of neighbors."""
 _MAX_KERNEL_NEIGHBORS = 63
 """Largest K that `kernels.vote` supports."""
@@ -82,7 +82,7 @@ def refine(
     skipped = (None, directions) if callable(directions) else (None,)
     check_tensors(**{name: value for name, value in arguments.items() if not any(value is x for x in skipped)})
     n, config = means.shape[0], config or RefineConfig(vote="paper" if own is None else "posterior")
-    config = config if neighbors is not None else possible(config, n)
+    config = config if neighbors is not None else clamp_k(config, n)
     table = directions if isinstance(directions, Tensor) else None
     shape = (n, 0) if table is None else tuple(table.shape)
     if len(shape) != 2 or shape[0] != n or tuple(reliability.shape) != (n,):
@@ -105,13 +105,13 @@ def refine(
     if tuple(neighbors.index.shape) != (n, config.k):
         raise InputError(f"neighbors.index has shape {tuple(neighbors.index.shape)}, expected {(n, config.k)}")
     neighbors = Neighbors(*(x.contiguous() for x in neighbors))
-    if table is not None and kernels_apply(means) and table.dtype == torch.float32:
+    if table is not None and can_use_triton(means) and table.dtype == torch.float32:
         directions = table.__getitem__  # in blocks, because the kernel needs as much memory again
     order, width = spatial_order(means), decay_width(neighbors.spacing, config)
-    return vote_of(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
+    return refine_subset(order, neighbors, directions, reliability, config, own=own, width=width, progress=progress)
 
 
-def vote_of(
+def refine_subset(
     voters: Int64[Tensor, " v"],
     neighbors: Neighbors,
     directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
@@ -132,7 +132,7 @@ def vote_of(
         width: sigma_d, in the units of the distances.
         progress: as in `refine`.
     """
-    n, device, on_gpu = len(reliability), reliability.device, kernels_apply(reliability)
+    n, device, on_gpu = len(reliability), reliability.device, can_use_triton(reliability)
     decay = float(width)
     source, row_of = (torch.arange(n, dtype=torch.int32, device=device) for _ in range(2))
     can_change = _any_reliable(neighbors, reliability)[voters]  # without a reliable neighbor, none can win
@@ -153,34 +153,32 @@ def vote_of(
     ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
     for block in voters[can_change].tensor_split(ends):
         if len(block) > 0:
-            in_parts(vote, block, "refine on the CPU")
+            retry_in_halves(vote, block, "refine on the CPU")
         done = min(done + size, len(voters))
         if progress is not None:
             progress(done, len(voters))
     return source
 
 
-def possible(config: RefineConfig, n: int) -> RefineConfig:
-    """Resolve the options of a vote, and limit K to the number of other Gaussians and to `MOST_VOTERS`.
+def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
+    """Resolve the options of a vote, and limit K to the number of other Gaussians and to `MAX_VOTERS`.
 
     A warning reports a smaller K.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as caught:
-    ...     possible(RefineConfig(k=100), 5).k, str(caught[0].message)
+    ...     clamp_k(RefineConfig(k=100), 5).k, str(caught[0].message)
     (4, 'k is 100, but a Gaussian has only 4 others; the vote uses 4 neighbors')
     """
     config = replace(config, **config.numbers._asdict())
-    k = min(config.k, max(1, n - 1), MOST_VOTERS)
+    k = min(config.k, max(1, n - 1), MAX_VOTERS)
     if k == config.k:
         return config
     if n < 2:
         warnings.warn(f"with {n} Gaussian{'s' * (n != 1)}, there are no neighbors and nothing to vote on", stacklevel=2)
         return replace(config, k=k)
     reason = (
-        f"a Gaussian has only {n - 1:,} other{'s' * (n != 2)}"
-        if k < MOST_VOTERS
-        else f"at most {MOST_VOTERS:,} can vote"
+        f"a Gaussian has only {n - 1:,} other{'s' * (n != 2)}" if k < MAX_VOTERS else f"at most {MAX_VOTERS:,} can vote"
     )
     warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbor{'s' * (k != 1)}", stacklevel=2)
     return replace(config, k=k)
@@ -334,19 +332,19 @@ def unsupported(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[
 
 def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """Return a mask of the Gaussians with a neighbor that has R > 0."""
-    if kernels_apply(neighbors.index):
-        from normlift_ns.kernels.vote import any_reliable  # noqa: PLC0415 (needs triton)
+    if can_use_triton(neighbors.index):
+        from normlift_ns.kernels.vote import has_reliable_neighbor  # noqa: PLC0415 (needs triton)
 
-        return any_reliable(neighbors.index.contiguous(), reliability)
+        return has_reliable_neighbor(neighbors.index.contiguous(), reliability)
     return (_gather(reliability, neighbors.index) > 0).any(dim=1)
 
 
 def _members(voters: Int[Tensor, " v"], neighbors: Neighbors, n: int) -> Int64[Tensor, " m"]:
     """Return the distinct voters and neighbors among n Gaussians, ascending."""
-    if kernels_apply(neighbors.index):
-        from normlift_ns.kernels.vote import members  # noqa: PLC0415 (needs triton)
+    if can_use_triton(neighbors.index):
+        from normlift_ns.kernels.vote import voters_and_neighbors  # noqa: PLC0415 (needs triton)
 
-        return members(voters, neighbors.index, n)
+        return voters_and_neighbors(voters, neighbors.index, n)
     group = torch.cat([voters, neighbors.index[voters].flatten().long()])
     mask = torch.zeros(n, dtype=torch.bool, device=voters.device)
     mask[group[group >= 0]] = True

@@ -11,10 +11,10 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from normlift_ns.core.gpu import kernels_apply
+from normlift_ns.core.device import can_use_triton
 from normlift_ns.errors import InputError
 
-CANCELLED = 1e-3
+CANCELLATION_RATIO = 1e-3
 """A vector sum shorter than this share of its weight is recomputed in float64, because its float32 digits cancel."""
 MANY_ENTRIES = 4096
 """Sums of more vectors than this are computed in float64, because rounding errors of float32 would add up."""
@@ -36,10 +36,10 @@ def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float
     """
     if values.numel() == 0:
         return torch.zeros(offsets.numel() - 1, dtype=torch.float64, device=values.device)
-    if kernels_apply(values):
-        from normlift_ns.kernels import sums  # noqa: PLC0415 (needs triton)
+    if can_use_triton(values):
+        from normlift_ns.kernels import sparse  # noqa: PLC0415 (needs triton)
 
-        return sums.segment_sum(values, offsets)
+        return sparse.segment_sum(values, offsets)
     return torch.segment_reduce(values.double(), "sum", offsets=offsets, initial=0.0)
 
 
@@ -160,10 +160,10 @@ class SparseRows:
         """Return the dense product with a table for all rows, in the table's precision."""
         if self.weight.numel() == 0:
             return table.new_zeros(len(self), table.shape[1])
-        if kernels_apply(table) and table.shape[1] <= _MAX_NARROW_COLUMNS:
-            from normlift_ns.kernels import sums  # noqa: PLC0415 (needs triton)
+        if can_use_triton(table) and table.shape[1] <= _MAX_NARROW_COLUMNS:
+            from normlift_ns.kernels import sparse  # noqa: PLC0415 (needs triton)
 
-            columns = [sums.product(self.offsets, self.column, self.weight, x.contiguous()) for x in table.T]
+            columns = [sparse.multiply_vector(self.offsets, self.column, self.weight, x.contiguous()) for x in table.T]
             return torch.stack(columns, dim=1)
         if table.device.type == "cpu" and table.shape[1] <= _MAX_NARROW_COLUMNS:  # ten times as fast as embedding_bag
             if self.num_columns > len(table):
@@ -204,7 +204,7 @@ class SparseRows:
         sums = self.matmul(table)
         if table.dtype == torch.float64:
             return sums
-        weak = torch.linalg.vector_norm(sums, dim=1) < CANCELLED * self.row_sums()
+        weak = torch.linalg.vector_norm(sums, dim=1) < CANCELLATION_RATIO * self.row_sums()
         weak = (weak | (self.offsets.diff() > MANY_ENTRIES)).nonzero().squeeze(1)
         if weak.numel() > 0:
             rows = self.select_rows(weak)

@@ -1,9 +1,14 @@
 """The demo room, a small synthetic scene with ground truth: tensors, a nerfstudio dataset and a trained run."""
 
-from normlift_ns.demo.build import DemoRoom
-from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture
-from normlift_ns.demo.room import demo_room
-from normlift_ns.demo.run import write_splatfacto_run
+from normlift_ns.demo.capture import (
+    demo_cameras,
+    held_out_cameras,
+    view_image,
+    view_labels,
+    write_capture,
+    write_splatfacto_run,
+)
+from normlift_ns.demo.room import DemoRoom, demo_room
 
 __all__ = [
     "DemoRoom",

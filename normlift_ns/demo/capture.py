@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from normlift_ns.core.files import new_file, write_text
-from normlift_ns.core.gaussians import Camera
-from normlift_ns.demo.build import DemoRoom
-from normlift_ns.raster.rasterize import render
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.demo.room import DemoRoom
+from normlift_ns.io.atomic import atomic_file, write_text_file
+from normlift_ns.rasterization.rasterize import render
 
 WIDTH, HEIGHT = 400, 300
 """Size of an image, in pixels."""
@@ -65,7 +69,7 @@ def write_capture(
     for path, camera in zip(paths, cameras):
         color, shares = render(room.scene, camera, channels)[0].tensor_split([3], dim=2)
         for file, pixels in ((path, _image(color)), (f"instance/{Path(path).name}", _labels(shares))):
-            with new_file(folder / file, overwrite=True) as draft:
+            with atomic_file(folder / file, overwrite=True) as draft:
                 Image.fromarray(pixels.numpy()).save(draft, compress_level=1)
     (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
     transforms = {
@@ -79,7 +83,7 @@ def write_capture(
     }
     labels = {"labels": {str(i): name for i, name in enumerate(room.names, 1)}, "background": 0}
     for name, content in (("transforms.json", transforms), ("labels.json", labels)):
-        write_text(folder / name, json.dumps(content, indent=1), overwrite=True)
+        write_text_file(folder / name, json.dumps(content, indent=1), overwrite=True)
 
 
 def _one_hot(room: DemoRoom) -> Float[Tensor, "n classes"]:
@@ -118,3 +122,85 @@ def _look_at(
 def _opengl_pose(camera: Camera) -> Float[Tensor, "4 4"]:
     """Return camera to world with x right, y up, z backward."""
     return camera.world_to_camera.double().inverse() * torch.tensor([1, -1, -1, 1], dtype=torch.float64)
+
+
+# The demo room as a splatfacto run, written by nerfstudio's own trainer without training.
+
+
+def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path) -> Path:
+    """Write output_dir/<name of the capture>/splatfacto/<time> as `ns-train splatfacto` does, on the CPU, in seconds.
+
+    The stock trainer sets up everything and saves its full checkpoint, including optimizers and schedulers. It does so
+    after one step with zero gradients, which does not change the Gaussians of the room. Only the weights of the LPIPS
+    metric are missing from the checkpoint.
+
+    Args:
+        capture_folder: folder written by `write_capture`. The config contains this path unchanged, relative or
+            absolute.
+    Returns:
+        The run's config.yml.
+    Raises:
+        AssertionError: `capture_folder` does not exist (nerfstudio's message).
+    """
+    from nerfstudio.models.splatfacto import RGB2SH  # noqa: PLC0415
+
+    config = splatfacto_config()
+    config.data = config.pipeline.datamanager.data = capture_folder
+    config.output_dir = output_dir
+    config.machine.device_type = "cpu"
+    config.vis = "tensorboard"  # the default starts a viewer
+    config.max_num_iterations = 1
+    config.pipeline.model.num_random = len(room.scene)
+    config.set_timestamp()
+    config.save_config()
+    config.vis = "none"  # no training, so no log, whose thread would write until the process ends
+    trainer = config.setup()
+    with (
+        # The metric would download its weights.
+        patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()),
+        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # global in the process; another training has its own
+    ):
+        trainer.setup()
+    dataset = trainer.pipeline.datamanager.train_dataparser_outputs
+    dataset.save_dataparser_transform(trainer.base_dir / "dataparser_transforms.json")
+    scene = to_dataparser_world(room.scene, dataset.dataparser_transform, dataset.dataparser_scale)
+    parameters = trainer.pipeline.model.gauss_params
+    values = {
+        "means": scene.means,
+        "scales": scene.scales.log(),
+        "quats": scene.quats,
+        "opacities": scene.opacities.logit()[:, None],
+        "features_dc": RGB2SH(room.colors),
+        "features_rest": torch.zeros_like(parameters["features_rest"]),
+    }
+    for name, value in values.items():
+        parameters[name].data.copy_(value)
+        parameters[name].grad = torch.zeros_like(value)
+    trainer.optimizers.optimizer_step_all()
+    trainer.optimizers.scheduler_step_all(0)
+    trainer.save_checkpoint(0)
+    return trainer.base_dir / "config.yml"
+
+
+def splatfacto_config() -> Any:
+    """Return nerfstudio's method splatfacto without importing the list of all its methods, which takes seconds
+    longer."""
+    from nerfstudio.models.splatfacto import SplatfactoModelConfig  # noqa: PLC0415
+    from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig  # noqa: PLC0415
+
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    config = copy.deepcopy(normlift_method.config)
+    config.method_name = "splatfacto"
+    config.pipeline = VanillaPipelineConfig(datamanager=config.pipeline.datamanager, model=SplatfactoModelConfig())
+    return config
+
+
+def to_dataparser_world(scene: GaussianScene, transform: Float[Tensor, "3 4"], scale: float) -> GaussianScene:
+    """Transform the scene to the world of nerfstudio's dataparser, p' = scale (R p + t) with transform = [R | t]."""
+    rotation = Rotation.from_matrix(transform[:, :3].numpy())
+    means = scale * (scene.means @ transform[:, :3].T + transform[:, 3])
+    quats = (rotation * Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy())).as_quat()  # SciPy puts w last
+    return GaussianScene(
+        means, torch.from_numpy(quats).roll(1, dims=1).to(means), scale * scene.scales, scene.opacities
+    )

@@ -1,21 +1,363 @@
-"""The demo room: objects with the names of their colors, on a table, in a room with light and texture.
-
-The color encoder knows only names of colors. Many names in the XKCD color survey are names of objects. The prompt
-"tomato red" thus finds the tomatoes here, by their color.
-"""
+"""Synthetic rooms: Gaussians of known class on the surfaces of parts, as a reproducible benchmark for any lift."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from jaxtyping import Float, Int64
 from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
-from normlift_ns.demo import paint, things
-from normlift_ns.demo.build import HALF_WIDTH, HEIGHT, DemoRoom, Part, Surface, built
-from normlift_ns.demo.light import shade
-from normlift_ns.demo.shapes import Array, box, capsule, cavity, cone, place, union
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.demo import shapes
+from normlift_ns.demo.shapes import (
+    ON_SURFACE,
+    Array,
+    Distance,
+    box,
+    capsule,
+    cavity,
+    cone,
+    fit_surfels,
+    map_threaded,
+    place,
+    project_to_surface,
+    row_lengths,
+    sample_near_surface,
+    union,
+)
+from normlift_ns.errors import InputError
+
+HALF_WIDTH = 1.6
+"""Half the side of the floor, the square -HALF_WIDTH..HALF_WIDTH in x and y at z = 0, in meters; z is up."""
+HEIGHT = 1.8
+"""Height of the walls in meters. There is no ceiling."""
+
+_OPACITY = 0.97
+_POINTS_PER_GAUSSIAN = 12
+"""Average number of points per Gaussian in the dense sample that surfaces are divided from."""
+_STRAY_SHARE = 0.1
+"""Share of all Gaussians."""
+_FLOATER_SHARE = 0.02
+"""Share of all Gaussians."""
+_MARGIN = 0.05
+"""Maximum extent of a part beyond the bounding box of its sample, in meters."""
+_FAINT_OPACITIES = (0.001, 0.1)
+"""Range of the opacities of strays and floaters. A Gaussian below 1 / 255 is never drawn."""
+
+
+@dataclass(frozen=True)
+class DemoRoom:
+    """N Gaussians of known color and class."""
+
+    scene: GaussianScene
+    """Gaussians in meters, z up, float32."""
+    colors: Float[Tensor, "n 3"]
+    """sRGB in 0..1."""
+    labels: Int64[Tensor, " n"]
+    """Class of every Gaussian, an index into `names`; -1 for a floater, which belongs to no class."""
+    names: tuple[str, ...]
+    """Name of each class, from the XKCD color survey."""
+
+
+class Part(NamedTuple):
+    """Surface of a class. A room may have several parts of the same class."""
+
+    name: str
+    """Name of the class."""
+    detail: float
+    """Gaussians per square meter, relative to the walls."""
+    shape: Distance
+    paint: Callable[[Array], Array] | None = None
+    """Factors [n, 3] or [n, 1] on the color of the class at points [n, 3] of the surface; None for a plain color."""
+    gloss: float = 0.0
+    """Brightness of highlights."""
+
+
+class Surface(NamedTuple):
+    """Positions, normals and parts of the opaque Gaussians in a room."""
+
+    means: Array
+    normals: Array
+    parts: NDArray[np.int64]
+    """[n], indices of the room's parts"""
+
+
+Painter = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
+"""sRGB [n, 3] of the Gaussians on a surface, including light and shadow; values may leave 0..1."""
+
+
+class _Gaussians(NamedTuple):
+    means: Array
+    normals: Array
+    """[n, 3], unit; the third axis of `scales`."""
+    scales: Array
+    opacities: Array
+    colors: Array
+    labels: NDArray[Any]
+    """[n], integers: indices of parts"""
+
+
+def class_names(parts: Sequence[Part]) -> tuple[str, ...]:
+    """Return the names of the classes, in the order of their first parts."""
+    return tuple(dict.fromkeys(part.name for part in parts))
+
+
+def build_room(parts: Sequence[Part], painter: Painter, area: float, num_gaussians: int, seed: int = 0) -> DemoRoom:
+    """Build a room. The same arguments give the same room.
+
+    Most Gaussians lie flat on the surfaces. As in trained scenes, some faint ones stray above and below the surfaces,
+    in places that the views contradict each other about or do not show. Others float in the air.
+
+    Args:
+        area: approximate visible area of all parts, each multiplied by its `detail`, in square meters.
+        num_gaussians: N, at least 2000.
+    Raises:
+        ValueError: `num_gaussians` is too small.
+    """
+    if num_gaussians < 2000:
+        raise InputError(f"num_gaussians must be at least 2000 to cover the shapes, got {num_gaussians}")
+    rng = np.random.default_rng(seed)
+    num_strays, num_floaters = int(_STRAY_SHARE * num_gaussians), int(_FLOATER_SHARE * num_gaussians)
+    surface = _surface(parts, painter, area, num_gaussians - num_strays - num_floaters, rng)
+    groups = surface, _strays(parts, surface, num_strays, rng), _floaters(num_floaters, rng)
+    means, normals, scales, opacities, colors, labels = (np.concatenate(values) for values in zip(*groups))
+    upper = normals * np.where(normals[:, 2:] < 0, -1, 1)
+    quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)  # z axis to normal
+    quats /= row_lengths(quats)[:, None]
+    scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
+    names = class_names(parts)
+    classes = np.array([*(names.index(part.name) for part in parts), -1])[labels.astype(int)]
+    return DemoRoom(scene, torch.from_numpy(colors.clip(0, 1)).float(), torch.from_numpy(classes), names)
+
+
+def _surface(parts: Sequence[Part], painter: Painter, area: float, count: int, rng: np.random.Generator) -> _Gaussians:
+    """Cover all surfaces with Gaussians, except for those inside other parts."""
+    low, high = np.array([-HALF_WIDTH, -HALF_WIDTH, 0]), np.array([HALF_WIDTH, HALF_WIDTH, HEIGHT])
+    density, shapes = _POINTS_PER_GAUSSIAN * count / area, [part.shape for part in parts]
+    near = [sample_near_surface(part.shape, low, high, density * part.detail, rng) for part in parts]
+    samples = _uncovered(shapes, map_threaded(partial(project_to_surface, low=low, high=high), shapes, near))
+    bounds = np.cumsum([len(points) for points in samples])
+    counts = np.diff(np.rint(bounds / bounds[-1] * count).astype(int), prepend=0)
+    first = [rng.choice(len(points), n, replace=False) for points, n in zip(samples, counts)]
+    covers = map_threaded(fit_surfels, shapes, samples, first)
+    means, normals, radii, thickness = (np.concatenate(values) for values in zip(*covers))
+    labels = np.repeat(np.arange(len(parts)), counts)
+    scales = np.stack([radii, radii, thickness], axis=1)
+    colors = painter(parts, Surface(means, normals, labels), rng)
+    return _Gaussians(means, normals, scales, np.full(count, _OPACITY), colors, labels)
+
+
+def _uncovered(shapes: Sequence[Distance], samples: Sequence[Array]) -> list[Array]:
+    """Return the points of each part that lie inside no other part."""
+    boxes = [
+        (points.min(axis=0, initial=np.inf) - _MARGIN, points.max(axis=0, initial=-np.inf) + _MARGIN)
+        for points in samples
+    ]
+
+    def uncovered(shape: Distance, points: Array) -> Array:
+        keep, axes = np.ones(len(points), bool), points.T.copy()
+        for other, (low, high) in zip(shapes, boxes):
+            if other is not shape:
+                inside = keep.copy()
+                for axis, least, most in zip(axes, low, high):
+                    inside &= (axis > least) & (axis < most)
+                near = np.flatnonzero(inside)
+                keep[near] = other(points[near]) > ON_SURFACE
+        return points[keep]
+
+    return map_threaded(uncovered, shapes, samples)
+
+
+def _strays(parts: Sequence[Part], surface: _Gaussians, count: int, rng: np.random.Generator) -> _Gaussians:
+    """Return faint copies of surface Gaussians, up to three radii above or below; each belongs to the nearest part."""
+    chosen = rng.choice(len(surface.labels), count)
+    heights = surface.scales[chosen, :1] * rng.uniform(-3, 3, (count, 1))
+    means = surface.means[chosen] + surface.normals[chosen] * heights
+    labels = np.argmin([np.abs(part.shape(means)) for part in parts], axis=0)
+    copies = _Gaussians(*(values[chosen] for values in surface))
+    return copies._replace(means=means, opacities=_faint(count, rng), labels=labels)
+
+
+def _floaters(count: int, rng: np.random.Generator) -> _Gaussians:
+    """Return faint gray Gaussians in the air."""
+    means = rng.uniform((-1.6, -1.6, 0.2), (1.6, 1.6, 2.0), (count, 3))
+    normals = rng.normal(size=(count, 3))
+    normals /= row_lengths(normals)[:, None]
+    scales = rng.uniform(0.005, 0.04, (count, 3))
+    colors = np.repeat(rng.uniform(0.4, 0.9, (count, 1)), 3, axis=1)
+    return _Gaussians(means, normals, scales, _faint(count, rng), colors, np.full(count, -1))
+
+
+def _faint(count: int, rng: np.random.Generator) -> Array:
+    low, high = np.log(_FAINT_OPACITIES)
+    return np.exp(rng.uniform(low, high, count))
+
+
+# Light baked into the colors of surfaces: lamps with soft shadows, gloss and contact shadows. Lengths are in meters.
+
+
+_SOFTNESS = 6.0
+"""Larger values sharpen the edges of shadows."""
+_GLOSS_POWER = 32
+"""Larger values make highlights smaller."""
+
+
+_LAMP, _LAMP_COLOR = np.array([-0.8, 0.9, 2.6]), np.array([0.5, 0.48, 0.45])
+"""Position of the lamp, and the warm light it casts on surfaces that face it."""
+_SKY_COLOR, _FLOOR_COLOR = np.array([0.62, 0.63, 0.65]), np.array([0.5, 0.49, 0.48])
+"""Ambient light on surfaces that face upward and downward."""
+_GRID_STEP = 0.04
+"""Side of the grid cells in which distances are interpolated for shadows."""
+_CHUNKS = 16
+"""Number of chunks that points are divided into. A few thousand points per chunk fit into processor caches."""
+_CONTACT_STRENGTH = 1.0
+"""Factor by which corners are darker than `contact_shadow`."""
+
+
+def shade(scene: Distance, points: Array, normals: Array) -> tuple[Array, Array]:
+    """Return the light on surface points, [n, 3] factors on their colors, and highlights, [n] in 0..1.
+
+    Args:
+        scene: distance to everything that casts a shadow.
+        points: [n, 3] on its surface.
+        normals: [n, 3], unit, outward.
+    """
+    to_lamp = _LAMP - points
+    distance = row_lengths(to_lamp)
+    to_lamp /= distance[:, None]
+    lit = visibility(_interpolated(scene, points), points + 0.02 * normals, to_lamp, distance)
+    facing = (normals * to_lamp).sum(axis=1).clip(0) * lit
+    upward = (1 + normals[:, 2:]) / 2
+    ambient = (_SKY_COLOR * upward + _FLOOR_COLOR * (1 - upward)) * (
+        1 - _CONTACT_STRENGTH * contact_shadow(scene, points, normals)[:, None]
+    )
+    return ambient + _LAMP_COLOR * facing[:, None], facing**_GLOSS_POWER
+
+
+def _interpolated(scene: Distance, points: Array) -> Distance:
+    """Return a fast approximation of the distance, interpolated on a grid around the scene."""
+    low, high = points.min(axis=0) - _GRID_STEP, points.max(axis=0) + _GRID_STEP
+    ticks = [np.arange(a, b + _GRID_STEP, _GRID_STEP) for a, b in zip(low, high)]
+    grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
+    values = _distances(scene, grid.reshape(-1, 3)).reshape(grid.shape[:3])
+    return lambda p: map_coordinates(values, ((p - low) / _GRID_STEP).T, order=1, mode="nearest")
+
+
+def visibility(scene: Distance, start: Array, direction: Array, distance: Array) -> Array:
+    """Return the share of a soft lamp that each point sees, [n], by sphere tracing that keeps the closest miss."""
+    visible, traveled = np.ones(len(start)), np.full(len(start), 0.03)
+    for _ in range(32):
+        clearance = scene(start + traveled[:, None] * direction)
+        visible = np.minimum(visible, (_SOFTNESS * clearance / traveled).clip(0, 1))
+        traveled = np.minimum(traveled + clearance.clip(0.02, 0.3), distance)
+    return visible
+
+
+def contact_shadow(scene: Distance, points: Array, normals: Array) -> Array:
+    """Return the darkening close to other surfaces, 0 to 0.45, [n]."""
+    probes = ((0.03, 0.1), (0.08, 0.15), (0.2, 0.2))  # height above the surface, weight
+    return np.sum([w * (1 - _distances(scene, points + h * normals) / h).clip(0, 1) for h, w in probes], axis=0)
+
+
+def _distances(scene: Distance, points: Array) -> Array:
+    return np.concatenate(map_threaded(scene, np.array_split(points, _CHUNKS)))
+
+
+# Textures as formulas: factors on the color of a surface at its points. Lengths are in meters.
+
+
+Paint = Callable[[Array], Array]
+"""Returns factors [n, 3] or [n, 1] at points [n, 3]."""
+
+_WAVES = 9
+"""Number of waves in the noise; fewer give a regular pattern."""
+
+
+def noise(points: Array, size: float, seed: int = 0) -> Array:
+    """Return smooth noise with spots of about `size`, [n], mean 0, mostly in -1..1: plane waves of random
+    directions."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(size=(_WAVES, 3)) * (2 / size)
+    return np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, _WAVES)).sum(axis=1) / np.sqrt(_WAVES)
+
+
+def mottled(size: float, depth: float, seed: int = 0) -> Paint:
+    """Return spots of about `size`, lighter and darker by about `depth`."""
+    return lambda p: 1 + depth * noise(p, size, seed)[:, None]
+
+
+def wood(width: float, across: int, ring: float = 0.035, joint: float = 0.006, contrast: float = 1.0) -> Paint:
+    """Return boards of `width` with grain, side by side along the horizontal axis `across` (0: x, 1: y).
+
+    Args:
+        ring: distance between the lines of the grain.
+        joint: half the width of the dark line between two boards.
+        contrast: contrast of the grain; dark woods need more.
+    """
+
+    def paint(p: Array) -> Array:
+        board = np.floor(p[:, across] / width)
+        local = p + 7.3 * board[:, None]  # each board has another part of the grain
+        stretched = local * np.where(np.arange(3) == 1 - across, 0.18, 1)  # the grain runs along the board
+        rings = stretched[:, across] / ring + 1.1 * noise(stretched, 0.12, 1)
+        grain = 0.09 * np.sin(2 * np.pi * rings) + 0.05 * noise(stretched, 0.03, 2)
+        tone = 0.09 * np.sin(board * 12.9898)
+        edge = np.abs(p[:, across] / width - board - 0.5) * width  # from the middle of the board
+        return ((1 + contrast * (grain + tone)) * np.where(edge > width / 2 - joint, 0.62, 1))[:, None]
+
+    return paint
+
+
+def woven(band: float, half_length: float, half_width: float) -> Paint:
+    """Return the pattern of a rug around the origin, with rows of diamonds of length `band` and a darker border."""
+
+    def paint(p: Array) -> Array:
+        x, y = p[:, 0] / band, p[:, 1] / band
+        diamond = np.abs((x % 1) - 0.5) + np.abs((y % 1) - 0.5)
+        tone = np.where(diamond < 0.2, 1.15, np.where(diamond < 0.4, 0.7, 0.95))
+        to_edge = np.minimum(half_length - np.abs(p[:, 0]), half_width - np.abs(p[:, 1]))
+        tone = np.where(to_edge < 0.4 * band, np.where(to_edge < 0.2 * band, 0.6, 1.1), tone)
+        return (tone * (1 + 0.04 * noise(p, 0.03, 3)))[:, None]
+
+    return paint
+
+
+def cloth(thread: float = 0.03) -> Paint:
+    """Return a slightly uneven weave of crossing threads."""
+    return lambda p: (
+        1 + 0.05 * np.sin(2 * np.pi * (p[:, :1] + p[:, 2:]) / thread) * np.sin(2 * np.pi * p[:, 1:2] / thread)
+    ) * (1 + 0.05 * noise(p, 0.12, 4)[:, None])  # fmt: skip
+
+
+def ribs(count: int, depth: float) -> Paint:
+    """Return dark furrows between the ribs of `things.gourd`."""
+
+    def paint(p: Array) -> Array:
+        furrow = 1 - np.abs(np.cos(count / 2 * np.arctan2(p[:, 1], p[:, 0])))
+        return ((1 - depth * furrow**2) * (1 + 0.03 * noise(p, 0.05, 5)))[:, None]
+
+    return paint
+
+
+def banded(tones: Callable[[Array], Array], tint: tuple[float, float, float]) -> Paint:
+    """Return `tint` at points whose `tones` is 1, and the plain color at those whose `tones` is 0."""
+    return lambda p: 1 + tones(p).clip(0, 1)[:, None] * (np.array(tint) - 1)
+
+
+# The demo room: objects with the names of their colors, on a table, in a room with light and texture.
+#
+# The color encoder knows only names of colors. Many names in the XKCD color survey are names of objects. The prompt
+# "tomato red" thus finds the tomatoes here, by their color.
+
 
 _TABLE = 0.62
 """Height of the table top in meters."""
@@ -43,7 +385,7 @@ def demo_room(num_gaussians: int = 45_000, seed: int = 0) -> DemoRoom:
     Raises:
         ValueError: `num_gaussians` is too small.
     """
-    return built([*_walls(), *_furniture(), *_plant(), *_fruit()], _painted, _DETAILED_AREA, num_gaussians, seed)
+    return build_room([*_walls(), *_furniture(), *_plant(), *_fruit()], _painted, _DETAILED_AREA, num_gaussians, seed)
 
 
 def _painted(parts: Sequence[Part], surface: Surface, rng: np.random.Generator) -> Array:
@@ -83,9 +425,9 @@ def _walls() -> list[Part]:
         *(place(box(0.05, 1.29, 0.05, 0.01), w - 0.01, 0, z) for z in (0.78, 1.2, 1.62)),
     ]
     return [
-        Part("white", 1, cavity(box(2 * w, 2 * w, 4 * HEIGHT)), paint.mottled(0.3, 0.012)),
-        Part("slate", 2, place(box(2 * w, 2 * w, 0.1), 0, 0, -0.05), paint.wood(0.2, 1)),
-        Part("sky blue", 3, place(box(0.03, 1.2, 0.8), w, 0, 1.2), paint.mottled(0.35, 0.05, 8)),
+        Part("white", 1, cavity(box(2 * w, 2 * w, 4 * HEIGHT)), mottled(0.3, 0.012)),
+        Part("slate", 2, place(box(2 * w, 2 * w, 0.1), 0, 0, -0.05), wood(0.2, 1)),
+        Part("sky blue", 3, place(box(0.03, 1.2, 0.8), w, 0, 1.2), mottled(0.35, 0.05, 8)),
         Part("white", 16, union(*bars)),
     ]
 
@@ -100,11 +442,11 @@ def _furniture() -> list[Part]:
     )
     pillow = box(0.36, 0.13, 0.36, 0.062)
     return [
-        Part("merlot", 4, place(box(1.7, 2.0, 0.024, 0.01), 0, 0, 0.004), paint.woven(0.34, 0.85, 1.0)),
-        Part("cocoa", 11, union(place(box(1.08, 1.5, 0.06, 0.01), 0, 0, _TABLE - 0.03), *legs), paint.wood(0.27, 0)),
-        Part("teal", 4, place(sofa, 0.3, 1.27, 0), paint.cloth()),
-        _at(Part("merlot", 7, pillow, paint.cloth(0.05)), 0.72, 1.2, 0.56, 12, 0, -18),
-        _at(Part("merlot", 7, pillow, paint.cloth(0.05)), -0.12, 1.2, 0.56, -14, 0, -18),
+        Part("merlot", 4, place(box(1.7, 2.0, 0.024, 0.01), 0, 0, 0.004), woven(0.34, 0.85, 1.0)),
+        Part("cocoa", 11, union(place(box(1.08, 1.5, 0.06, 0.01), 0, 0, _TABLE - 0.03), *legs), wood(0.27, 0)),
+        Part("teal", 4, place(sofa, 0.3, 1.27, 0), cloth()),
+        _at(Part("merlot", 7, pillow, cloth(0.05)), 0.72, 1.2, 0.56, 12, 0, -18),
+        _at(Part("merlot", 7, pillow, cloth(0.05)), -0.12, 1.2, 0.56, -14, 0, -18),
     ]
 
 
@@ -112,35 +454,35 @@ def _plant() -> list[Part]:
     """Return a plant on the floor, in the corner."""
     x, y, rim = 1.18, -1.18, 0.42
     pot = union(place(cone(0.17, 0.23, 0.38, 0.012), x, y, 0.19), place(cone(0.255, 0.255, 0.08, 0.015), x, y, 0.38))
-    vein = paint.banded(lambda p: 1.2 - np.abs(p[:, 1]) / 0.008, _VEIN)
-    blade = Part("forest", 9, things.leaf(0.42, 0.19, 0.03), vein)
+    vein = banded(lambda p: 1.2 - np.abs(p[:, 1]) / 0.008, _VEIN)
+    blade = Part("forest", 9, shapes.leaf(0.42, 0.19, 0.03), vein)
     leaves = [_at(blade, x, y, rim + 0.1 + 0.06 * i, _GOLDEN_ANGLE * i + 40, -18 - 4.2 * i) for i in range(13)]
     stalk = Part("forest", 6, capsule((x, y, rim - 0.1), (x, y, rim + 0.8), 0.022))
-    return [Part("white", 6, pot, paint.mottled(0.1, 0.03)), stalk, *leaves]
+    return [Part("white", 6, pot, mottled(0.1, 0.03)), stalk, *leaves]
 
 
 def _fruit() -> list[Part]:
     """Return the objects on the table."""
     z = _TABLE
-    tomato = Part("tomato red", 30, things.gourd(0.105, 0.175, 5, 0.06, 0.18), paint.mottled(0.08, 0.02), 0.4)
-    star = Part("forest", 40, things.calyx(0.065))
-    apple = Part("apple", 30, things.gourd(0.092, 0.17, 1, 0.0, 0.24, 0.25), paint.mottled(0.03, 0.04), 0.35)
+    tomato = Part("tomato red", 30, shapes.gourd(0.105, 0.175, 5, 0.06, 0.18), mottled(0.08, 0.02), 0.4)
+    star = Part("forest", 40, shapes.calyx(0.065))
+    apple = Part("apple", 30, shapes.gourd(0.092, 0.17, 1, 0.0, 0.24, 0.25), mottled(0.03, 0.04), 0.35)
     stem = Part("cocoa", 40, capsule((0, 0, 0.13), (0.012, 0, 0.19), 0.007))
     tomatoes = [(-0.27, 0.2, 20), (-0.05, 0.36, 80), (-0.3, 0.43, 140)]
     apples = [(-0.36, -0.04, 30), (-0.16, -0.14, 200)]
     berries = [_ring(10, 0.13, 0.0), _ring(6, 0.072, 0.035), _ring(3, 0.04, 0.085)]
     return [
-        _at(Part("pumpkin", 14, things.gourd(0.25, 0.34, 10, 0.13, 0.2), paint.ribs(10, 0.3), 0.15), 0.2, 0.06, z),
-        _at(Part("forest", 30, things.tapered((0, 0, 0.27), (0.03, 0.02, 0.4), 0.035, 0.022)), 0.2, 0.06, z),
+        _at(Part("pumpkin", 14, shapes.gourd(0.25, 0.34, 10, 0.13, 0.2), ribs(10, 0.3), 0.15), 0.2, 0.06, z),
+        _at(Part("forest", 30, shapes.tapered((0, 0, 0.27), (0.03, 0.02, 0.4), 0.035, 0.022)), 0.2, 0.06, z),
         *(_at(tomato, x, y, z, turn) for x, y, turn in tomatoes),
         *(_at(star, x, y, z + 0.152, turn) for x, y, turn in tomatoes),
         *(_at(part, x, y, z, turn) for part in (apple, stem) for x, y, turn in apples),
         *_bananas(-0.12, -0.34, z + 0.035),
-        _at(Part("eggplant", 22, things.aubergine(), None, 0.35), 0.06, 0.58, z, 12),
-        _at(Part("forest", 40, things.aubergine_cap()), 0.06, 0.58, z, 12),
-        _at(Part("white", 14, things.bowl(0.2, 0.02), None, 0.2), 0.27, -0.45, z),
-        _at(Part("blueberry", 30, things.heap(np.concatenate(berries), 0.042), None, 0.2), 0.27, -0.45, z + 0.12),
-        _at(Part("forest", 18, things.bottle(0.075, 0.56), None, 0.4), 0.36, 0.42, z),
+        _at(Part("eggplant", 22, shapes.aubergine(), None, 0.35), 0.06, 0.58, z, 12),
+        _at(Part("forest", 40, shapes.aubergine_cap()), 0.06, 0.58, z, 12),
+        _at(Part("white", 14, shapes.bowl(0.2, 0.02), None, 0.2), 0.27, -0.45, z),
+        _at(Part("blueberry", 30, shapes.heap(np.concatenate(berries), 0.042), None, 0.2), 0.27, -0.45, z + 0.12),
+        _at(Part("forest", 18, shapes.bottle(0.075, 0.56), None, 0.4), 0.36, 0.42, z),
         _at(Part("white", 18, cone(0.0765, 0.0765, 0.13)), 0.36, 0.42, z + 0.15),
     ]
 
@@ -153,6 +495,6 @@ def _ring(count: int, radius: float, height: float) -> Array:
 
 def _bananas(x: float, y: float, z: float) -> list[Part]:
     """Return a bunch with its stems at (x, y), arched over the table."""
-    tints = paint.banded(things.banana_end, _STEM)
-    banana = Part("banana yellow", 26, things.banana(0.044), lambda p: _RIPE * tints(p), 0.15)
+    tints = banded(shapes.banana_end, _STEM)
+    banana = Part("banana yellow", 26, shapes.banana(0.044), lambda p: _RIPE * tints(p), 0.15)
     return [_at(banana, x, y, z + 0.012 * i, -75 + 17 * i, -62 + 16 * i) for i in range(4)]

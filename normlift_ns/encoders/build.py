@@ -1,27 +1,121 @@
-"""Builders of feature sources, encoders and regions from `SourceOptions`."""
+"""Adapter for encoders of other packages: checks their results and attributes their errors."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
-from normlift_ns.encoders.foreign import Foreign
-from normlift_ns.encoders.kinds import absolute_paths, encoder_kind, is_ours
-from normlift_ns.encoders.langsplat.source import LangSplat
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.sam.masks import SamMasks
-from normlift_ns.encoders.sam.text_masks import Sam3Masks
-from normlift_ns.encoders.sam.weights import local_sam
-from normlift_ns.encoders.source import Encoder, FeatureSource, RegionFeatures, Regions, TextEncoder
-from normlift_ns.encoders.texts.files import TextVectors
+import torch
+from jaxtyping import Float32, Int32, UInt8
+from torch import Tensor
+
+from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, TextEncoder
+from normlift_ns.encoders.langsplat import LangSplat
+from normlift_ns.encoders.prompts import UNIT_TOLERANCE, check_prompts
+from normlift_ns.encoders.registry import absolute_paths, encoder_kind, is_built_in, summarize_error
+from normlift_ns.encoders.text_files import TextEmbeddingFile
 from normlift_ns.errors import InputError
-from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, FeaturesName, RegionsName, SourceOptions
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, FeatureKind, RegionKind, SourceOptions
+from normlift_ns.segmentation.checkpoint import find_local_sam
+from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
+from normlift_ns.segmentation.sam import SamMasks
+from normlift_ns.segmentation.sam3 import Sam3Masks
+
+
+@dataclass(frozen=True)
+class PluginEncoder:
+    """An encoder of another package. The wrapped object needs only `identity`, `encode` and `text`; if it has
+    `patches`, so does the adapter. Error messages name the encoder that failed.
+
+    Raises (from every method):
+        InputError: If the encoder fails, or returns something that `Encoder` does not allow.
+    """
+
+    name: str
+    encoder: Encoder
+
+    @classmethod
+    def made(cls, name: str, make: Callable[[], Encoder]) -> PluginEncoder:
+        """Make an encoder, and check that it has the required attributes."""
+        with _attribute_errors(name):
+            encoder = make()
+        missing = [x for x in ("identity", "encode", "text") if not hasattr(encoder, x)]
+        if len(missing) > 0:
+            raise InputError(f"encoder {name!r} of another package has no {' and no '.join(missing)}; fix that package")
+        return DensePluginEncoder(name, encoder) if hasattr(encoder, "patches") else cls(name, encoder)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        with _attribute_errors(self.name):
+            return {"kind": self.name, **self.encoder.identity}
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        with _attribute_errors(self.name):
+            rows = self.encoder.encode(image, labels)
+        return self._check_rows(rows, int(labels.max()) + 1, "regions")
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        return (self.encode(image, labels) for image, labels in views)
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        check_prompts(prompts)
+        with _attribute_errors(self.name):
+            rows = self.encoder.text(prompts)
+        return self._check_rows(rows, len(prompts), "texts")
+
+    def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
+        """Return the rows as float32 on the CPU; raise InputError unless there are `count` of them, each of length
+        1."""
+        if not isinstance(rows, Tensor) or rows.ndim != 2 or len(rows) != count or not rows.is_floating_point():
+            received = f"{rows.dtype} {tuple(rows.shape)}" if isinstance(rows, Tensor) else type(rows).__name__
+            raise InputError(
+                f"encoder {self.name!r} of another package returned {received} for {count} {units}, expected "
+                f"floats [{count}, D]; fix that package"
+            )
+        rows = rows.detach().float().cpu()
+        length = torch.linalg.vector_norm(rows, dim=1)
+        if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
+            raise InputError(
+                f"encoder {self.name!r} of another package returned vectors of {units} whose length is not 1 (such as "
+                f"{float(length[(length - 1).abs().argmax()]):.3g}); normalize them"
+            )
+        return rows
+
+
+@dataclass(frozen=True)
+class DensePluginEncoder(PluginEncoder):
+    """An encoder of another package that also has features of patches."""
+
+    @property
+    def why_not_dense(self) -> str | None:
+        return getattr(self.encoder, "why_not_dense", None)
+
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        with _attribute_errors(self.name):
+            features = self.encoder.patches(image, rows, columns)  # type: ignore[attr-defined]
+        return self._check_rows(features, rows * columns, "patches")
+
+
+@contextmanager
+def _attribute_errors(name: str) -> Iterator[None]:
+    """Attribute exceptions to the encoder of another package."""
+    try:
+        yield
+    except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:  # a third-party module may raise anything
+        raise InputError(f"encoder {name!r} of another package failed ({summarize_error(error)})") from error
+
+
+# Builders of feature sources, encoders and regions from `SourceOptions`.
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
@@ -34,8 +128,8 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             without imported features.
         FileNotFoundError: As those. Also if the folder of features does not exist.
     """
-    if options.features not in get_args(FeaturesName):
-        known = ", ".join(get_args(FeaturesName))
+    if options.features not in get_args(FeatureKind):
+        known = ", ".join(get_args(FeatureKind))
         raise InputError(f"unknown features {options.features!r}; --features is one of {known}")
     if options.features == "none":
         if options.features_dir is not None:
@@ -84,7 +178,7 @@ def _absolute_if_exists(name: str) -> str:
     return os.path.abspath(name) if os.path.exists(name) else name
 
 
-def recorded_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:
+def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:
     """Recreate the feature source that a field was lifted from.
 
     Args:
@@ -125,8 +219,8 @@ def _restore_settings(settings: object) -> dict[str, Any]:
 
 
 def make_texts(options: SourceOptions, device: str = "cpu") -> TextEncoder:
-    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextVectors`."""
-    return make_encoder(options, device) if options.text_vectors is None else TextVectors(options.text_vectors)
+    """Return the text encoder of the options; arguments and errors as in `make_encoder` and `TextEmbeddingFile`."""
+    return make_encoder(options, device) if options.text_vectors is None else TextEmbeddingFile(options.text_vectors)
 
 
 def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
@@ -140,19 +234,19 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
         FileNotFoundError: If a weight file does not exist.
     """
     kind = encoder_kind(options.encoder)
-    if is_ours(kind):
+    if is_built_in(kind):
         return kind.make(options, device)
-    return Foreign.made(options.encoder, lambda: kind.make(options, device))
+    return PluginEncoder.made(options.encoder, lambda: kind.make(options, device))
 
 
-def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
+def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionKind:
     """Return the regions of the options, with "auto" resolved.
 
     Raises:
         ValueError: If the regions are unknown.
     """
-    if options.regions not in get_args(RegionsName):
-        raise InputError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionsName))}")
+    if options.regions not in get_args(RegionKind):
+        raise InputError(f"unknown regions {options.regions!r}; --regions is one of {', '.join(get_args(RegionKind))}")
     if options.regions != "auto":
         return options.regions
     if options.regions_dir is not None:
@@ -162,7 +256,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> RegionsName:
     kind = encoder_kind(options.encoder)
     if not kind.learned:
         return "superpixel"
-    if device.startswith("cuda") and find_spec("transformers") is not None and local_sam(DEFAULT_SAM) is not None:
+    if device.startswith("cuda") and find_spec("transformers") is not None and find_local_sam(DEFAULT_SAM) is not None:
         return "sam"
     return "patches" if kind.has_patches(options) else "superpixel"
 

@@ -20,18 +20,11 @@ import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
-from normlift_ns.core.disk.tensors import load_tensors, save_tensors
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.sam.text_masks import Sam3Network, sam3_identity
-from normlift_ns.encoders.source import (
-    Encoder,
-    FeatureSource,
-    RegionFeatures,
-    Regions,
-    ViewFeatures,
-)
-from normlift_ns.encoders.texts.kept import cache_path
-from normlift_ns.encoders.texts.prompts import UNIT_TOLERANCE
+from normlift_ns.encoders.base import Encoder, FeatureSource, PatchFeatures, RegionFeatures, Regions, ViewFeatures
+from normlift_ns.encoders.prompts import UNIT_TOLERANCE
+from normlift_ns.encoders.text_files import cache_path
+from normlift_ns.io.arrays import load_tensors, save_tensors
+from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
 
 def cached(source: FeatureSource, folder: Path) -> FeatureSource:
@@ -49,14 +42,14 @@ def cached(source: FeatureSource, folder: Path) -> FeatureSource:
     return replace(source, regions=regions, encoder=encoder)
 
 
-class NotKeptError(Exception):
+class NotCachedError(Exception):
     """A result that is not in the cache."""
 
 
-def only_kept(source: FeatureSource, folder: Path) -> FeatureSource:
+def cached_only(source: FeatureSource, folder: Path) -> FeatureSource:
     """Return a source that reads cached results from a folder and never computes any that would be cached.
 
-    Its `view` raises `NotKeptError` if a result for the image is missing. Sources that are not cached are returned
+    Its `view` raises `NotCachedError` if a result for the image is missing. Sources that are not cached are returned
     unchanged.
     """
     result: Any = cached(source, folder)
@@ -84,18 +77,18 @@ class _Stub:
 
 class _NoPatches(_Stub):
     def features(self, image: Tensor, name: str) -> Tensor:
-        raise NotKeptError
+        raise NotCachedError
 
 
 class _NoRegions(_Stub):
     def labels(self, image: Tensor, name: str) -> Tensor:
-        raise NotKeptError
+        raise NotCachedError
 
 
 class _NoEncoder(_Stub):
     def encode_each(self, views: Iterable[Any]) -> Iterator[Tensor]:
         for _ in views:
-            raise NotKeptError
+            raise NotCachedError
         yield from ()
 
 
@@ -220,7 +213,7 @@ class CachedPatches:
 
 
 @dataclass(frozen=True)
-class KeptTextMasks:
+class CachedTextMasks:
     """A cache of SAM 3 masks for prompts in images. The network is loaded only for prompts that are not cached.
 
     The key: the image, the text, and the network. Masks are stored as bits.

@@ -5,29 +5,40 @@ Each is our own implementation of the idea that distinguishes the method from a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from normlift_ns.core.consensus import consensus, seen_reliability
+from normlift_ns.core.consensus import consensus, with_original_reliability
 from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.lift import lift
+from normlift_ns.core.lowrank import StoredDirections, StoredEvidence
 from normlift_ns.core.sparse import SparseRows, row_offsets
-from normlift_ns.core.storage import StoredDirections, StoredEvidence
-from normlift_ns.encoders.build import recorded_source
+from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import cached
+from normlift_ns.errors import InputError
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.observing import Block, in_chunks, observe_views, of_regions, region_levels, spread
+from normlift_ns.evidence_collection import (
+    ViewBatch,
+    cells_to_regions,
+    chunk_views,
+    observe_views,
+    region_levels,
+    sample_evenly,
+)
 from normlift_ns.options import LiftOptions
-from normlift_ns.raster.rasterize import rasterize_evidence
+from normlift_ns.rasterization.backend import RasterJob
+from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
+from normlift_ns.rasterization.rasterize import rasterize_evidence
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {
@@ -53,15 +64,15 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     """Lift a run again with another method; return its field on the CPU, unrefined.
 
     Raises:
-        ValueError, FileNotFoundError: as `seen_blocks`.
+        ValueError, FileNotFoundError: as `lifted_batches`.
     """
     gaussians = lifted.scene.gaussians.to(device)
     rasterize = partial(
         rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
     )
     parts, tables = [], []
-    for block in seen_blocks(lifted, device):
-        parts.append(of_regions(_CELL_EVIDENCE[name](rasterize, gaussians, block), block))
+    for block in lifted_batches(lifted, device):
+        parts.append(cells_to_regions(_CELL_EVIDENCE[name](rasterize, gaussians, block), block))
         tables += block.features
     evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
     options = lifted.field.manifest.get("options", {})
@@ -81,7 +92,7 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
     If it was lifted otherwise, it is lifted again from its regions and features.
 
     Raises:
-        ValueError, FileNotFoundError: as `seen_blocks`.
+        ValueError, FileNotFoundError: as `lifted_batches`.
     """
     manifest, defaults = lifted.field.manifest, LiftOptions()
     options = manifest.get("options", {})
@@ -93,8 +104,8 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
         rasterize_evidence, gaussians, rasterize_mode=lifted.scene.rasterize_mode, settings=lifted.settings
     )
     parts, tables, levels = [], [], []
-    for block in seen_blocks(lifted, device):
-        parts.append(of_regions(_plain(rasterize, gaussians, block, power=power), block))
+    for block in lifted_batches(lifted, device):
+        parts.append(cells_to_regions(_plain(rasterize, gaussians, block, power=power), block))
         tables += block.features
         levels += [region_levels(*x) for x in zip(block.regions, map(len, block.features))]
     evidence, features = Evidence.merge(*parts), torch.cat(tables).to(device)
@@ -105,14 +116,14 @@ def with_consensus(lifted: EvaluatedRun, on: bool, device: str) -> EvaluatedRun:
         kwargs = {key: value for key, value in kwargs.items() if value is not None}
         table = consensus(evidence, features, level=torch.cat(levels), **kwargs).features
         after = lift(evidence, table, **lift_kwargs)
-        result = replace(after, scalars=seen_reliability(after.scalars, result.scalars))
+        result = replace(after, scalars=with_original_reliability(after.scalars, result.scalars))
     own = torch.arange(len(gaussians), dtype=torch.int32)
     store = StoredEvidence(evidence.to("cpu"), result.features.cpu())
     manifest = {**manifest, "options": {**options, "consensus": on}}
     return replace(lifted, field=SemanticField(result.scalars.map(Tensor.cpu), own, store, manifest), refined=False)
 
 
-def seen_blocks(lifted: EvaluatedRun, device: str, *, most: int | None = None) -> Iterator[Block]:
+def lifted_batches(lifted: EvaluatedRun, device: str, *, most: int | None = None) -> Iterator[ViewBatch]:
     """Yield cameras, labels and features of the views of the lift, a few views at a time.
 
     Args:
@@ -123,34 +134,34 @@ def seen_blocks(lifted: EvaluatedRun, device: str, *, most: int | None = None) -
         FileNotFoundError: files of the features are missing.
     """
     manifest, scene = lifted.field.manifest, lifted.scene
-    source = recorded_source(manifest, device)
+    source = restore_source(manifest, device)
     source = source if lifted.cache is None else cached(source, lifted.cache)
     options = manifest.get("options", {})
     names = set(source.available(scene.train.names))
     usable = [index for index, name in enumerate(scene.train.names) if name in names]
-    used = [usable[i] for i in spread(len(usable), options.get("max_views"))]
-    used = [used[i] for i in spread(len(used), most)]
+    used = [usable[i] for i in sample_evenly(len(usable), options.get("max_views"))]
+    used = [used[i] for i in sample_evenly(len(used), most)]
     rendered = lifted.settings if options.get("image_source") == "render" else None
     kwargs = {"rendered": rendered, "divisor": options.get("lift_downscale", 1), "done": lambda view: None}
-    for chunk in in_chunks(used):
+    for chunk in chunk_views(used):
         yield observe_views(scene, chunk, source, **kwargs)
 
 
-def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: Block, *, power: int = 1) -> Evidence:
+def _plain(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch, *, power: int = 1) -> Evidence:
     counts = [regions.shape[1] for regions in block.regions]
     return rasterize(block.cameras, block.labels, num_regions=counts, weight_power=power)
 
 
-def _centers(rasterize: Rasterize, gaussians: GaussianScene, block: Block) -> Evidence:
+def _centers(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch) -> Evidence:
     cells = _plain(rasterize, gaussians, block)
-    return centre_evidence(gaussians.means, block.cameras, _columns(block), cells)
+    return center_evidence(gaussians.means, block.cameras, _columns(block), cells)
 
 
-def _heaviest(rasterize: Rasterize, gaussians: GaussianScene, block: Block) -> Evidence:
+def _heaviest(rasterize: Rasterize, gaussians: GaussianScene, block: ViewBatch) -> Evidence:
     return top_evidence(rasterize, block.cameras, _columns(block), _plain(rasterize, gaussians, block))
 
 
-_CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, Block], Evidence]] = {
+_CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]] = {
     "sfs": partial(_plain, power=2),
     "occam": _centers,
     "vala": _plain,
@@ -159,13 +170,13 @@ _CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, Block], Evide
 """Functions that compute the evidence of the cells in some views."""
 
 
-def _columns(block: Block) -> list[Int[Tensor, "h w"]]:
+def _columns(block: ViewBatch) -> list[Int[Tensor, "h w"]]:
     """Return the column of every pixel in the evidence of the block's cells, -1 for none."""
     first = torch.tensor([0, *(regions.shape[1] for regions in block.regions)]).cumsum(0).tolist()
     return [torch.where(labels >= 0, labels + start, -1) for labels, start in zip(block.labels, first)]
 
 
-def centre_evidence(
+def center_evidence(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], columns: Sequence[Int[Tensor, "h w"]], evidence: Evidence
 ) -> Evidence:
     """Occam's LGS: in every view, a Gaussian takes the feature at its projected center, with its weight in that view.
@@ -202,7 +213,7 @@ def top_evidence(
 
     Args:
         rasterize: computes evidence from cameras and labels.
-        columns: as in `centre_evidence`.
+        columns: as in `center_evidence`.
         evidence: evidence of those columns; only its rows are replaced.
     """
     device, size = evidence.rows.weight.device, evidence.num_gaussians
@@ -270,3 +281,124 @@ def _weighted_sum(row: Tensor, weight: Tensor, values: Tensor, count: int) -> Te
     offsets = row_offsets(row, count)
     product = SparseRows(offsets, torch.arange(len(row), device=row.device, dtype=torch.int32), weight)
     return normalize(product.matmul(values), dim=1)
+
+
+# Lifting of feature maps channel by channel through stock gsplat, as in Splat Feature Solver (SFS), for timing.
+
+
+_TIMED_VIEWS = 6
+"""Number of views that are timed; each of the others would take as long."""
+_CHANNELS = 32
+_ROUNDS = 3
+
+
+def dense_sums(
+    job: RasterJob, cameras: Sequence[Camera], maps: Iterable[Float[Tensor, "h w d"]], dimension: int
+) -> Float[Tensor, "n d"]:
+    """Return sum_i A_ij B_i of every Gaussian over the pixels i of all views.
+
+    It is the gradient of gsplat's render with respect to colors: one forward pass per view, and one backward pass per
+    32 channels.
+
+    Args:
+        maps: feature B_i of every pixel, for each view.
+        dimension: D.
+    """
+    forward, backward = compiled_rasterizer()
+    total = torch.zeros(len(job.scene), dimension, device=job.scene.means.device)
+    blank = torch.zeros(1, len(job.scene), _CHANNELS, device=total.device)
+    for camera, features in zip(cameras, maps):
+        projected = project_views(job, [camera])
+        splats = (projected.means2d, projected.conics, blank, projected.opacities, None, None)
+        tiles = (job.settings.tile_size, projected.offsets, projected.members)
+        inputs = (*splats, camera.width, camera.height, *tiles)
+        _, alphas, last = forward(*inputs)
+        alpha_gradient = torch.zeros_like(alphas)
+        for first in range(0, dimension, _CHANNELS):
+            gradient = features[None, :, :, first : first + _CHANNELS]
+            padding = _CHANNELS - gradient.shape[3]
+            gradient = torch.nn.functional.pad(gradient, (0, padding)).contiguous()
+            sums = backward(*inputs, alphas, last, gradient, alpha_gradient, False)[3][0]
+            total[:, first : first + _CHANNELS] += sums[:, : _CHANNELS - padding]
+    return total
+
+
+def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
+    """Return why SFS's method cannot be timed; None if it can."""
+    if not device.startswith("cuda"):
+        return f"it needs a GPU, because gsplat is compiled for GPUs only; this is --device {device}"
+    try:
+        check(_job(lifted, device))
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
+    """Time SFS's method and this package's, from labels and features to sums per Gaussian.
+
+    Both process the same few views of the lift. Each time is the median of three rounds after a warm-up round. The time
+    of SFS's method is also extrapolated to all views of the lift.
+
+    Raises:
+        ValueError, FileNotFoundError: as `lifted_batches`.
+    """
+    blocks = list(lifted_batches(lifted, device, most=_TIMED_VIEWS))
+    job = _job(lifted, device)
+    timed = {"dense": lambda: _dense(job, blocks), "ours": lambda: _sparse(lifted, job, blocks)}
+    seconds = {name: _median_seconds(run) for name, run in timed.items()}
+    views = sum(len(block.cameras) for block in blocks)
+    all_views = lifted.field.manifest.get("statistics", {}).get("views", views)
+    return {
+        "timed_views": float(views),
+        "dense512_s": seconds["dense"],
+        "evidence_lift_s": seconds["ours"],
+        "dense512_over_evidence_lift": seconds["dense"] / seconds["ours"],
+        "dense512_all_views_s": seconds["dense"] * all_views / views,
+    }
+
+
+def _job(lifted: EvaluatedRun, device: str) -> RasterJob:
+    antialiased = lifted.scene.rasterize_mode == "antialiased"
+    return RasterJob(lifted.scene.gaussians.to(device), antialiased, lifted.settings, torch.float32)
+
+
+def _dense(job: RasterJob, blocks: Sequence[ViewBatch]) -> None:
+    for block in blocks:
+        dense_sums(job, block.cameras, feature_maps(block, job.scene.means.device), block.features[0].shape[1])
+
+
+def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float[Tensor, "h w d"]]:
+    """Yield the feature of every pixel for each view, summed over levels; 0 without a region."""
+    for labels, regions, features in zip(block.labels, block.regions, block.features):
+        table = torch.nn.functional.pad(features.to(device), (0, 0, 1, 0))  # row 0: none
+        cells = torch.stack([table[level.to(device).long() + 1] for level in regions]).sum(0)
+        rows = torch.nn.functional.pad(cells, (0, 0, 1, 0))
+        yield rows[labels.to(device).long().clamp(min=-1) + 1]
+
+
+def _sparse(lifted: EvaluatedRun, job: RasterJob, blocks: Sequence[ViewBatch]) -> None:
+    for block in blocks:
+        cells = rasterize_evidence(
+            job.scene,
+            block.cameras,
+            block.labels,
+            num_regions=[regions.shape[1] for regions in block.regions],
+            rasterize_mode=lifted.scene.rasterize_mode,
+            settings=lifted.settings,
+        )
+        lift(cells_to_regions(cells, block), torch.cat(block.features).to(job.scene.means)).directions(
+            dtype=torch.float16
+        )
+
+
+def _median_seconds(run: Callable[[], Any]) -> float:
+    run()
+    seconds = []
+    for _ in range(_ROUNDS):
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        run()
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return sorted(seconds)[_ROUNDS // 2]

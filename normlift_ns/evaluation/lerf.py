@@ -1,22 +1,258 @@
-"""2D open-vocabulary segmentation on LERF-OVS, with composited scores of prompts instead of feature maps."""
+"""Score map processing of the published code of Splat Feature Solver (SFS), number by number, including its
+oddities."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
+from scipy import ndimage
 from torch import Tensor
 
 from normlift_ns.core.metrics import localized, mask_iou, mask_recall
-from normlift_ns.evaluation.lerf_labels import LabeledFrame
-from normlift_ns.evaluation.options import LANGSPLAT, Average, Masking
-from normlift_ns.evaluation.results import Evaluation, mean
-from normlift_ns.evaluation.sfs import cleaned, histogram_threshold
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.options import (
+    LANGSPLAT_MASKINGS,
+    AveragingOrder,
+    Evaluation,
+    Masking,
+    PromptText,
+    mean,
+    read_document,
+)
+
+_BINS, _MIN_PEAK, _UPPER_QUANTILE = 40, 600, 0.75
+_MIN_RANGE, _MIN_VARIANCE = 1e-12, 1e-10
+_MAX_QUANTILE_VALUES = 2**24
+"""Maximum number of values for torch's quantile."""
+_EPSILON = 1e-12
+"""Keeps the means of empty sides finite."""
+
+
+def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
+    """Return the threshold of SFS's attention maps, a float32 number. Scores that reach it (>=) are selected.
+
+    The histogram has 40 bins from the smallest to the largest score. Its peaks are the bins of at least 600 pixels that
+    no neighbor exceeds; on a plateau, every bin is a peak. The rule uses the k-th peak from the right, with k the
+    number of true instances. If there are fewer than k, it uses the rightmost peak.
+
+    The valley is the nearest bin to the left that is lower than the peak and that no neighbor undercuts. The first bin
+    is excluded. If there is no such bin, the valley is the rightmost bin of all that lies right of the peak and is
+    lower. The threshold is the middle of the valley.
+
+    Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. It
+    is the mean of all scores if these are nearly equal (variance below 1e-10).
+
+    In two cases, the published code has no answer to follow. It fails if the last two bins are equal and the peak is
+    the last; this function then follows the rule above. Its float32 mean of a constant map may exceed the constant;
+    this function then selects every pixel. The last digit of float32 sums depends on the memory layout, so this
+    function keeps that of `score`.
+    """
+    values = score.detach().cpu().float().flatten()
+    low, high = float(values.min()), float(values.max())
+    if low == high:
+        return low
+    if high <= low + _MIN_RANGE:
+        counts, edges = torch.tensor([len(values)]), torch.linspace(low, high + 1e-6, 2)
+    else:
+        counts, edges = values.histc(_BINS, low, high).long(), torch.linspace(low, high, _BINS + 1)
+    valley = _valley(counts.tolist(), max(1, instances))
+    if valley is not None:
+        threshold = (float(edges[valley]) + float(edges[valley + 1])) / 2
+    elif float(values.var()) < _MIN_VARIANCE:
+        threshold = float(values.mean())
+    else:
+        threshold = (_otsu(counts, edges) + _upper_quartile(values)) / 2
+    return float(torch.tensor(threshold, dtype=torch.float32))
+
+
+def _valley(counts: list[int], instances: int) -> int | None:
+    last = len(counts) - 1
+    peaks = [
+        i for i, count in enumerate(counts) if count >= max(_MIN_PEAK, counts[max(i - 1, 0)], counts[min(i + 1, last)])
+    ]
+    if len(peaks) == 0:
+        return None
+    peak = peaks[-instances] if instances <= len(peaks) else peaks[-1]
+    for i in range(peak - 1, 0, -1):
+        if counts[i] <= min(counts[i - 1], counts[i + 1]) and counts[i] < counts[peak]:
+            return i
+    return next((i for i in range(last, peak, -1) if counts[i] < counts[peak]), None)
+
+
+def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> float:
+    """Return the center of the bin after which a split maximizes the variance between both sides, in float32."""
+    center, share = (edges[:-1] + edges[1:]) / 2, counts.float() / int(counts.sum())
+    below, moment = share.cumsum(0), (share * center).cumsum(0)
+    above, total = 1 - below, (share * center).sum()
+    between = below * above * (moment / (below + _EPSILON) - (total - moment) / (above + _EPSILON)) ** 2
+    return float(center[int(between.argmax())])
+
+
+def _upper_quartile(values: Float[Tensor, " n"]) -> float:
+    if len(values) <= _MAX_QUANTILE_VALUES:
+        return float(values.quantile(_UPPER_QUANTILE))
+    return float(np.quantile(values.numpy(), _UPPER_QUANTILE))
+
+
+def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Open and close the mask by 3 x 3 pixels, keep its largest 8-connected component (the first of equals), and fill
+    holes.
+
+    The outside of the image counts as empty in every step, so erosion removes the border. In the outermost rows and
+    columns, only filled holes remain.
+    """
+    image, square = mask.cpu().numpy().astype(np.uint8), np.ones((3, 3), np.uint8)
+    for step in (cv2.erode, cv2.dilate, cv2.dilate, cv2.erode):
+        image = step(image, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    labels, count = ndimage.label(image, structure=square)  # pyright: ignore[reportGeneralTypeIssues]
+    if count == 0:
+        return torch.zeros_like(mask, device="cpu")
+    sizes = np.bincount(labels.ravel())
+    largest = labels == 1 + sizes[1:].argmax()
+    return torch.from_numpy(np.asarray(ndimage.binary_fill_holes(largest)))
+
+
+# Labels of LERF-OVS: one JSON file per annotated frame, with polygons of named objects.
+
+
+_Point = tuple[float, float]
+
+
+class _Info(msgspec.Struct):
+    width: Annotated[int, msgspec.Meta(ge=1, le=2**15)]
+    height: Annotated[int, msgspec.Meta(ge=1, le=2**15)]
+
+
+class _Object(msgspec.Struct):
+    category: PromptText
+    segmentation: Annotated[list[_Point], msgspec.Meta(min_length=3)]
+    bbox: tuple[float, float, float, float] | None = None
+
+
+class _File(msgspec.Struct):
+    """Content of a label file."""
+
+    info: _Info
+    objects: list[_Object]
+
+
+class LabeledFrame(NamedTuple):
+    """Masks and boxes of an annotated frame."""
+
+    stem: str
+    """File stem of the annotated image."""
+    masks: dict[str, Bool[Tensor, "h w"]]
+    """Mask of each category, the union of its objects."""
+    boxes: dict[str, list[tuple[float, float, float, float]]]
+    """(x1, y1, x2, y2) of every object of a category, in pixels."""
+
+
+def read_frames(folder: Path) -> list[Path]:
+    """Return the JSON files of a folder such as lerf_ovs/label/figurines, sorted by name.
+
+    Raises:
+        FileNotFoundError: the folder does not exist or has no JSON files.
+    """
+    files = sorted(folder.glob("*.json")) if os.path.isdir(folder) else []
+    if len(files) == 0:
+        raise FileNotFoundError(
+            f"{folder} has no label files; give the folder with files such as frame_00041.json, lerf_ovs/label/SCENE"
+        )
+    return files
+
+
+def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
+    """Read a label file and fill its polygons, scaled to the size of the image.
+
+    Raises:
+        ValueError: the file has another format, or is for an image with another aspect ratio. The message names the
+            file.
+    """
+    try:
+        document = read_document(file, _File)
+        size = document.info.width, document.info.height
+        shapes = [(o.category, _points(o.segmentation, *size), _box(o.bbox, *size)) for o in document.objects]
+    except ValueError as error:
+        raise InputError(
+            f"{file} is not a LERF-OVS label file ({error}); expected "
+            '{"info": {"width", "height"}, "objects": [{"category", "segmentation": [[x, y], ...], "bbox"}]}'
+        ) from error
+    if abs(size[0] * height - size[1] * width) > 0.01 * size[0] * height:
+        raise InputError(
+            f"{file} labels an image of {size[0]} x {size[1]} pixels, but that of the run has {width} x {height}; use "
+            "the images that the labels were drawn on"
+        )
+    scale = np.array([width / size[0], height / size[1]])
+    masks: dict[str, np.ndarray] = {}
+    boxes: dict[str, list[tuple[float, float, float, float]]] = {}
+    for category, points, box in shapes:
+        mask = masks.setdefault(category, np.zeros((height, width), np.uint8))
+        scaled = points * scale
+        drawn = np.zeros_like(mask)
+        cv2.fillPoly(drawn, [np.int32(scaled)], 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        if not drawn.any():
+            raise InputError(
+                f"{file}: a segmentation of {category!r} lies completely outside its image of {size[0]} x {size[1]} "
+                "pixels; correct or remove it"
+            )
+        mask |= drawn
+        low, high = (scaled.min(0), scaled.max(0)) if box is None else box * scale
+        boxes.setdefault(category, []).append((low[0], low[1], high[0], high[1]))
+    return LabeledFrame(file.stem, {name: torch.from_numpy(m).bool() for name, m in masks.items()}, boxes)
+
+
+def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
+    """Return the points of a polygon, which may lie slightly outside the image, but not by its whole size."""
+    points = np.array(segmentation, dtype=float)
+    if np.abs(points / (width, height) - 0.5).max() > 1.5:
+        raise InputError(
+            f"a segmentation of an image of {width} x {height} pixels has the coordinate {np.abs(points).max():g}"
+        )
+    return points
+
+
+def _box(box: tuple[float, float, float, float] | None, width: int, height: int) -> np.ndarray | None:
+    return None if box is None else _points([box[:2], box[2:]], width, height)
+
+
+def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path, str], list[str]]:
+    """Match label files with images by their stems.
+
+    Returns:
+        The image of every label file that has one, and the stems of the files without one.
+    Raises:
+        ValueError: no file has an image, or a file has several.
+    """
+    images: dict[str, list[str]] = {}
+    for name in names:
+        images.setdefault(PurePosixPath(name).stem, []).append(name)
+    matches = {file: images[file.stem] for file in files if file.stem in images}
+    if len(matches) == 0:
+        stems = ", ".join(sorted(images)[:3])
+        raise InputError(
+            f"none of the {len(files)} label files in {files[0].parent} has an image in the run; the first file is "
+            f"{files[0].name}, but the run has {stems}, …"
+        )
+    for file, candidates in matches.items():
+        if len(candidates) > 1:
+            raise InputError(
+                f"{file} labels one image, but {' and '.join(candidates)} of the run are all called {file.stem}; "
+                "rename all but one of them"
+            )
+    return {file: candidates[0] for file, candidates in matches.items()}, [f.stem for f in files if f not in matches]
+
+
+# 2D open-vocabulary segmentation on LERF-OVS, with composited scores of prompts instead of feature maps.
+
 
 _BOX, _THRESHOLD, _HALF_WINDOW = 30, 0.4, 3
 """LangSplat's values: side of the box filter, threshold, and half the side of the majority window."""
@@ -33,7 +269,7 @@ class FrameScores(NamedTuple):
     already."""
 
 
-def found_mask(
+def prompt_mask(
     score: Float[Tensor, "h w"],
     background: Float[Tensor, "h w b"],
     masking: Masking,
@@ -91,7 +327,7 @@ def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: b
     A category is localized if its peak lies in the mask. With LangSplat's maskings, any peak may lie in any box.
     """
     rows = []
-    frame, langsplat = scores.frame, masking in LANGSPLAT
+    frame, langsplat = scores.frame, masking in LANGSPLAT_MASKINGS
     for q, (category, truth) in enumerate(frame.masks.items()):
         score, inside = scores.prompts[:, :, q], truth
         peaks = score
@@ -99,8 +335,8 @@ def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: b
             peaks, score = box_filtered(score)
             inside = in_boxes(frame.boxes[category], *truth.shape)
         instances = len(frame.boxes[category])
-        mask = found_mask(score, scores.background, masking, margin=margin, instances=instances)
-        mask = cleaned(mask) if clean else mask
+        mask = prompt_mask(score, scores.background, masking, margin=margin, instances=instances)
+        mask = clean_mask(mask) if clean else mask
         rows.append(
             {
                 "frame": frame.stem,
@@ -122,7 +358,7 @@ def in_boxes(boxes: Sequence[tuple[float, float, float, float]], height: int, wi
     return inside
 
 
-def summarize_lerf(rows: Sequence[dict[str, Any]], average: Average, settings: dict[str, Any]) -> Evaluation:
+def summarize_lerf(rows: Sequence[dict[str, Any]], average: AveragingOrder, settings: dict[str, Any]) -> Evaluation:
     """Compute miou, macc and loc_acc of every scene and their means over scenes, as the paper averages.
 
     Results with _pooled are averaged over the frames, pairs or categories of all scenes together.
@@ -146,7 +382,7 @@ def summarize_lerf(rows: Sequence[dict[str, Any]], average: Average, settings: d
 _METRICS = {"miou": "iou", "macc": "accuracy", "loc_acc": "localized"}
 
 
-def _averages(rows: Sequence[Mapping[str, Any]], average: Average) -> dict[str, float]:
+def _averages(rows: Sequence[Mapping[str, Any]], average: AveragingOrder) -> dict[str, float]:
     group_key: Callable[[Mapping[str, Any]], Hashable] = {
         "frames": lambda row: (row["scene"], row["frame"]),
         "categories": lambda row: row["category"],

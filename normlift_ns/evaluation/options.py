@@ -2,32 +2,39 @@
 
 from __future__ import annotations
 
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from normlift_ns.options import WithoutDirection
-from normlift_ns.ranges import check_options
+import msgspec
+
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import write_text_file
+from normlift_ns.options import WithoutDirection, check_options
 
 Masking = Literal["background", "auto", "langsplat", "langsplat_composited"]
-LANGSPLAT: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
+LANGSPLAT_MASKINGS: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
 """Maskings that use LangSplat's relevancy."""
-Average = Literal["frames", "pairs", "categories"]
-MARGIN = 0.02
+AveragingOrder = Literal["frames", "pairs", "categories"]
+MASK_MARGIN = 0.02
 """Lead of a score over every background word (section "Mask thresholding" of the paper; 0 in SFS's code)."""
 
 
-POSES = 5
+MAX_SUGGESTED_POSES = 5
 """Largest number of new poses that the coverage study suggests."""
 
 
-def pose_files(stem: Path) -> tuple[Path, ...]:
+def pose_output_paths(stem: Path) -> tuple[Path, ...]:
     """Return all paths that new poses may be written to: a camera path, and a render of each pose.
 
-    >>> [path.name for path in pose_files(Path("next"))][:2]
+    >>> [path.name for path in pose_output_paths(Path("next"))][:2]
     ['next_camera_path.json', 'next_pose_1.png']
     """
-    renders = (stem.with_name(f"{stem.name}_pose_{i}.png") for i in range(1, POSES + 1))
+    renders = (stem.with_name(f"{stem.name}_pose_{i}.png") for i in range(1, MAX_SUGGESTED_POSES + 1))
     return (stem.with_name(f"{stem.name}_camera_path.json"), *renders)
 
 
@@ -56,10 +63,10 @@ class LerfOptions:
     """Conversion of scores to a mask. background: scores above all background words by --margin. auto: SFS's
     threshold from the histogram. langsplat: LERF's relevancy of each pixel's unit feature, scaled as in LangSplat.
     langsplat_composited: the same for composited scores, without division by the length of the pixel's feature."""
-    margin: float = MARGIN
+    margin: float = MASK_MARGIN
     """Lead over the best background word for --masking background, in cosine; larger values give smaller masks. SFS's
     code has 0."""
-    average: Average = "frames"
+    average: AveragingOrder = "frames"
     """Order of averaging within a scene; the scenes are averaged last. frames: categories of a frame, then frames.
     pairs: all pairs of frame and category equally. categories: frames of a category, then categories."""
     clean: bool = False
@@ -87,3 +94,111 @@ class MaskOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
+
+
+# JSON files from other programs, validated against the types that a protocol expects.
+
+
+PromptText = Annotated[str, msgspec.Meta(pattern=r"(?s)\A(?!.*[\ud800-\udfff]).*\S")]
+"""Text that can be used as a prompt: not blank, and without lone surrogates."""
+_MAX_BYTES = 2**26
+"""Maximum file size in bytes; label files have some thousands."""
+T = TypeVar("T")
+
+
+def read_document(path: Path, kind: type[T]) -> T:
+    """Read a JSON file and convert it to a type.
+
+    Raises:
+        ValueError: the file is missing, too large or not valid JSON, a key occurs twice, or a value has another type.
+    """
+    if not os.path.isfile(path):
+        raise InputError("it is not a file")
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise InputError(f"it has more than {_MAX_BYTES:,} bytes")
+        document = json.loads(content.decode("utf8"), object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
+        return msgspec.convert(document, kind)
+    except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
+        raise InputError(f"{type(error).__name__}: {error}") from None
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        keys = [key for key, _ in pairs]
+        duplicate = next(key for key in keys if keys.count(key) > 1)
+        raise InputError(f"the key {duplicate!r} occurs twice")
+    return result
+
+
+def _reject_constant(text: str) -> float:
+    raise InputError(f"{text} is not a valid JSON number")
+
+
+# Results of an evaluation, in the JSON format of ns-eval.
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Metrics of one protocol over one or several runs."""
+
+    results: Mapping[str, float]
+    """Metrics by name, as `results` of ns-eval. Shares are in 0..1."""
+    rows: Sequence[Mapping[str, Any]]
+    """Metrics per class (and scene or frame), as JSON types."""
+    settings: Mapping[str, Any]
+    """The protocol and its settings."""
+    scenes: Sequence[Mapping[str, Any]] = ()
+    """Metrics of each scene, if `results` are their means."""
+
+
+def mean(values: Sequence[float]) -> float:
+    """Return the mean of the values that are not NaN; NaN if there are none.
+
+    >>> mean([1.0, float("nan"), 3.0])
+    2.0
+    """
+    numbers = [value for value in values if not math.isnan(value)]
+    return sum(numbers) / len(numbers) if len(numbers) > 0 else float("nan")
+
+
+def write_evaluation(
+    path: Path,
+    evaluation: Evaluation,
+    *,
+    experiment_name: str,
+    method_name: str,
+    checkpoint: str,
+    studies: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write experiment_name, method_name, checkpoint and results as ns-eval does, then settings, scenes, rows and
+    studies.
+
+    NaN is written as null.
+
+    Raises:
+        FileExistsError: the file exists and `overwrite` is False.
+    """
+    document = {
+        "experiment_name": experiment_name,
+        "method_name": method_name,
+        "checkpoint": checkpoint,
+        "results": evaluation.results,
+        "settings": evaluation.settings,
+        **({"scenes": evaluation.scenes} if evaluation.scenes else {}),
+        "rows": evaluation.rows,
+        **({"studies": studies} if studies else {}),
+    }
+    write_text_file(path, json.dumps(_to_json(document), indent=2, allow_nan=False) + "\n", overwrite=overwrite)
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _to_json(x) for key, x in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_to_json(x) for x in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

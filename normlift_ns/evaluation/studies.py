@@ -1,22 +1,476 @@
-"""Further studies of lifted runs: ablation, parameter sweeps, signals of R, comparison with other methods, timing."""
+"""Variants of the refinement: those of the paper's ablation (its table 2), and the posterior vote."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
-from normlift_ns.core.metrics import classify
-from normlift_ns.evaluation.baselines import BASELINES, baseline_field, with_consensus
-from normlift_ns.evaluation.dense import time_sfs_way, why_not_timed
-from normlift_ns.evaluation.options import ScannetOptions
+import matplotlib as mpl
+import torch
+from jaxtyping import Bool, Float, Int, Int32
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.lift import Lifted, Scalars
+from normlift_ns.core.lowrank import StoredDirections
+from normlift_ns.core.metrics import NO_CLASS, bin_means, classify, kendall_test, lowest_jaccard, spearman_test
+from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
+from normlift_ns.core.refine import decay_width, refine, voting_weights
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.baselines import BASELINES, baseline_field, time_dense_lift, timing_obstacle, with_consensus
+from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
 from normlift_ns.evaluation.protocols import EvaluatedRun, MaskTruth, label_scene, scene_names
-from normlift_ns.evaluation.results import Evaluation, mean
-from normlift_ns.evaluation.scannet import answers, read_labels
-from normlift_ns.evaluation.signals import SceneSignals, signals
-from normlift_ns.evaluation.votes import Vote, ablation, agreed_ablation, own_vote, voter
+from normlift_ns.evaluation.scannet import predict_classes, read_labels
+from normlift_ns.io.atomic import atomic_file
+from normlift_ns.options import LiftOptions, RefineConfig, VoteKind
+
+Variant = Literal["none", "plain_knn", "linear", "norm_only", "support_only", "paper", "posterior"]
+
+
+def refine_variant(
+    variant: Variant,
+    means: Float[Tensor, "n 3"],
+    lifted: Lifted,
+    config: RefineConfig | None = None,
+    *,
+    beta: float = 1.0,
+    neighbors: Neighbors | None = None,
+) -> Float[Tensor, "n d"]:
+    """Return the directions after one variant of the refinement, as unit rows or 0.
+
+    Args:
+        variant: "none" returns the directions of the lift. "linear" averages the directions of N+ with the weights
+            R d_ik and normalizes the result. The others vote with `variant_config` and `variant_reliability`.
+        beta: prior strength of the shrinkage of R, as in `lift`.
+    Raises:
+        ValueError: if the variant is unknown.
+
+    >>> import torch
+    >>> from normlift_ns import Evidence, RefineConfig, lift, refine_variant
+    >>> from normlift_ns.core.evidence import Entries
+    >>> entries = Entries(torch.tensor([0, 1, 2]), torch.tensor([1, 2, 1]), torch.ones(3), (2,))
+    >>> lifted = lift(Evidence.from_entries([entries], 3), torch.eye(2))
+    >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    >>> [refine_variant(name, means, lifted, RefineConfig(k=2))[1] for name in ("none", "linear", "paper")]
+    [tensor([0., 1.]), tensor([0.7716, 0.6361]), tensor([1., 0.])]
+    """
+    reliability, directions = variant_reliability(variant, lifted.scalars, beta), lifted.directions()
+    config = variant_config(variant, config or RefineConfig())
+    if variant == "none":
+        return directions
+    neighbors = neighbors or nearest_neighbors(means, config.k)
+    if variant == "linear":
+        return linear_average(directions, reliability, neighbors, config)
+    source = variant_source(variant, means, directions, lifted.scalars, config, beta=beta, neighbors=neighbors)
+    return directions[source.long()]
+
+
+def variant_source(
+    variant: Variant,
+    means: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n d"] | Callable[[Tensor], Tensor],
+    scalars: Scalars,
+    config: RefineConfig,
+    *,
+    beta: float = 1.0,
+    neighbors: Neighbors | None = None,
+) -> Int32[Tensor, " n"]:
+    """Run `refine` as one of the variants that vote.
+
+    Raises:
+        ValueError: if the variant is unknown, or `refine` rejects the arguments.
+    """
+    reliability, config = variant_reliability(variant, scalars, beta), variant_config(variant, config)
+    return refine(means, directions, reliability, config, own=scalars.own_evidence, neighbors=neighbors)
+
+
+def variant_config(variant: Variant, config: RefineConfig) -> RefineConfig:
+    """Return the options of a variant's vote.
+
+    The result is `config` if that is for the variant's kind of vote. Otherwise it has the defaults of that kind, with
+    the `k` and `prior` of `config`. All variants but "posterior" use the paper's vote.
+
+    >>> variant_config("posterior", RefineConfig(vote="paper", k=12, sigma_d=3.0)).numbers.sigma_d
+    2.0
+    """
+    kind: VoteKind = "posterior" if variant == "posterior" else "paper"
+    return config if config.vote == kind else RefineConfig(vote=kind, k=config.k, prior=config.prior)
+
+
+def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -> Float[Tensor, " n"]:
+    """Return the R that a variant votes with.
+
+    "plain_knn" uses 1 for every Gaussian with a direction, "norm_only" uses ||f||, and "support_only" uses
+    N_eff / (N_eff + beta). All others use NormLift's R, the product of the last two.
+
+    Raises:
+        ValueError: if the variant is unknown.
+    """
+    if variant not in get_args(Variant):
+        raise InputError(f"variant must be one of {', '.join(get_args(Variant))}; got {variant!r}")
+    if variant == "plain_knn":
+        return (scalars.norm > 0).to(scalars.norm.dtype)
+    if variant == "norm_only":
+        return scalars.norm
+    support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + beta), 0.0)
+    return support if variant == "support_only" else scalars.norm * support
+
+
+def linear_average(
+    directions: Float[Tensor, "n d"], reliability: Float[Tensor, " n"], neighbors: Neighbors, config: RefineConfig
+) -> Float[Tensor, "n d"]:
+    """Return normalize(sum_{k in N+} R_k d_ik u_k), or u_i if that sum is 0."""
+    out, width = torch.empty_like(directions), decay_width(neighbors.spacing, config)
+    for i in torch.arange(len(directions), device=directions.device).split(2**14):
+        group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)
+        weight = voting_weights(neighbors, width, i, reliability).to(directions.dtype)
+        out[i] = torch.einsum("ik,ikd->id", weight, directions[group])
+    length = torch.linalg.vector_norm(out, dim=1, keepdim=True)
+    return torch.where(length > 0, out / length, directions)
+
+
+# Alternative votes over the stored directions of a run: the paper's ablation, and a sweep of every parameter.
+
+
+SWEEPS: dict[str, tuple[float, ...]] = {
+    "beta": (0.25, 0.5, 1.0, 2.0, 4.0),
+    "k": (12, 24, 36, 48, 60),
+    "sigma_d": (0.5, 1.0, 1.5, 2.0, 3.0),
+    "tau": (0.7, 0.75, 0.8, 0.85, 0.9),
+    "gamma": (0.05, 0.1, 0.2, 0.4, 0.8),
+    "delta": (0.0, 0.05, 0.1, 0.2, 0.3),
+}
+"""Values of each parameter, in addition to its default and the values of the runs; the others stay as in the lift.
+
+beta, K and Delta are as in the paper's appendix.
+"""
+CONSENSUS_VARIANTS: dict[str, Variant] = {
+    "consensus": "none",
+    "consensus_paper": "paper",
+    "consensus_posterior": "posterior",
+}
+"""Vote after the consensus, by variant name."""
+BETA = LiftOptions().beta
+"""Default beta."""
+
+
+@dataclass(frozen=True)
+class Vote:
+    """Variant and parameters of a vote."""
+
+    variant: Variant
+    config: RefineConfig
+    beta: float
+    label: Mapping[str, Any]
+    """Columns that distinguish it from other votes."""
+
+
+def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
+    """Return the vote that a run was lifted with, with defaults for values that its manifest does not record."""
+    options = manifest.get("options", {})
+    kind = {"vote": "paper"} if "vote" in options else {}  # the only one in version 0.1
+    config = RefineConfig(**{**kind, **options.get("vote", {})})
+    return Vote(config.vote, config, options.get("beta", BETA), {})
+
+
+def voting_scalars(field: SemanticField) -> Scalars:
+    """Return the scalars that a run votes with.
+
+    With consensus, ||f|| is the one before the consensus, from which R was computed.
+    """
+    scalars, options = field.scalars, field.manifest.get("options", {})
+    if not options.get("consensus", False):
+        return scalars
+    support = scalars.n_eff / (scalars.n_eff + options.get("beta", BETA))
+    return replace(scalars, norm=torch.where(support > 0, scalars.reliability / support, 0.0).clamp(max=1))
+
+
+def ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """Yield the variants of the paper's table 2 and the posterior vote, one vote per run."""
+    return _variants(owns, {variant: variant for variant in get_args(Variant)})
+
+
+def consensus_ablation(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """Yield `CONSENSUS_VARIANTS` for runs with consensus, one vote per run."""
+    return _variants(owns, CONSENSUS_VARIANTS)
+
+
+def _variants(owns: Sequence[Vote], variants: Mapping[str, Variant]) -> Iterator[list[Vote]]:
+    for name, variant in variants.items():
+        yield [replace(own, variant=variant, label={"variant": name}) for own in owns]
+
+
+def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
+    """Yield the votes of `SWEEPS` around the values of each run, one vote per run.
+
+    They include the default and the values of the runs, and mark both.
+    """
+    for parameter, values in SWEEPS.items():
+        default = default_value(parameter, owns[0].config.vote)
+        used = {_value(own, parameter) for own in owns}
+        for value in sorted({*values, default, *used}):
+            label = {"parameter": parameter, "value": value, "default": value == default, "own": value in used}
+            yield [_changed(own, parameter, value, label) for own in owns]
+
+
+def default_value(parameter: str, kind: VoteKind) -> float:
+    """Return the default of a parameter of `SWEEPS` for a kind of vote."""
+    return _value(Vote(kind, RefineConfig(vote=kind), BETA, {}), parameter)
+
+
+def _value(vote: Vote, parameter: str) -> float:
+    if parameter == "beta":
+        return vote.beta
+    return getattr(vote.config if parameter == "k" else vote.config.numbers, parameter)
+
+
+def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) -> Vote:
+    if parameter == "beta":
+        return replace(own, beta=value, label=label)
+    changed: dict[str, Any] = {parameter: int(value) if parameter == "k" else value}
+    return replace(own, config=replace(own.config, **changed), label=label)
+
+
+def make_voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:
+    """Return a function that votes again on the device.
+
+    It searches neighbors once per K. Only linear averaging holds all directions in memory.
+    """
+    device_field, means = field.to(device), means.to(device)
+    scalars = voting_scalars(device_field)
+
+    @cache
+    def neighbors(k: int) -> Neighbors:
+        return nearest_neighbors(means, k)
+
+    def unrefined(gaussians: Tensor) -> Tensor:
+        return device_field.directions(gaussians, refined=False)
+
+    def apply(vote: Vote) -> SemanticField:
+        near = neighbors(vote.config.k)
+        own = torch.arange(len(field), dtype=torch.int32)
+        if vote.variant == "none":
+            return replace(field, source=own)
+        if vote.variant == "linear":
+            r = variant_reliability(vote.variant, scalars, vote.beta)
+            config = variant_config(vote.variant, vote.config)
+            directions = linear_average(unrefined(own.long().to(device)), r, near, config)
+            valid = (directions != 0).any(dim=1)
+            norm = torch.where(valid & (device_field.scalars.norm <= 0), 1.0, device_field.scalars.norm)
+            changed = replace(field.scalars, norm=norm.to(field.scalars.norm))
+            store = StoredDirections(directions[valid].half().cpu(), None)
+            return replace(field, scalars=changed, source=own, store=store)
+        kwargs = {"beta": vote.beta, "neighbors": near}
+        source = variant_source(vote.variant, means, unrefined, scalars, vote.config, **kwargs)
+        return replace(field, source=source.cpu())
+
+    return apply
+
+
+# Statistics of R in a scene: Gaussians without evidence, accuracy by R and by ||f||, and R against opacity.
+
+
+_FAINT_OPACITY = 0.1
+"""Opacity below which a Gaussian is faint."""
+_HISTOGRAM_BINS = 20
+"""Number of bins of R from 0 to 1; R = 0 is counted separately."""
+
+
+@dataclass(frozen=True)
+class SceneSignals:
+    """Data on the Gaussians of a scene."""
+
+    scalars: Scalars
+    opacity: Float[Tensor, " n"]
+    """Opacity in 0..1."""
+    truth: Int[Tensor, " n"] | None = None
+    """Class of every Gaussian, `NO_CLASS` if it does not count. None means that it is unknown; there are no accuracies
+    then."""
+    answers: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
+    """Predicted class of each direction: "unrefined", and "refined" after a vote."""
+
+
+def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
+    """Return statistics by name, over the Gaussians of all scenes together.
+
+    The groups are `all`, `zero` (R = 0) and `seen` (R > 0), as in the paper's table of zero-evidence Gaussians. Each
+    has its `.share` of all Gaussians, the mean `.opacity`, the share of `.faint` Gaussians and the mean number of
+    `.views` that see them. It also has `.accuracy_unrefined` and `.accuracy_refined`, over Gaussians of known truth.
+
+    For Gaussians with R > 0, R is compared with opacity. There are `opacity.spearman` and `opacity.kendall` with their
+    p-values `…_p`, and `opacity.jaccard` of the lowest fifths. `opacity.quintile1` … are mean opacities by ascending R.
+
+    `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in tenths of equal count.
+    `….spearman_bins` is their rank correlation with the order. `histogram.0.00` … are shares by R.
+
+    The p-values assume that Gaussians are independent of each other, which neighbors are not.
+    """
+    reliability, norm, views = (
+        torch.cat([getattr(scene.scalars, name) for scene in scenes]) for name in ("reliability", "norm", "view_count")
+    )
+    opacity, seen = torch.cat([scene.opacity for scene in scenes]), reliability > 0
+    labeled, correct = _correct_predictions(scenes)
+    out: dict[str, float] = {}
+    for name, group in (("all", torch.ones_like(seen)), ("zero", ~seen), ("seen", seen)):
+        out[f"{name}.share"] = _mean(group, torch.ones_like(group))
+        out[f"{name}.opacity"] = _mean(opacity, group)
+        out[f"{name}.faint"] = _mean(opacity < _FAINT_OPACITY, group)
+        out[f"{name}.views"] = _mean(views, group)
+        out |= {f"{name}.accuracy_{kind}": _mean(right, group & labeled) for kind, right in correct.items()}
+    r, o = reliability[seen], opacity[seen]
+    for name, test in (("spearman", spearman_test(r, o)), ("kendall", kendall_test(r, o))):
+        out |= {f"opacity.{name}": test.value, f"opacity.{name}_p": test.p}
+    out["opacity.jaccard"] = lowest_jaccard(r, o)
+    out |= {f"opacity.quintile{i + 1}": x for i, x in enumerate(_bins(r, o, 5))}
+    if "unrefined" in correct:
+        for name, key in (("reliability", reliability), ("norm", norm)):
+            bins = accuracy_bins(key[labeled], correct["unrefined"][labeled])
+            out |= {f"{name}.bin{i + 1}": x for i, x in enumerate(bins)}
+            order = torch.arange(len(bins), dtype=torch.float64)
+            test = spearman_test(order, torch.tensor(bins, dtype=torch.float64))
+            out |= {f"{name}.spearman_bins": test.value, f"{name}.spearman_bins_p": test.p}
+    counts = torch.histc(r.double(), bins=_HISTOGRAM_BINS, min=0, max=1) / max(1, len(reliability))
+    return out | {f"histogram.{i / _HISTOGRAM_BINS:.2f}": float(x) for i, x in enumerate(counts)}
+
+
+def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, " n"], dict[str, Bool[Tensor, " n"]]]:
+    """Return the Gaussians of known truth, and those for which each kind of prediction is correct."""
+    truths = [scene.truth for scene in scenes if scene.truth is not None]
+    if len(truths) < len(scenes):
+        return torch.zeros(0, dtype=torch.bool), {}
+    right = {
+        kind: torch.cat([scene.answers[kind] == truth for scene, truth in zip(scenes, truths)])
+        for kind in scenes[0].answers
+        if all(kind in scene.answers for scene in scenes)
+    }
+    return torch.cat([truth != NO_CLASS for truth in truths]), right
+
+
+def accuracy_bins(key: Float[Tensor, " n"], correct: Bool[Tensor, " n"], bins: int = 10) -> list[float]:
+    """Return the share of correct predictions in bins of equal count by the key; only positive keys count."""
+    positive = key > 0
+    return list(_bins(key[positive], correct[positive].double(), bins))
+
+
+def _bins(key: Tensor, values: Tensor, bins: int) -> Iterator[float]:
+    return iter(bin_means(key, values, bins)[1].tolist())
+
+
+def _mean(values: Tensor, group: Tensor) -> float:
+    return float(values[group].double().mean())
+
+
+# Figures of the studies: a curve for every parameter, and R with accuracy.
+
+
+def plot_sweeps(
+    rows: Sequence[Mapping[str, Any]],
+    metric: str,
+    label: str,
+    path: Path,
+    *,
+    result: float | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write the figure of `sweeps_figure`.
+
+    Args:
+        overwrite: replace a file of that name.
+    """
+    _save(sweeps_figure(rows, metric, label, result), path, overwrite)
+
+
+def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, result: float | None = None) -> Figure:
+    """Plot the metric against each parameter of `votes.SWEEPS`, one panel each, with the run's values and the default
+    marked.
+
+    Args:
+        rows: rows with parameter, value and metric; `default` and `own` mark values.
+        label: label of the metric's axis.
+        result: main result of the run, drawn as a line across all panels.
+    """
+    parameters = list(dict.fromkeys(row["parameter"] for row in rows))
+    figure, axes = _figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
+    for panel, parameter in zip(axes, parameters):
+        points = sorted((row for row in rows if row["parameter"] == parameter), key=lambda row: row["value"])
+        values = [row[metric] for row in points]
+        panel.plot(range(len(points)), values, marker="o", markersize=4)
+        panel.set_xticks(range(len(points)), [f"{row['value']:g}" for row in points])
+        for mark, style in _MARKS.items():
+            marked = [i for i, row in enumerate(points) if row.get(mark)]
+            if len(marked) > 0:
+                panel.plot(marked, [values[i] for i in marked], linestyle="none", **style)
+        if result is not None:
+            panel.axhline(result, color="tab:gray", linestyle="--", label="result")
+        panel.set_xlabel(parameter, parse_math=False)
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel(label, parse_math=False)
+    if len(axes[0].get_legend_handles_labels()[0]) > 0:
+        axes[0].legend(fontsize="small")
+    return figure
+
+
+_MARKS: dict[str, dict[str, Any]] = {
+    "default": {"marker": "D", "color": "tab:orange", "label": "default"},
+    "own": {"marker": "o", "color": "black", "markerfacecolor": "none", "markersize": 11, "label": "this run"},
+}
+
+
+def plot_signals(rows: Sequence[Mapping[str, Any]], path: Path, *, overwrite: bool = False) -> None:
+    """Write the figure of `signals_figure`.
+
+    Args:
+        overwrite: replace a file of that name.
+    """
+    _save(signals_figure(rows), path, overwrite)
+
+
+def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Plot accuracy and reliability, one line of panels per row of the study (that is, per scene).
+
+    The left panel shows the accuracy of unrefined predictions in tenths by R and by ||f||, if there is a truth. The
+    right panel shows the histogram of R, with R = 0 as a separate bar.
+    """
+    figure, axes = _figure((9, 3.5 * len(rows)), len(rows), 2)
+    for row, curves, histogram in zip(rows, axes[::2], axes[1::2]):
+        for name, label in (("reliability", "R"), ("norm", "||f||")):
+            bins = [100 * x for key, x in row.items() if key.startswith(f"{name}.bin")]
+            if len(bins) > 0:
+                curves.plot(range(1, len(bins) + 1), bins, marker="o", label=f"by {label}")
+        curves.set_title(row.get("scene", ""), parse_math=False)
+        curves.set_xlabel("tenth of the Gaussians, ascending")
+        curves.set_ylabel("accuracy, unrefined, %")
+        counts = {float(k.removeprefix("histogram.")): 100 * x for k, x in row.items() if k.startswith("histogram.")}
+        width = 1 / len(counts)
+        histogram.bar(list(counts), list(counts.values()), width=width, align="edge", label="R > 0")
+        histogram.bar([-2 * width], [100 * row["zero.share"]], width=width, color="tab:red", label="R = 0")
+        histogram.set_xlabel("R")
+        histogram.set_ylabel("Gaussians, %")
+        for panel in (curves, histogram):
+            panel.grid(axis="y", alpha=0.3)
+            if len(panel.get_legend_handles_labels()[0]) > 0:
+                panel.legend()
+    return figure
+
+
+def _figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
+    mpl.rcParams["svg.hashsalt"] = "normlift"  # reproducible files
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+
+
+def _save(figure: Figure, path: Path, overwrite: bool) -> None:
+    with atomic_file(path, overwrite=overwrite) as draft:
+        figure.savefig(draft, metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+# Further studies of lifted runs: ablation, parameter sweeps, signals of R, comparison with other methods, timing.
+
 
 Evaluate = Callable[[Iterable[EvaluatedRun]], Evaluation]
 Row = Mapping[str, Any]
@@ -29,10 +483,10 @@ def study_votes(
     device: str,
 ) -> list[Row]:
     """Evaluate the protocol with every vote, around that of each run; equal votes are evaluated once."""
-    voters = [voter(lifted.field, lifted.scene.gaussians.means, device) for lifted in runs]
+    voters = [make_voter(lifted.field, lifted.scene.gaussians.means, device) for lifted in runs]
     results: dict[Any, Mapping[str, float]] = {}
     rows = []
-    for run_votes in votes([own_vote(lifted.field.manifest) for lifted in runs]):
+    for run_votes in votes([recorded_vote(lifted.field.manifest) for lifted in runs]):
         key = tuple((vote.variant, vote.config, vote.beta) for vote in run_votes)
         if key not in results:
             voted = (
@@ -53,7 +507,7 @@ def study_ablation(
         tell: called with the reason if variants are left out, because the features of a run cannot be computed again.
     """
     rows: list[Row] = []
-    for on, votes in ((False, ablation), (True, agreed_ablation)):
+    for on, votes in ((False, ablation), (True, consensus_ablation)):
         try:
             variants = [with_consensus(lifted, on, device) for lifted in runs]
         except (ValueError, FileNotFoundError) as error:
@@ -64,12 +518,12 @@ def study_ablation(
 
 
 def signal_rows(names: Sequence[str], scenes: Sequence[SceneSignals]) -> list[Row]:
-    """Return `signals` of every scene and, if there are several, of all of them pooled."""
-    rows: list[Row] = [{"scene": name, **signals(scene)} for name, scene in zip(names, scenes)]
-    return [*rows, {"scene": POOLED, **signals(*scenes)}] if len(rows) > 1 else rows
+    """Return `signal_statistics` of every scene and, if there are several, of all of them pooled."""
+    rows: list[Row] = [{"scene": name, **signal_statistics(scene)} for name, scene in zip(names, scenes)]
+    return [*rows, {"scene": POOLED_SCENE, **signal_statistics(*scenes)}] if len(rows) > 1 else rows
 
 
-POOLED = "all scenes"
+POOLED_SCENE = "all scenes"
 """Scene name of the pooled row."""
 
 
@@ -80,7 +534,7 @@ def scannet_signals(runs: Sequence[EvaluatedRun], labels: Sequence[Path], option
     for lifted, name, path in zip(runs, names, labels):
         nyu40, predictions, truth = read_labels(path), {}, None
         for kind, run in _by_refinement(lifted).items():
-            truth, predictions[kind] = answers(label_scene(run, name, path, nyu40, options), 19, **kwargs)
+            truth, predictions[kind] = predict_classes(label_scene(run, name, path, nyu40, options), 19, **kwargs)
         scenes.append(SceneSignals(lifted.field.scalars, lifted.scene.gaussians.opacities, truth, predictions))
     return signal_rows(names, scenes)
 
@@ -106,11 +560,11 @@ def _by_refinement(lifted: EvaluatedRun) -> dict[str, EvaluatedRun]:
     return {kind: replace(lifted, refined=refined) for kind, refined in kinds.items()}
 
 
-def baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> list[Row]:
+def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> list[Row]:
     """Evaluate the protocol for the runs and for `BASELINES` on the same features. Baselines are not refined.
 
     Raises:
-        ValueError, FileNotFoundError: as `seen_blocks`.
+        ValueError, FileNotFoundError: as `lifted_batches`.
     """
     rows: list[Row] = []
     for refined in (True, False):
@@ -123,7 +577,7 @@ def baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str) -> 
     return rows
 
 
-def timing(
+def study_timing(
     runs: Sequence[EvaluatedRun], device: str = "cpu", tell: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
     """Return the seconds of every stage and the peak memory of every lift, from the manifests, and their means.
@@ -136,10 +590,10 @@ def timing(
     rows = []
     for lifted in runs:
         row = {"scene": lifted.scene.name, **lifted.field.manifest.get("cost", {})}
-        reason = why_not_timed(lifted, device)
+        reason = timing_obstacle(lifted, device)
         if reason is None:
             try:
-                row |= time_sfs_way(lifted, device)
+                row |= time_dense_lift(lifted, device)
             except (ValueError, FileNotFoundError) as error:  # its features cannot be computed again
                 reason = str(error)
         if reason is not None:

@@ -21,7 +21,7 @@ LEAF = 32
 SLOTS = 64
 SPARE = 4
 """Candidates kept in addition to K, because float32 may confuse the last few."""
-MOST_NEIGHBORS = SLOTS - SPARE
+MAX_TREE_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
 """Distances per chunk, each of 8 bytes plus the same for its components."""
 _SORTED_IN_A_BLOCK = 4096
@@ -30,8 +30,8 @@ _LEAVES = 2**14
 """Leaves per launch: half a million points, 320 bytes each at K = 36."""
 
 
-class Sharing(Protocol):
-    """Group of processes, implemented by `core.portions.Team`."""
+class GatheringProcesses(Protocol):
+    """Group of processes, implemented by `core.partition.Communicator`."""
 
     @property
     def rank(self) -> int:
@@ -48,7 +48,7 @@ class Sharing(Protocol):
         ...
 
 
-class Tree(NamedTuple):
+class KdTree(NamedTuple):
     """Balanced k-d tree of L = 2 ** depth leaves; nodes in heap order, root 1, leaves L..2 L - 1."""
 
     index: Int64[Tensor, " slots"]
@@ -59,7 +59,7 @@ class Tree(NamedTuple):
     """Least and greatest coordinates of each node; the box of an empty node is at infinity."""
 
 
-class Found(NamedTuple):
+class NearestNeighbors(NamedTuple):
     """The K nearest other points of each point, sorted by (distance, index)."""
 
     index: Int32[Tensor, "n k"]
@@ -72,7 +72,7 @@ class Found(NamedTuple):
     """False if the result may be wrong."""
 
 
-def build_tree(points: Float32[Tensor, "n 3"], team: Sharing | None = None) -> Tree:
+def build_kd_tree(points: Float32[Tensor, "n 3"], team: GatheringProcesses | None = None) -> KdTree:
     """Build a tree level by level by splitting nodes at the median along their longest side.
 
     Each level needs one sort, and small nodes are sorted independently.
@@ -110,7 +110,7 @@ def build_tree(points: Float32[Tensor, "n 3"], team: Sharing | None = None) -> T
         if level > 0:
             low, high = low.view(-1, 2, 3).amin(dim=1), high.view(-1, 2, 3).amax(dim=1)
     boxes[boxes[:, 0] == torch.inf] = torch.inf
-    return Tree(index, padded, boxes)
+    return KdTree(index, padded, boxes)
 
 
 def _split(
@@ -243,14 +243,14 @@ def _rank(
         tl.store(out_certain + row, certain.to(tl.int8))
 
 
-def nearest(
+def find_nearest(
     points: Float32[Tensor, "n 3"],
     k: int,
     *,
     of: Int64[Tensor, " m"] | None = None,
     done: Callable[[int], None] | None = None,
-    team: Sharing | None = None,
-) -> Found:
+    team: GatheringProcesses | None = None,
+) -> NearestNeighbors:
     """Return the K nearest other points of all or some points.
 
     Args:
@@ -260,7 +260,7 @@ def nearest(
         done: Function called with the number of rows whose search has been launched.
         team: Processes that call this function together with the same points, each for its own query points.
     """
-    tree, device, wanted = build_tree(points, team), points.device, k + SPARE
+    tree, device, wanted = build_kd_tree(points, team), points.device, k + SPARE
     n, leaves = len(points) if of is None else len(of), len(tree.index) // LEAF
     row_of = torch.arange(len(points), dtype=torch.int32, device=device)
     query_leaves = torch.arange(-(-len(points) // LEAF), dtype=torch.int32, device=device)  # others are empty
@@ -268,7 +268,7 @@ def nearest(
         row_of = torch.full_like(row_of, -1).index_copy_(0, of, row_of[:n])
         rows = torch.where(tree.index < 0, -1, row_of[tree.index.clamp(min=0)])
         query_leaves = (rows.view(leaves, LEAF) >= 0).any(dim=1).nonzero().squeeze(1).int()
-    result = Found(
+    result = NearestNeighbors(
         torch.empty(n, k, dtype=torch.int32, device=device),
         torch.empty(n, k, device=device),
         torch.empty(n, dtype=torch.float64, device=device),
@@ -292,8 +292,8 @@ def nearest(
     return result._replace(certain=result.certain.bool())
 
 
-def nearest_of_rows(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> Found:
-    """Return the K nearest other points of some points by brute force, for the few uncertain results of `nearest`."""
+def brute_force_nearest(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> NearestNeighbors:
+    """Return the K nearest other points of some points by brute force, for the few uncertain results of `find_nearest`."""
     exact, parts = points.double(), []
     n = len(points)
     for chunk in rows.split(max(1, _PAIRS // n)):
@@ -308,7 +308,7 @@ def nearest_of_rows(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k
         rank = torch.arange(len(row), device=rows.device) - torch.searchsorted(row, row)
         keep = (rank < k) & (distance[row, index] < torch.inf)
         slots = (row[keep], rank[keep])
-        result = Found(
+        result = NearestNeighbors(
             torch.full((len(chunk), k), -1, dtype=torch.int32, device=rows.device),
             torch.full((len(chunk), k), torch.inf, device=rows.device),
             spacing,
@@ -317,4 +317,4 @@ def nearest_of_rows(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k
         result.index[slots] = index[keep].int()
         result.distance[slots] = distance[row, index][keep].float()
         parts.append(result)
-    return Found(*(torch.cat(x) for x in zip(*parts)))
+    return NearestNeighbors(*(torch.cat(x) for x in zip(*parts)))

@@ -30,7 +30,7 @@ _ENORMOUS = tl.constexpr(2.0**60)
 _LARGEST = tl.constexpr(3.4028234e38)
 
 
-class Rules(NamedTuple):
+class ProjectionSettings(NamedTuple):
     """Fields of the rasterizer's settings that the projection uses."""
 
     near_plane: float
@@ -43,7 +43,7 @@ class Rules(NamedTuple):
     min_alpha: float
 
 
-class Splats(NamedTuple):
+class ProjectedSplats(NamedTuple):
     """Visible Gaussians of some cameras."""
 
     seen: Int64[Tensor, " m"]
@@ -232,7 +232,7 @@ def _project_visible(
     tl.store(out_depth + e, depth, mask=valid)
 
 
-def project(
+def project_gaussians(
     means: Float32[Tensor, "n 3"],
     quats: Float32[Tensor, "n 4"],
     scales: Float32[Tensor, "n 3"],
@@ -241,11 +241,11 @@ def project(
     cameras: Float32[Tensor, "views 16"],
     width: int,
     height: int,
-    rules: Rules,
+    rules: ProjectionSettings,
     *,
     antialiased: bool,
     per_axis: bool,
-) -> Splats:
+) -> ProjectedSplats:
     """Project a scene into cameras of one size. Invisible Gaussians take only one byte per view.
 
     Args:
@@ -278,4 +278,4 @@ def project(
         _project_visible[(triton.cdiv(len(keys), _BLOCK),)](
             *scene, cameras, keys, splats, depth, len(keys), views, width, height, *rules, SPLAT=SPLAT, **options
         )
-    return Splats(keys, splats, depth)
+    return ProjectedSplats(keys, splats, depth)

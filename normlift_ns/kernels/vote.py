@@ -21,11 +21,11 @@ import triton.language as tl
 from jaxtyping import Bool, Float, Float16, Float32, Int, Int32, Int64
 from torch import Tensor
 
-MOST_NEIGHBORS = 63
-Precision = Literal["certified", "first", "halves", "tf32", "tf32x3", "ieee"]
+MAX_VOTE_NEIGHBORS = 63
+VotePrecision = Literal["certified", "first", "halves", "tf32", "tf32x3", "ieee"]
 
 
-class Tuning(NamedTuple):
+class LaunchConfig(NamedTuple):
     """Launch parameters of one program."""
 
     columns: int
@@ -39,8 +39,8 @@ class Tuning(NamedTuple):
     """Largest number of registers per thread; with fewer, more programs run simultaneously."""
 
 
-_HALVES = Tuning(columns=64, columns_later=32, stages=3, warps=4, registers=128)
-_WHOLE = Tuning(columns=64, columns_later=64, stages=3, warps=4)
+_HALVES = LaunchConfig(columns=64, columns_later=32, stages=3, warps=4, registers=128)
+_WHOLE = LaunchConfig(columns=64, columns_later=64, stages=3, warps=4)
 _ROWS = 16
 
 
@@ -145,7 +145,7 @@ def _halve(rows, high, low, rough, dimension, BLOCK: tl.constexpr):
     tl.store(rough + j, tl.where(length < 1.01, error, float("inf")))
 
 
-def halve(
+def split_float16(
     rows: Float32[Tensor, "m d"],
 ) -> tuple[Float16[Tensor, "m d"], Float16[Tensor, "m d"], Float32[Tensor, " m"]]:
     """Return h, 2048 l and |l| of unit rows u = h + l; |l| is inf for rows longer than 1."""
@@ -173,7 +173,7 @@ def vote(
     delta: float,
     own: Float32[Tensor, " n"] | None = None,
     prior: float = 0.0,
-    precision: Precision = "certified",
+    precision: VotePrecision = "certified",
 ) -> None:
     """Write the index of the Gaussian whose direction each voter takes to `source`; formulas in `core.refine`.
 
@@ -199,7 +199,7 @@ def vote(
     if len(voters) == 0:
         return
     halves = directions.dtype == torch.float32 and precision in ("certified", "first", "halves")
-    high, low, rough = halve(directions) if halves else (directions, directions, reliability)
+    high, low, rough = split_float16(directions) if halves else (directions, directions, reliability)
     tuning = _HALVES if halves else _WHOLE
     _vote[(len(voters),)](
         voters, neighbors, distance, high, low, rough, row_of, reliability, reliability if own is None else own,
@@ -221,7 +221,7 @@ def _find_reliable(neighbors, reliability, out, n, k, ROWS: tl.constexpr, SLOTS:
     tl.store(out + row, tl.max(reliable.to(tl.int8), axis=1), mask=row < n)
 
 
-def any_reliable(neighbors: Int32[Tensor, "m k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
+def has_reliable_neighbor(neighbors: Int32[Tensor, "m k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """Return a mask of the Gaussians with a neighbor that has R > 0."""
     n, k = neighbors.shape
     mask = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
@@ -242,7 +242,7 @@ def _mark(voters, neighbors, out, count, k, ROWS: tl.constexpr, SLOTS: tl.conste
     tl.store(out + index, tl.full([ROWS, SLOTS], 1, tl.int8), mask=index >= 0)
 
 
-def members(voters: Int[Tensor, " v"], neighbors: Int32[Tensor, "r k"], n: int) -> Int64[Tensor, " m"]:
+def voters_and_neighbors(voters: Int[Tensor, " v"], neighbors: Int32[Tensor, "r k"], n: int) -> Int64[Tensor, " m"]:
     """Return the distinct indices of the voters and their neighbors among n Gaussians, ascending."""
     k = neighbors.shape[1]
     mask = torch.zeros(n, dtype=torch.int8, device=neighbors.device)

@@ -4,11 +4,13 @@ Every ns-* command imports this module while nerfstudio builds its list of metho
 that list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils) nor anything slow or optional.
 """
 
+from pathlib import Path
 from typing import Any
 
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
@@ -86,4 +88,47 @@ def _splatfacto_optimizers() -> dict[str, Any]:
 normlift_method = MethodSpecification(
     config=trainer_config("normlift", NerfstudioDataParserConfig(load_3D_points=True), NormLiftModelConfig()),
     description="splatfacto with open-vocabulary semantics, lifted at the end of training.",
+)
+
+
+# Method of `ns-train normlift-lerf-ovs`, for scenes of LERF-OVS: COLMAP folders with images/ and sparse/0.
+#
+# All images are used for training, including the labeled frames, at the size of the labels. Features are read from
+# language_features/ of the scene, as written by LangSplat's preprocessing. `--pipeline.source.features none` computes
+# them from the images instead.
+
+
+lerf_ovs_method = MethodSpecification(
+    config=trainer_config(
+        "normlift-lerf-ovs",
+        ColmapDataParserConfig(load_3D_points=True, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"),
+        NormLiftModelConfig(),
+        source=SourceOptions(features="langsplat"),
+    ),
+    description="normlift for scenes of the LERF-OVS benchmark: COLMAP folders with LangSplat's language_features/.",
+)
+
+
+# Method of `ns-train normlift-scannet`: one Gaussian per vertex of a ScanNet mesh, at its position and in its order.
+#
+# The benchmark compares labels vertex by vertex. Training therefore does not move, split or cull the seed points
+# (`ply_file_path` of transforms.json: the vertices), and keeps the coordinates of the dataset.
+
+
+scannet_method = MethodSpecification(
+    config=trainer_config(
+        "normlift-scannet",
+        NerfstudioDataParserConfig(
+            load_3D_points=True,
+            downscale_factor=1,
+            orientation_method="none",
+            center_method="none",
+            auto_scale_poses=False,
+            eval_mode="all",
+        ),
+        NormLiftModelConfig(stop_split_at=0),
+        image_scale=0.5,
+        means={"optimizer": AdamOptimizerConfig(lr=0.0, eps=1e-15), "scheduler": None},
+    ),
+    description="normlift with frozen points, for ScanNet: Gaussian i is vertex i.",
 )

@@ -1,9 +1,10 @@
-"""splatfacto's model with a semantic field, as loaded by ns-viewer, ns-render, ns-eval and ns-export."""
+"""LPIPS metric that is built at its first use."""
 
 from __future__ import annotations
 
 import inspect
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
@@ -19,20 +20,52 @@ from torch import Tensor
 
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.data.images import to_camera
+from normlift_ns.data.nerfstudio.config_classes import active_sh_degree
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.lpips import LazyLpips
-from normlift_ns.nerfstudio_plugin.panel import Panel
+from normlift_ns.io.run_dir import FIELD_FOLDER, check_run, resolve_field_paths
+from normlift_ns.nerfstudio_plugin.panel import SearchPanel
 from normlift_ns.options import RasterizeMode
-from normlift_ns.question import Question
-from normlift_ns.raster.colors import view_colors
-from normlift_ns.raster.picking import ray_weights
-from normlift_ns.raster.rasterize import render
-from normlift_ns.raster.settings import RasterSettings
-from normlift_ns.runs.files import FIELD_FOLDER, check_run, with_paths
-from normlift_ns.runs.question import load_question
-from normlift_ns.scenes.nerfstudio.appearance import shading_degree
-from normlift_ns.scenes.photographs import to_camera
-from normlift_ns.viewer.display import Display, draw
+from normlift_ns.query.question import Query, load_query
+from normlift_ns.rasterization.rasterize import ray_weights, render, view_colors
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.rendering.figures import Display, render_outputs
+
+
+class LazyLpips(torch.nn.Module):
+    """Stand-in for torchmetrics' LearnedPerceptualImagePatchSimilarity, whose constructor downloads weights.
+
+    Args:
+        options: keyword arguments of the metric.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__()
+        self.options = options
+        self.available = True
+        """False once loading the weights has failed."""
+        self._metric: list[torch.nn.Module] = []  # in a list, which keeps the network out of checkpoints
+
+    def forward(self, image: Tensor, reference: Tensor) -> Tensor:
+        """Return the LPIPS of images [B, 3, H, W] in 0..1; NaN, with a single warning, if the weights are missing."""
+        if self.available and not self._metric:
+            self._build()
+        if not self.available:
+            return image.new_tensor(torch.nan)
+        return self._metric[0].to(image.device)(image, reference)
+
+    def _build(self) -> None:
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # noqa: PLC0415 (slow)
+
+        try:
+            self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
+        except (ImportError, OSError) as error:
+            self.available = False
+            warnings.warn(f"LPIPS is skipped: its weights cannot be downloaded ({error})", stacklevel=2)
+
+
+# splatfacto's model with a semantic field, as loaded by ns-viewer, ns-render, ns-eval and ns-export.
+
 
 _MIN_FOCAL = 1e-3
 """Smallest focal length that is rendered, as a fraction of the image's longer side; its inverse is the largest."""
@@ -72,7 +105,7 @@ class NormLiftModel(SplatfactoModel):
             super().populate_modules()
         self._field: SemanticField | None = None
         self._display: Display | None = None
-        self.normlift = Panel(self)
+        self.normlift = SearchPanel(self)
 
     @property
     def on_cpu(self) -> bool:
@@ -92,13 +125,13 @@ class NormLiftModel(SplatfactoModel):
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
-            folder = self.config.semantics = own_semantics(self.config.semantics)
+            folder = self.config.semantics = find_field_folder(self.config.semantics)
             check_run(folder.parent)
-            self.attach(with_paths(SemanticField.load(folder, self.means), folder), load_question(folder))
+            self.attach(resolve_field_paths(SemanticField.load(folder, self.means), folder), load_query(folder))
         if self.on_cpu:
             compile_renderer()
 
-    def attach(self, semantic_field: SemanticField, question: Question | None = None) -> None:
+    def attach(self, semantic_field: SemanticField, question: Query | None = None) -> None:
         """Render a field and the answer to a query from now on, and enable the panel for the field."""
         self._field = semantic_field.to(self.device)
         self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
@@ -124,7 +157,7 @@ class NormLiftModel(SplatfactoModel):
         rows = self.rows_in(obb_box, display)
         values = self.means.new_zeros(self.num_points, 0) if display is None else display.values
         if self.on_cpu:
-            with untraced():
+            with without_tracer():
                 outputs, scalars = self._render_on_cpu(view, values, rows)
         else:
             outputs = super().get_outputs_for_camera(camera, None if rows is None else _Rows(rows))  # type: ignore[arg-type]
@@ -136,8 +169,8 @@ class NormLiftModel(SplatfactoModel):
         if display is None:
             return outputs
         alpha = outputs["accumulation"][:, :, 0]
-        with untraced():
-            return {**outputs, **draw(display, outputs["rgb"], scalars, alpha, by_text=self.normlift.viewed)}
+        with without_tracer():
+            return {**outputs, **render_outputs(display, outputs["rgb"], scalars, alpha, by_text=self.normlift.viewed)}
 
     def rows_in(self, obb_box: OrientedBox | None, display: Display | None) -> Bool[Tensor, " n"] | None:
         """Return the mask of the Gaussians that are drawn: in the box and not hidden. None: all."""
@@ -158,7 +191,7 @@ class NormLiftModel(SplatfactoModel):
         return self._scene(None)
 
     def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """Return what `write_splats` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
+        """Return what `write_splat_ply` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
         return dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:
@@ -171,7 +204,7 @@ class NormLiftModel(SplatfactoModel):
         coefficients = torch.cat([self.features_dc[:, None], self.features_rest], dim=1).detach()
         if rows is not None:
             coefficients, values = coefficients[rows], values[rows]
-        rgb = view_colors(scene.means, coefficients, view, shading_degree(self.config, self.step))
+        rgb = view_colors(scene.means, coefficients, view, active_sh_degree(self.config, self.step))
         depth = scene.means @ view.world_to_camera[2, :3, None] + view.world_to_camera[2, 3]
         options = {"rasterize_mode": self.config.rasterize_mode, "settings": self._settings}
         image, alpha = render(scene, view, torch.cat([rgb, depth, values], dim=1), **options)
@@ -206,7 +239,7 @@ class NormLiftModel(SplatfactoModel):
         return metrics, images
 
 
-def own_semantics(semantics: Path) -> Path:
+def find_field_folder(semantics: Path) -> Path:
     """Return the folder of the semantic field next to the config.yml that nerfstudio's `eval_setup` reads.
 
     The config of a copied run still names the folder of the original run, and nerfstudio does not tell a model where
@@ -270,7 +303,7 @@ def _valid_camera(camera: Cameras) -> tuple[Cameras, Camera]:
 
 
 @contextmanager
-def untraced() -> Iterator[None]:
+def without_tracer() -> Iterator[None]:
     """Suspend the tracer with which nerfstudio's viewer interrupts a render at any line of Python.
 
     If the tracer raises inside Numba's dispatcher, or in the middle of an import, the thread that renders ends.

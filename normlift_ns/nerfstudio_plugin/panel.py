@@ -1,62 +1,143 @@
-"""Controller of the panel in nerfstudio's viewer: applies the actions of the widgets to a history of states.
-
-All browsers share one panel, as they share nerfstudio's own. States are immutable, and so is the `Display` of a state
-that the model gets. Other threads can therefore render images without waiting for this one.
-"""
+"""Encoding of the prompts typed into the panel, with the text encoder of the run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import Any, cast
 
 from torch import Tensor
 
+from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.core.field import SemanticField
-from normlift_ns.crash import explain
-from normlift_ns.errors import InputError
-from normlift_ns.insight.floaters import find_floaters
-from normlift_ns.nerfstudio_plugin.asker import Asker, stored
-from normlift_ns.nerfstudio_plugin.clicks import MODES, Clicks
-from normlift_ns.nerfstudio_plugin.face import WAITING, Face
-from normlift_ns.nerfstudio_plugin.insights import go_to, reasons_of
-from normlift_ns.nerfstudio_plugin.keeping import Host, save_prompts, selection_file
-from normlift_ns.question import Question
+from normlift_ns.encoders.registry import LazyTextEncoder
+from normlift_ns.errors import InputError, describe_error
+from normlift_ns.io.run_dir import text_cache_folder
+from normlift_ns.nerfstudio_plugin.panel_view import (
+    CLICK_MODES,
+    NO_FIELD_MESSAGE,
+    ClickListener,
+    PanelHost,
+    PanelView,
+    PanelWidgets,
+    explanation_of_run,
+    export_selection,
+    move_camera,
+    store_prompts,
+)
+from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.text_encoder import default_rule, text_encoder_for
 from normlift_ns.session import actions
-from normlift_ns.session.found import FoundObject
-from normlift_ns.session.history import History
-from normlift_ns.session.prompts import join_prompts, prompts_of
-from normlift_ns.session.space import Space
-from normlift_ns.session.state import State
-from normlift_ns.session.turns import Turn
-from normlift_ns.session.verdicts import carried
-from normlift_ns.text_encoders import default_rule
-from normlift_ns.viewer.reasons import Reasons
-from normlift_ns.viewer.rows import OBJECT_DEEDS
+from normlift_ns.session.actions import carry_threshold
+from normlift_ns.session.objects import ObjectRow
+from normlift_ns.session.prompts import (
+    Prompt,
+    build_query,
+    encode_prompts,
+    join_prompts,
+    prompts_of_query,
+    split_prompts,
+)
+from normlift_ns.session.selection import SelectionContext
+from normlift_ns.session.state import History, RequestToken, State
+from normlift_ns.viewer.widgets import OBJECT_ACTIONS, Explanation
+
+
+class PromptEncoder:
+    """Encoder of the panel's prompts. The text encoder is loaded at the first prompt and then kept."""
+
+    def __init__(self) -> None:
+        self.encoder: list[LazyTextEncoder] = []
+        """The text encoder as the only item once it is loaded; empty before."""
+        self._lock = Lock()
+
+    def pose(
+        self,
+        field: SemanticField,
+        folder: Path | None,
+        line: str,
+        negatives: str,
+        clicks: Mapping[str, Any],
+        widgets: PanelWidgets | None,
+        is_current: Callable[[], bool],
+    ) -> tuple[tuple[Prompt, ...], Query] | None:
+        """Encode a line of prompts and build its query.
+
+        Args:
+            folder: folder of the semantic field; None: no stored prompts and no text embedding cache.
+            line: prompts as typed.
+            negatives: negative prompts as typed.
+            clicks: directions of clicked Gaussians, by the names of their prompts.
+            widgets: where the rule, the minimum reliability and the choice of features are set; None: defaults.
+            is_current: returns False once the request is stale.
+        Returns:
+            The prompts and their query; None if the request is stale.
+        Raises:
+            ValueError, OSError: as `encode_prompts` and `session.prompts.build_query`.
+        """
+        vectors: dict[str, Any] = dict(clicks)
+        with suppress(ValueError, OSError):  # a damaged file is reported when it is shown or replaced
+            vectors |= {prompt.text: prompt.vector for prompt in prompts_of_query(load_stored_query(folder))}
+        options: dict[str, Any] = {}
+        if widgets is not None:
+            options = {
+                "rule": widgets.rule.value,
+                "min_reliability": widgets.reliability.value,
+                "refined": widgets.refined.value,
+            }
+
+        def encode(texts: Sequence[str]) -> Any:
+            if len(self.encoder) == 0:
+                cache = None if folder is None else text_cache_folder(folder.parent)
+                self.encoder.append(text_encoder_for(field, str(field.source.device), cache))
+            return self.encoder[0].rows(texts)
+
+        with self._lock:  # so that two threads do not both load the encoder
+            if not is_current():
+                return None
+            prompts = encode_prompts(line, encode, vectors)
+            return build_query(field, prompts, encode, negatives=split_prompts(negatives), **options)
+
+
+def load_stored_query(folder: Path | None) -> Query | None:
+    """Return the query stored in a run, or None if it stores none."""
+    return None if folder is None else load_query(folder)
+
+
+# Controller of the panel in nerfstudio's viewer: applies the actions of the widgets to a history of states.
+#
+# All browsers share one panel, as they share nerfstudio's own. States are immutable, and so is the `Display` of a
+# state that the model gets. Other threads can therefore render images without waiting for this one.
+
 
 _READING = "Reading the prompts. The first query also loads the text encoder, which takes a while."
 _ACTIONS = {
     "Hide": actions.hide,
-    "Only": actions.only,
+    "Only": actions.show_only,
     "All": actions.show_all,
-    "Suggested": actions.suggest,
-    "Leave out what is poorly evidenced": actions.leave_out_poor,
+    "Suggested": actions.use_suggested_threshold,
+    "Leave out what is poorly evidenced": actions.remove_weak,
 }
-_SLIDERS = {"Threshold": actions.threshold, "Minimum reliability": actions.min_reliability, "Grow": actions.resize}
+_SLIDERS = {
+    "Threshold": actions.set_threshold,
+    "Minimum reliability": actions.set_min_reliability,
+    "Grow": actions.resize,
+}
 
 
-class Panel(Face):
+class SearchPanel(PanelView):
     """The panel with its queries, clicks and history."""
 
-    def __init__(self, host: Host) -> None:
+    def __init__(self, host: PanelHost) -> None:
         super().__init__(host, lambda: self._clicks.armed)
-        self._asker, self._clicks = Asker(), Clicks(self._on_click)
+        self._asker, self._clicks = PromptEncoder(), ClickListener(self._on_click)
         self._folder: Path | None = None
 
     def open(
-        self, field: SemanticField, means: Tensor, folder: Path | None = None, question: Question | None = None
+        self, field: SemanticField, means: Tensor, folder: Path | None = None, question: Query | None = None
     ) -> None:
         """Enable the panel for a field, and show the answer to a query.
 
@@ -64,16 +145,16 @@ class Panel(Face):
             folder: folder of the field; None: prompts cannot be saved.
         """
         with self._lock:
-            self._folder, state = folder, State(Space(field, means))
+            self._folder, state = folder, State(SelectionContext(field, means))
             if question is None:
                 with suppress(ValueError, OSError):  # a missing file of text embeddings is reported when it is needed
                     self._negatives = join_prompts(default_rule(field).negatives)
             else:
-                state = actions.ask(state, prompts_of(question), question)
+                state = actions.ask(state, prompts_of_query(question), question)
                 self._negatives = join_prompts(question.negatives)
                 self._set_prompts(join_prompts(question.texts))
             self._clicks.known, self._message = {}, ""
-            self._reasons = reasons_of(folder, field)
+            self._reasons = explanation_of_run(folder, field)
             if self._widgets is not None:
                 self._widgets.negatives.value = self._negatives
             self._show(History.of(state, lean=State.lean))
@@ -95,7 +176,7 @@ class Panel(Face):
         """
         try:
             if self.state is None:
-                raise InputError(WAITING)
+                raise InputError(NO_FIELD_MESSAGE)
             if name == "Ask":
                 self._ask()
             elif name == "Select likely floaters":
@@ -106,7 +187,7 @@ class Panel(Face):
                 with self._lock:
                     self._act_quickly(name, value, client)
         except Exception as error:  # no error may stop the viewer
-            self.tell(explain(error)[0])
+            self.tell(describe_error(error)[0])
 
     def _act_quickly(self, name: str, value: Any, client: Any) -> None:
         """Carry out an action that takes no noticeable time."""
@@ -129,20 +210,20 @@ class Panel(Face):
                 self._widgets.forget(self._negatives)
             self._show(history.do(replace(actions.show_all(actions.clear(state)), did="Clear")))
         elif name == "shown" and self._widgets is not None:
-            self._show(history.do(actions.show(state, self._widgets.place(value))))
+            self._show(history.do(actions.show_prompt(state, self._widgets.place(value))))
         elif name == "refined" and state.question is not None:
             question = replace(state.question, refined=value)
-            self._show(history.do(actions.ask_again(state, question, "Refined features")))
+            self._show(history.do(actions.update_query(state, question, "Refined features")))
         elif name == "colormap":
             self._colormap = value
             self._show(history)
-        elif name in MODES:
+        elif name in CLICK_MODES:
             self._clicks.arm(name, client)
             self.tell("Click on the scene, or press Cancel or Escape to stop.")
         elif name == "Cancel":
             self._cancel()
             self._update_widgets()
-        elif name in OBJECT_DEEDS:
+        elif name in OBJECT_ACTIONS:
             self._act_on_object(name, value, client)
         elif name == "Download selection":
             self._download(state.selection, state.name, client)
@@ -156,17 +237,17 @@ class Panel(Face):
         if self._reasons is not None:
             self._reasons.forget()
 
-    def _act_on_object(self, action: str, row: FoundObject, client: Any) -> None:
+    def _act_on_object(self, action: str, row: ObjectRow, client: Any) -> None:
         if action == "go to":
-            go_to(client, row, self._host[0].scene(), cast(State, self.state).drawn)
+            move_camera(client, row, self._host[0].scene(), cast(State, self.state).drawn)
         elif action == "export":
             self._download(row.mask, row.name, client)
         else:
             history = cast("History[State]", self._history)
-            self._show(history.do((actions.only if action == "only" else actions.hide)(history.now, row.mask)))
+            self._show(history.do((actions.show_only if action == "only" else actions.hide)(history.now, row.mask)))
 
     def _download(self, mask: Tensor, name: str, client: Any) -> None:
-        file, content, count = selection_file(self._host[0], cast(State, self.state), mask, name)
+        file, content, count = export_selection(self._host[0], cast(State, self.state), mask, name)
         client.send_file_download(file, content)
         self.tell(f"Sent {file} with {count:,} Gaussians to the browser's downloads.")
 
@@ -176,7 +257,7 @@ class Panel(Face):
             self._line, self._negatives = self._widgets.prompts.value, self._widgets.negatives.value
         self._run(_READING, self._answer)
 
-    def _run(self, description: str, task: Callable[[Turn], None]) -> None:
+    def _run(self, description: str, task: Callable[[RequestToken], None]) -> None:
         """Run a slow task without holding a lock; the panel shows its description until it ends."""
         token = self._turns.start(description)
         self._clicks.disarm()
@@ -185,11 +266,11 @@ class Panel(Face):
         try:
             task(token)
         except Exception as error:  # the libraries of an encoder may raise anything; no error may stop the viewer
-            message = explain(error)[0]
+            message = describe_error(error)[0]
         if self._turns.finish(token):
             self.tell(message)
 
-    def _answer(self, token: Turn) -> None:
+    def _answer(self, token: RequestToken) -> None:
         inputs = (self._folder, self._line, self._negatives, dict(self._clicks.known), self._widgets)
         field = cast(State, self.state).space.field
         result = self._asker.pose(field, *inputs, lambda: self._turns.busy != "")
@@ -197,20 +278,22 @@ class Panel(Face):
             if result is not None and self._turns.finish(token) and self._history is not None:
                 state, (prompts, question) = self._history.now, result
                 self._message = ""
-                self._show(self._history.do(actions.ask(state, prompts, carried(state, question))), answered=True)
+                self._show(
+                    self._history.do(actions.ask(state, prompts, carry_threshold(state, question))), answered=True
+                )
 
-    def _select_floaters(self, token: Turn) -> None:
+    def _select_floaters(self, token: RequestToken) -> None:
         floaters = find_floaters(self._host[0].scene(), cast(State, self.state).space.field.scalars).mask
         with self._lock:
             if self._history is not None and self._turns.wanted(token):
                 state = actions.select_floaters(self._history.now, floaters)
                 self._turns.finish(token)
-                self._message = actions.LOOK_FIRST
+                self._message = actions.FLOATERS_HINT
                 self._show(self._history.do(state), answered=True)
 
     def _explain(self) -> None:
         """Show the training images behind the selection; the search for them holds no lock."""
-        state, reasons = cast(State, self.state), cast(Reasons, self._reasons)
+        state, reasons = cast(State, self.state), cast(Explanation, self._reasons)
         token = reasons.start(state)
         self.tell("")
         try:
@@ -236,16 +319,16 @@ class Panel(Face):
                     self._message = ""
                     self._show(history.do(actions.click(history.now, weights, cast(Any, mode))), answered=True)
                     return
-                saved = stored(self._folder)
-                vector = actions.click_vector(history.now, weights)
+                saved = load_stored_query(self._folder)
+                vector = actions.picked_direction(history.now, weights)
                 self._set_prompts(self._clicks.keep(vector, () if saved is None else saved.texts))
             self._ask()
         except Exception as error:  # as in `act`
-            self.tell(explain(error)[0])
+            self.tell(describe_error(error)[0])
 
     def _save(self, state: State, *, replaces: bool) -> None:
         try:
-            count = save_prompts(self._folder, state, replaces=replaces)
+            count = store_prompts(self._folder, state, replaces=replaces)
         except InputError:
             self._offer_to_replace(state.question is not None)
             raise

@@ -15,25 +15,22 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from normlift_ns.asking import answer
-from normlift_ns.core.files import write_text
-from normlift_ns.crash import explain
+from normlift_ns.data.checkpoint import numpy_scalar_globals
+from normlift_ns.data.nerfstudio.config import check_components, check_lift_options, dataset_in_config
+from normlift_ns.data.nerfstudio.load import image_name, load_nerfstudio_scene
+from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.encoders.source import FeatureSource
-from normlift_ns.lifting import lift_scene
-from normlift_ns.nerfstudio_plugin.face import redraw
+from normlift_ns.errors import describe_error
+from normlift_ns.io.atomic import write_text_file
+from normlift_ns.io.run_dir import FIELD_FOLDER, add_digest_comment, cache_folder, run_file_digests
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
-from normlift_ns.nerfstudio_plugin.views import DatasetViews, by_nerfstudio
+from normlift_ns.nerfstudio_plugin.panel_view import rerender_clients
+from normlift_ns.nerfstudio_plugin.views import DatasetViews, nerfstudio_views
 from normlift_ns.options import LiftOptions, SourceOptions
-from normlift_ns.question import make_question
-from normlift_ns.runs.files import FIELD_FOLDER, cache_folder, digests_beside, sealed
-from normlift_ns.runs.question import save_question
-from normlift_ns.scenes.nerfstudio.checks import check_options, check_parts
-from normlift_ns.scenes.nerfstudio.config import stored_data
-from normlift_ns.scenes.nerfstudio.load import load_scene
-from normlift_ns.scenes.nerfstudio.views import image_name
-from normlift_ns.scenes.unpickling import numpy_numbers
-from normlift_ns.text_encoders import encoder_settings
+from normlift_ns.pipeline import lift_scene
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import make_query, save_query
+from normlift_ns.query.text_encoder import encoder_settings
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -60,7 +57,7 @@ class NormLiftPipeline(VanillaPipeline):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if hasattr(torch.serialization, "add_safe_globals"):  # nerfstudio cannot load from torch 2.4 on without it
-            torch.serialization.add_safe_globals(numpy_numbers())
+            torch.serialization.add_safe_globals(numpy_scalar_globals())
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -74,8 +71,8 @@ class NormLiftPipeline(VanillaPipeline):
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
         model.detach()  # the field of a lifted checkpoint whose training is resumed
         if trainer is not None and trainer.local_rank == 0:
-            check_before(trainer)
-            source = source_of(trainer.config)
+            check_before_training(trainer)
+            source = feature_source_of(trainer.config)
             folder = dataset_folder(trainer.config)
             files = self.datamanager.train_dataset.image_filenames  # type: ignore[union-attr]
             source.available([image_name(file, folder) for file in files])
@@ -86,7 +83,7 @@ class NormLiftPipeline(VanillaPipeline):
         return callbacks
 
 
-def check_before(trainer: Trainer) -> None:
+def check_before_training(trainer: Trainer) -> None:
     """Raise before training if the lift at its end would fail, and print warnings about the images.
 
     Raises:
@@ -96,8 +93,8 @@ def check_before(trainer: Trainer) -> None:
     """
     config: Any = trainer.config
     path = trainer.base_dir / "config.yml"
-    check_parts(config, path)
-    check_options(config.pipeline.lift, "--pipeline.lift")
+    check_components(config, path)
+    check_lift_options(config.pipeline.lift, "--pipeline.lift")
     datamanager: Any = trainer.pipeline.datamanager
     dataset = datamanager.train_dataset
     poses = dataset.cameras.camera_to_worlds
@@ -114,11 +111,11 @@ def check_before(trainer: Trainer) -> None:
 
 def dataset_folder(config: TrainerConfig) -> Path:
     """Return the folder of the dataset that the config names."""
-    data = stored_data(config)
+    data = dataset_in_config(config)
     return data.parent if data.suffix == ".json" else data
 
 
-def source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
+def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
     """Make the feature source of a config; without a folder of features, LangSplat's are read from the dataset.
 
     Raises:
@@ -148,13 +145,13 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
     """Lift the trained scene; print any error instead of raising it, since training is complete and saved."""
     config = trainer.base_dir / "config.yml"
     try:
-        lift_trained(trainer)
+        lift_last_checkpoint(trainer)
     except Exception as error:  # no error may make a completed training fail
         if trainer.config.pipeline.model.semantics is None:  # type: ignore[attr-defined]
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
         CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
-            f"Training is complete and saved, but lifting it at step {step} failed: {explain(error)[0]}\n"
+            f"Training is complete and saved, but lifting it at step {step} failed: {describe_error(error)[0]}\n"
             f"Lift it again with: ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,
@@ -162,7 +159,7 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
         )
 
 
-def lift_trained(trainer: Trainer) -> Path:
+def lift_last_checkpoint(trainer: Trainer) -> Path:
     """Lift the last checkpoint of a trainer, write the field and its config into the run, and show it in the viewer.
 
     Returns:
@@ -171,8 +168,8 @@ def lift_trained(trainer: Trainer) -> Path:
     pipeline: Any = trainer.pipeline
     options, path = pipeline.config, trainer.base_dir / "config.yml"
     CONSOLE.print("Lifting the trained scene")
-    scene = load_scene(path, by_nerfstudio=by_nerfstudio)
-    source = source_of(trainer.config, str(pipeline.device))
+    scene = load_nerfstudio_scene(path, by_nerfstudio=nerfstudio_views)
+    source = feature_source_of(trainer.config, str(pipeline.device))
     encoder = encoder_settings(options.source)
     device = "cuda" if pipeline.device.type == "cuda" else "cpu"
     result = lift_scene(scene, source, options.lift, cache_folder(path.parent), device=device, encoder=encoder)
@@ -180,21 +177,21 @@ def lift_trained(trainer: Trainer) -> Path:
     field = replace(result.field, manifest={**result.field.manifest, "source": settings})
     folder = trainer.base_dir / FIELD_FOLDER
     files = [scene.checkpoint_path, scene.location.run_dir / "dataparser_transforms.json"]
-    field.save(folder, overwrite=True, beside=digests_beside(folder, files))
+    field.save(folder, overwrite=True, beside=run_file_digests(folder, files))
     question = None
     if len(options.queries) > 0:
-        question = make_question(field, source.text, options.queries)
-        question = answer(field, scene.gaussians.means, question).question
-        save_question(folder, question)
+        question = make_query(field, source.text, options.queries)
+        question = run_query(field, scene.gaussians.means, question).question
+        save_query(folder, question)
     model: Any = trainer.config.pipeline.model
     model.semantics = Path(FIELD_FOLDER)
-    write_text(path, sealed(yaml.dump(trainer.config)), overwrite=True)
+    write_text_file(path, add_digest_comment(yaml.dump(trainer.config)), overwrite=True)
     model.semantics = folder
     with trainer.train_lock:
         pipeline.model.attach(field, question)
     viewer: Any = trainer.viewer_state
     if hasattr(viewer, "render_statemachines"):
-        redraw(viewer)
+        rerender_clients(viewer)
     command = f"ns-normlift-query --load-config {shlex.quote(str(path))} --text ..."
     CONSOLE.print(f"Lifted: {folder}. Query it with: {command}", markup=False, soft_wrap=True)
     return folder

@@ -1,4 +1,4 @@
-"""Images and cameras of a run as splatfacto trained on them, without lens distortion."""
+"""Configs of trained runs as objects of nerfstudio's own classes, for its commands and its viewer."""
 
 from __future__ import annotations
 
@@ -9,19 +9,60 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from jaxtyping import Bool, Float, UInt8
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.scene import View
+from normlift_ns.data.frames import check_mask, image_warnings, read_image_header
+from normlift_ns.data.images import to_camera
+from normlift_ns.data.nerfstudio import config as plain
+from normlift_ns.data.nerfstudio.config import dump_config
+from normlift_ns.data.nerfstudio.load import image_name
 from normlift_ns.errors import InputError
-from normlift_ns.nerfstudio_plugin.config import as_nerfstudios
-from normlift_ns.scenes.image_files import check_mask, read_head, remarks
-from normlift_ns.scenes.nerfstudio.views import image_name
-from normlift_ns.scenes.photographs import to_camera
+from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig
+
+
+def read_nerfstudio_config(path: Path) -> TrainerConfig:
+    """Read a config.yml into nerfstudio's classes.
+
+    Raises:
+        FileNotFoundError, ValueError: as `normlift_ns.data.nerfstudio.config.read_trainer_config`.
+    """
+    return to_nerfstudio_config(plain.read_trainer_config(path))
+
+
+def to_nerfstudio_config(config: Any) -> TrainerConfig:
+    """Convert a config that normlift_ns has read and checked to nerfstudio's classes."""
+    # Loader is safe here: dump_config wrote the text, and it names allowed classes only
+    return yaml.load(dump_config(config), Loader=yaml.Loader)
+
+
+def relocate_config(config: TrainerConfig, config_path: Path, data: Path | None = None) -> TrainerConfig:
+    """Return a copy of the config with absolute paths, valid from any directory, and without seed points.
+
+    It also works with stock nerfstudio:
+    `eval_setup(path, update_config_callback=lambda config: rerooted(config, path))`.
+
+    Raises:
+        FileNotFoundError: as `locate`.
+    """
+    location = plain.locate_run(config, config_path, data)
+    config = plain.with_absolute_paths(config, location)
+    model: Any = config.pipeline.model
+    if isinstance(model, NormLiftModelConfig) and model.semantics is not None:
+        model.semantics = location.run_dir / FIELD_FOLDER
+    return config
+
+
+# Images and cameras of a run as splatfacto trained on them, without lens distortion.
+
 
 _SUPPORTED_MODES = {"RGB", "RGBA", "L", "CMYK"}
 """Pillow image modes that nerfstudio can train on; CMYK images get wrong colors."""
@@ -123,7 +164,7 @@ class DatasetViews:
             FileNotFoundError, ValueError: an image or mask is missing, is not a valid image, has pixel values that
                 nerfstudio misreads, or differs in size from its camera or image; the message names it.
         """
-        heads = [read_head(file) for file in self.files]
+        heads = [read_image_header(file) for file in self.files]
         masks, scale = self._dataset._dataparser_outputs.mask_filenames, self._dataset.scale_factor
         cameras = self._dataset.cameras
         sizes = torch.stack([cameras.width, cameras.height]).reshape(2, -1).T.tolist() if len(self) > 0 else []
@@ -137,7 +178,7 @@ class DatasetViews:
             self._check_size(index, size, sizes[index])
             if masks is not None:
                 check_mask(masks[index], file, head.size)
-        return remarks(self.files, heads)
+        return image_warnings(self.files, heads)
 
     def _check_size(self, index: int, size: Sequence[int], expected: Sequence[int]) -> None:
         if tuple(size) != tuple(expected):
@@ -197,7 +238,7 @@ def _check_aria(camera: Cameras, *, masked: bool) -> None:
         )
 
 
-def by_nerfstudio(
+def nerfstudio_views(
     config: Any, folder: Path, poses: Float[Tensor, "v 3 4"], background: Float[Tensor, " 3"]
 ) -> tuple[DatasetViews, DatasetViews]:
     """Return the training views and the held-out views of a run that was read without nerfstudio.
@@ -208,7 +249,7 @@ def by_nerfstudio(
         poses: camera-to-world poses of the training views.
         background: RGB in 0..1 behind images with an alpha channel.
     """
-    manager: Any = as_nerfstudios(config).pipeline.datamanager.setup(
+    manager: Any = to_nerfstudio_config(config).pipeline.datamanager.setup(
         device="cpu", test_mode="test", world_size=1, local_rank=0
     )
     held_out = manager.eval_dataset

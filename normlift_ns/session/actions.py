@@ -1,12 +1,9 @@
-"""User actions: each function takes a state and returns a new one, or the same state if nothing changes.
-
-An action that is not possible raises ValueError (`InputError`) with a message for the user; the state stays as it was.
-"""
+"""Diagnostics of a query: relevancy histograms, suggested thresholds, and prompts that may not be in the scene."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,22 +12,113 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from normlift_ns.errors import InputError
-from normlift_ns.question import Question
-from normlift_ns.session.prompts import Prompt, join_prompts
-from normlift_ns.session.space import Box
-from normlift_ns.session.state import POOR, State
-from normlift_ns.session.verdicts import suggested
+from normlift_ns.query.engine import Finding
+from normlift_ns.query.histogram import Histogram, suggest_threshold
+from normlift_ns.query.question import Query
+from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
+from normlift_ns.session.prompts import Prompt, is_click, join_prompts
+from normlift_ns.session.selection import SelectionBox
+from normlift_ns.session.state import WEAK_RELIABILITY, State
 
-Mode = Literal["select", "add", "take away"]
+
+@dataclass(frozen=True, eq=False)
+class PromptDiagnostics:
+    """Diagnostics of one prompt."""
+
+    text: str
+    """The prompt."""
+    colour: RGB
+    """Color of the prompt."""
+    histogram: Histogram
+    """Histogram of its relevancies."""
+    words: str
+    """Warning that the prompt is probably not in the scene, or that nothing reaches the threshold, with the nearest
+    match; empty if a selected match stands out, or if presence cannot be judged."""
+    nearest: tuple[float, float, float] | None = None
+    """Position of the nearest match, if there is a warning."""
+
+
+def diagnose_prompts(state: State, *, most: int = 3) -> tuple[PromptDiagnostics, ...]:
+    """Return the diagnostics of the first `most` prompts that select; none if the selection was made by hand."""
+    answer = state.answer
+    if answer is None or not state.from_answer:
+        return ()
+    colors = prompt_rgb_tuples(answer.texts)
+    prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
+    results = []
+    for index in prompts[:most]:
+        finding = Finding(answer, index)
+        if finding.histogram is not None:
+            warning = _warning(finding, finding.histogram)
+            x = finding.nearest if warning else None
+            position = None if x is None else (x[0], x[1], x[2])
+            results.append(PromptDiagnostics(finding.text, colors[index], finding.histogram, warning, position))
+    return tuple(results)
+
+
+def _warning(finding: Finding, histogram: Histogram) -> str:
+    if is_click(finding.text) or histogram.stands_out is None:
+        return ""
+    position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
+    if not histogram.stands_out:
+        return (
+            f"{finding.text}: probably not in this scene. The nearest match{position} has relevancy "
+            f"{histogram.top:.2f}; objects in a scene reach {histogram.limit:.2g} or more."
+        )
+    if finding.peak is None or bool(finding.mask.any()):
+        return ""
+    return (
+        f"{finding.text}: nothing is above the threshold of {finding.answer.question.threshold:.2f}. "
+        f"The nearest match{position} has relevancy {finding.peak:.2f}; lower the threshold, or press Suggested."
+    )
+
+
+def threshold_suggestion(state: State) -> float | None:
+    """Return the threshold suggested by the histogram of the prompts that select; None without a suggestion."""
+    answer = state.answer
+    if answer is None:
+        return None
+    if state.shown is not None:
+        return Finding(answer, state.shown).suggested_threshold
+    return suggest_threshold(answer.relevancy.cpu().numpy(), answer.valid.cpu().numpy())
+
+
+def carry_threshold(state: State, question: Query) -> Query:
+    """Return a new query with the threshold of the previous one, if both use the same rule.
+
+    A query that asks for a suggested threshold keeps its own, unless the user has chosen the previous one.
+    """
+    previous = state.question
+    if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
+        return question
+    if question.suggest and previous.threshold in (
+        threshold_suggestion(state),
+        threshold_suggestion(replace(state, shown=None)),
+    ):
+        return question
+    return replace(question, threshold=previous.threshold, suggest=False)
+
+
+def _only_clicks(question: Query) -> bool:
+    return all(is_click(text) for text in question.texts)
+
+
+# User actions: each function takes a state and returns a new one, or the same state if nothing changes.
+#
+# An action that is not possible raises ValueError (`InputError`) with a message for the user; the state stays as it
+# was.
+
+
+ClickMode = Literal["select", "add", "take away"]
 """What a click does with the object under it."""
-MOST_STEPS = 10
+MAX_GROW_STEPS = 10
 """Largest number of steps by which a selection can be grown or shrunk."""
-LOWEST, HIGHEST = -0.2, 1.0
+MIN_THRESHOLD, MAX_THRESHOLD = -0.2, 1.0
 """Range of the threshold slider."""
-LOOK_FIRST = "Likely floaters are selected. Check them, then press Hide. Undo brings them back."
+FLOATERS_HINT = "Likely floaters are selected. Check them, then press Hide. Undo brings them back."
 
 
-def ask(state: State, prompts: Sequence[Prompt], question: Question) -> State:
+def ask(state: State, prompts: Sequence[Prompt], question: Query) -> State:
     """Answer a query. Hidden Gaussians stay hidden; selections by click and cuts are dropped.
 
     Args:
@@ -44,7 +132,7 @@ def ask(state: State, prompts: Sequence[Prompt], question: Question) -> State:
     return _with_suggested_threshold(state)
 
 
-def ask_again(state: State, question: Question | None, did: str) -> State:
+def update_query(state: State, question: Query | None, did: str) -> State:
     """Answer the same prompts with another rule or other features. Selections by click and cuts are kept."""
     return state if question is None else _with_suggested_threshold(replace(state, question=question, did=did))
 
@@ -61,28 +149,28 @@ def clear(state: State) -> State:
     return State(state.space, hidden=state.hidden, look=state.look, did="Clear")
 
 
-def threshold(state: State, value: float) -> State:
+def set_threshold(state: State, value: float) -> State:
     """Set the relevancy above which Gaussians are selected, clamped to the range of the slider."""
-    value = min(HIGHEST, max(LOWEST, value))
+    value = min(MAX_THRESHOLD, max(MIN_THRESHOLD, value))
     if state.question is None or value == state.question.threshold:
         return state
     question = replace(state.question, threshold=value, suggest=False)
     return replace(state, question=question, did=f"Threshold {value:.3g}")
 
 
-def suggest(state: State) -> State:
+def use_suggested_threshold(state: State) -> State:
     """Set the threshold suggested by the relevancies of the prompts that select.
 
     Raises:
         ValueError: there is no query.
     """
-    value = suggested(state)
+    value = threshold_suggestion(state)
     if value is None:
         raise InputError("No query yet; there is no threshold to suggest.")
-    return threshold(state, value)
+    return set_threshold(state, value)
 
 
-def min_reliability(state: State, value: float) -> State:
+def set_min_reliability(state: State, value: float) -> State:
     """Set the reliability R, clamped to 0..1, that Gaussians selected by prompts must have."""
     value = min(1.0, max(0.0, value))
     if state.question is None or value == state.question.min_reliability:
@@ -90,13 +178,13 @@ def min_reliability(state: State, value: float) -> State:
     return replace(state, question=replace(state.question, min_reliability=value), did=f"Reliability {value:.2g}")
 
 
-def leave_out_poor(state: State) -> State:
+def remove_weak(state: State) -> State:
     """Remove Gaussians with weak evidence from the selection, including those selected by clicks."""
-    poor = state.selection & (state.space.field.scalars.reliability < POOR)
-    return take_away(state, poor, "Leave out what is poorly evidenced")
+    poor = state.selection & (state.space.field.scalars.reliability < WEAK_RELIABILITY)
+    return remove(state, poor, "Leave out what is poorly evidenced")
 
 
-def show(state: State, shown: int | None) -> State:
+def show_prompt(state: State, shown: int | None) -> State:
     """Let only one prompt of the query select; None: all of them."""
     count = 0 if state.question is None else len(state.question.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
@@ -105,12 +193,12 @@ def show(state: State, shown: int | None) -> State:
     return replace(state, shown=shown, did=f"Show {text}")
 
 
-def look(state: State, name: str) -> State:
+def set_color_mode(state: State, name: str) -> State:
     """Set the color mode in which the viewer draws the state."""
     return state if name == state.look else replace(state, look=name, did=f"Draw {name}")
 
 
-def met(state: State, weights: Float[Tensor, " n"]) -> int:
+def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
     """Return the index of the Gaussian with the largest weight on a ray, of those drawn that have a direction.
 
     Raises:
@@ -123,26 +211,26 @@ def met(state: State, weights: Float[Tensor, " n"]) -> int:
     return index
 
 
-def click(state: State, weights: Float[Tensor, " n"], mode: Mode = "select") -> State:
+def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select") -> State:
     """Select, add or remove the connected object under a click; see `Space.object_at`.
 
     Args:
-        weights: weights of the Gaussians on the ray, for instance from `raster.picking.ray_weights`.
+        weights: weights of the Gaussians on the ray, for instance from `rasterization.rasterize.ray_weights`.
     """
-    gaussian = met(state, weights)
+    gaussian = pick_gaussian(state, weights)
     mask = state.space.object_at(gaussian, state.selection, refined=state.refined)
     if mode == "take away":
-        return take_away(state, mask, "Take away an object")
+        return remove(state, mask, "Take away an object")
     return add(state, mask, "Add an object") if mode == "add" else select(state, mask, "Select an object")
 
 
-def click_vector(state: State, weights: Float[Tensor, " n"]) -> Float[np.ndarray, " d"]:
+def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.ndarray, " d"]:
     """Return the direction of the Gaussian under a click: the vector of a prompt named `click_name(...)`.
 
     Args:
         weights: weights of the Gaussians on the ray.
     """
-    row = torch.tensor([met(state, weights)], device=state.space.means.device)
+    row = torch.tensor([pick_gaussian(state, weights)], device=state.space.means.device)
     return state.space.field.directions(row, refined=state.refined)[0].cpu().numpy()
 
 
@@ -159,7 +247,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
     return replace(state, added=chosen if state.added is None else state.added | chosen, removed=removed, did=did)
 
 
-def take_away(state: State, chosen: Bool[Tensor, " n"], did: str = "Take away") -> State:
+def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Take away") -> State:
     """Remove Gaussians from the selection. Prompts and thresholds stay in effect, unless it was grown or shrunk."""
     if state.steps != 0:
         return select(state, state.selection & ~chosen, did)
@@ -170,7 +258,7 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
     """Select likely floaters.
 
     Args:
-        floaters: mask of the floaters, from `insight.floaters.find_floaters`.
+        floaters: mask of the floaters, from `analysis.objects.find_floaters`.
     Raises:
         ValueError: there are none.
     """
@@ -181,11 +269,11 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
 
 def resize(state: State, steps: int) -> State:
     """Set how far the selection is grown (steps > 0) or shrunk (steps < 0), from part to whole, clamped to -10..10."""
-    steps = max(-MOST_STEPS, min(MOST_STEPS, int(steps)))
+    steps = max(-MAX_GROW_STEPS, min(MAX_GROW_STEPS, int(steps)))
     return state if steps == state.steps else replace(state, steps=steps, did=f"Grow {steps:+d}")
 
 
-def cut(state: State, box: Box | None) -> State:
+def set_box(state: State, box: SelectionBox | None) -> State:
     """Cut the selection with a box; None: remove the box."""
     if box == state.box:
         return state
@@ -207,7 +295,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     return replace(state, hidden=hidden, did=f"Hide {int(chosen.sum()):,}")
 
 
-def only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
+def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Draw these Gaussians alone, including hidden ones.
 
     Args:

@@ -11,17 +11,17 @@ import numpy as np
 from jaxtyping import Float
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import RULES, Rule
-from normlift_ns.question import Question, make_question
-from normlift_ns.text_encoders import Field
+from normlift_ns.options import RELEVANCY_RULES, RelevancyRule
+from normlift_ns.query.question import Query, make_query
+from normlift_ns.query.text_encoder import HasManifest
 
-MOST_PROMPTS = 64
-ALIKE = 0.9
+MAX_PROMPTS = 64
+CLICK_THRESHOLD = 0.9
 """Cosine to the direction of a clicked Gaussian above which another one counts as similar."""
 _PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
 _CLICK = re.compile(r"like (what was clicked|click \d+)")
 _CLICK_RULE = "Clicks are compared by cosine; ask them alone, or choose the rule cosine."
-Read = Callable[[Sequence[str]], Any]
+EncodeTexts = Callable[[Sequence[str]], Any]
 """Function from texts to vectors [Q, D], such as `rows` of an encoder. Raises ValueError if it cannot encode a text."""
 
 
@@ -75,7 +75,7 @@ def join_prompts(texts: Sequence[str]) -> str:
     return ", ".join(f'"{line}"' if re.search("[,;]", line) else line for line in lines)
 
 
-def read_prompts(text: str, read: Read, known: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
+def encode_prompts(text: str, read: EncodeTexts, known: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
     """Encode a line of prompts. A text that cannot be encoded gets the encoder's message instead of a vector.
 
     Args:
@@ -89,8 +89,8 @@ def read_prompts(text: str, read: Read, known: Mapping[str, Any] | None = None) 
     texts, known = split_prompts(text), known or {}
     if len(texts) == 0:
         raise InputError("Type what to look for, then press Ask.")
-    if len(texts) > MOST_PROMPTS:
-        raise InputError(f"{len(texts)} prompts were typed; ask at most {MOST_PROMPTS} at a time.")
+    if len(texts) > MAX_PROMPTS:
+        raise InputError(f"{len(texts)} prompts were typed; ask at most {MAX_PROMPTS} at a time.")
     new = [one for one in texts if one not in known]
     try:
         vectors: dict[str, Any] = dict(zip(new, read(new) if len(new) > 0 else []))
@@ -99,7 +99,7 @@ def read_prompts(text: str, read: Read, known: Mapping[str, Any] | None = None) 
     return tuple(_row(one, known[one] if one in known else vectors[one]) for one in texts)
 
 
-def _read_alone(text: str, read: Read) -> Any:
+def _read_alone(text: str, read: EncodeTexts) -> Any:
     """Return the vector of a text, or an error message."""
     if is_click(text):
         return f"{text!r} is not a click of this session or run; click the scene again."
@@ -115,62 +115,62 @@ def _row(text: str, result: Any) -> Prompt:
     return Prompt(text, np.asarray(result, np.float32))
 
 
-def pose(
-    field: Field,
+def build_query(
+    field: HasManifest,
     prompts: Sequence[Prompt],
-    read: Read,
+    read: EncodeTexts,
     *,
     negatives: Sequence[str] | None = None,
-    rule: Rule | Literal["auto"] = "auto",
+    rule: RelevancyRule | Literal["auto"] = "auto",
     threshold: float | None = None,
     min_reliability: float = 0.0,
     refined: bool = True,
-) -> tuple[tuple[Prompt, ...], Question]:
+) -> tuple[tuple[Prompt, ...], Query]:
     """Build the query of all rows that have a vector.
 
     Clicks alone are compared by cosine, above 0.9 by default. Together with texts, clicks need the rule cosine.
 
     Args:
-        read: encoder of the negatives. The other arguments are those of `make_question`.
+        read: encoder of the negatives. The other arguments are those of `make_query`.
     Returns:
         The rows, in which clicks that the rule excludes have an error, and their query.
     Raises:
-        ValueError: no row has a vector; as `make_question`.
+        ValueError: no row has a vector; as `make_query`.
     """
     valid = [prompt for prompt in prompts if prompt.vector is not None]
     if len(valid) == 0:
         raise InputError(prompts[0].problem if len(prompts) > 0 else "Type what to look for, then press Ask.")
     options: dict[str, Any] = {"min_reliability": min_reliability, "refined": refined}
     if all(prompt.clicked for prompt in valid):
-        threshold = ALIKE if threshold is None else threshold
+        threshold = CLICK_THRESHOLD if threshold is None else threshold
         question = _question(field, valid, read, negatives=(), rule="cosine", threshold=threshold, **options)
         return tuple(prompts), question
     options |= {"negatives": negatives, "rule": rule, "threshold": threshold}
     question = _question(field, valid, read, **options)
-    if not RULES[question.rule].compares or not any(prompt.clicked for prompt in valid):
+    if not RELEVANCY_RULES[question.rule].compares or not any(prompt.clicked for prompt in valid):
         return tuple(prompts), question
     error: dict[str, Any] = {"vector": None, "problem": _CLICK_RULE}
     rows = tuple(replace(p, **error) if p.clicked and p.vector is not None else p for p in prompts)
     return rows, _question(field, [prompt for prompt in rows if prompt.vector is not None], read, **options)
 
 
-def _question(field: Field, prompts: Sequence[Prompt], read: Read, **options: Any) -> Question:
+def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, **options: Any) -> Query:
     vectors: dict[str, Any] = {prompt.text: prompt.vector for prompt in prompts}
 
     def rows(texts: Sequence[str]) -> np.ndarray:
         return np.stack([vectors[text] if text in vectors else read([text])[0] for text in texts])
 
-    return make_question(field, rows, list(vectors), **options)
+    return make_query(field, rows, list(vectors), **options)
 
 
-def prompts_of(question: Question | None) -> tuple[Prompt, ...]:
+def prompts_of_query(question: Query | None) -> tuple[Prompt, ...]:
     """Return the rows of a query, for instance of the one that a run stores. None: no rows."""
     if question is None:
         return ()
     return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.vectors))
 
 
-def merged(stored: Question | None, asked: Question) -> Question:
+def merge_queries(stored: Query | None, asked: Query) -> Query:
     """Merge stored and new prompts into one query; a new prompt replaces a stored one with the same text.
 
     Args:
@@ -187,5 +187,7 @@ def merged(stored: Question | None, asked: Question) -> Question:
             f"{asked.rule}, other negatives or other features, and cannot be saved with them. Replace the stored "
             "prompts, or ask again with the same settings."
         )
-    rows: dict[str, Any] = {prompt.text: prompt.vector for prompt in (*prompts_of(stored), *prompts_of(asked))}
+    rows: dict[str, Any] = {
+        prompt.text: prompt.vector for prompt in (*prompts_of_query(stored), *prompts_of_query(asked))
+    }
     return replace(asked, texts=tuple(rows), vectors=np.stack(list(rows.values())))

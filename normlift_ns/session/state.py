@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from threading import Lock
+from typing import Generic, TypeVar
 
 from jaxtyping import Bool
 from torch import Tensor
 
-from normlift_ns.asking import Answer
-from normlift_ns.question import Question
+from normlift_ns.query.engine import Answer
+from normlift_ns.query.question import Query
 from normlift_ns.session.prompts import Prompt, join_prompts
-from normlift_ns.session.space import Box, Space
+from normlift_ns.session.selection import SelectionBox, SelectionContext
 
-POOR = 0.6
+WEAK_RELIABILITY = 0.6
 """R below which the evidence of a Gaussian is weak."""
 
 
@@ -25,10 +30,10 @@ class State:
     it and `removed` is removed; the result is grown or shrunk, then cut by the box.
     """
 
-    space: Space
+    space: SelectionContext
     prompts: tuple[Prompt, ...] = ()
     """All rows, including those with errors."""
-    question: Question | None = None
+    question: Query | None = None
     """Query of the rows without errors, with the threshold and the minimum reliability."""
     shown: int | None = None
     """Index of the only prompt of the query that selects; None: all of them select."""
@@ -38,7 +43,7 @@ class State:
     removed: Bool[Tensor, " n"] | None = None
     steps: int = 0
     """Steps of growth over the neighbor graph; negative: steps of shrinking."""
-    box: Box | None = None
+    box: SelectionBox | None = None
     hidden: Bool[Tensor, " n"] | None = None
     """Gaussians that are not drawn."""
     look: str = "colours"
@@ -93,7 +98,7 @@ class State:
     def poor(self) -> float:
         """Fraction of the selection with weak evidence; 0 if nothing is selected."""
         reliability = self.space.field.scalars.reliability[self.selection]
-        return float((reliability < POOR).float().mean()) if len(reliability) > 0 else 0.0
+        return float((reliability < WEAK_RELIABILITY).float().mean()) if len(reliability) > 0 else 0.0
 
     @property
     def remark(self) -> str:
@@ -103,8 +108,202 @@ class State:
         """
         if self.poor < 0.25:
             return ""
-        return f"{self.poor:.0%} of this selection has weak evidence (R < {POOR:g})."
+        return f"{self.poor:.0%} of this selection has weak evidence (R < {WEAK_RELIABILITY:g})."
 
     def lean(self) -> State:
         """Return a copy without cached results, for a history. They are computed again when it is shown again."""
         return replace(self)
+
+
+# Undo and redo: a list of immutable states.
+
+
+T = TypeVar("T")
+MAX_STATES = 100
+
+
+def _identity(state: T) -> T:
+    return state
+
+
+@dataclass(frozen=True, eq=False)
+class History(Generic[T]):
+    """States in chronological order, and the index of the current one.
+
+    >>> history = History.of("a").do("b").do("c").undo()
+    >>> history.now, history.undo().now, history.redo().now, history.do("d").can_redo
+    ('b', 'a', 'c', False)
+    """
+
+    states: tuple[T, ...]
+    at: int = 0
+    """Index of the current state."""
+    key: str | None = None
+    """Key of the last step, if successive steps with this key are merged."""
+
+    lean: Callable[[T], T] = _identity
+    """Applied to a state when another one becomes current, for instance `State.lean`."""
+
+    @staticmethod
+    def of(state: T, *, lean: Callable[[T], T] = _identity) -> History[T]:
+        """Return a history with a single state."""
+        return History((state,), lean=lean)
+
+    @property
+    def now(self) -> T:
+        """The current state."""
+        return self.states[self.at]
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is an earlier state."""
+        return self.at > 0
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is a later state, after an undo."""
+        return self.at < len(self.states) - 1
+
+    def do(self, state: T, *, key: str | None = None) -> History[T]:
+        """Make a new state current, and drop undone ones. The state that is current already adds no step.
+
+        Args:
+            key: successive steps with the same key are merged into one, such as the drag of a slider.
+        """
+        if state is self.now:
+            return self
+        merge = key is not None and key == self.key and self.at > 0
+        states = (*self._leaned[: self.at + (not merge)], state)[-MAX_STATES:]
+        return History(states, len(states) - 1, key, self.lean)
+
+    def undo(self) -> History[T]:
+        """Return to the previous state; the same history if there is none."""
+        return self.go_to(self.at - 1)
+
+    def redo(self) -> History[T]:
+        """Return to the state undone last; the same history if there is none."""
+        return self.go_to(self.at + 1)
+
+    def go_to(self, index: int) -> History[T]:
+        """Make any state of the list current; the same history if the index is out of range."""
+        if index == self.at or not 0 <= index < len(self.states):
+            return self
+        return replace(self, states=self._leaned, at=index, key=None)
+
+    @property
+    def _leaned(self) -> tuple[T, ...]:
+        """The states with `lean` applied to the current one."""
+        return (*self.states[: self.at], self.lean(self.now), *self.states[self.at + 1 :])
+
+
+# Request tokens that discard stale results: a number per user that increases with every request.
+
+
+@dataclass(frozen=True)
+class RequestToken:
+    """Token of one request."""
+
+    number: int
+    what: str
+    """Description of the request, shown while it runs."""
+
+
+@dataclass
+class RequestTokens:
+    """Tokens of one user. Methods may be called from any thread.
+
+    >>> turns = RequestTokens()
+    >>> first, second = turns.start("Reading red"), turns.start("Reading blue")
+    >>> turns.busy, turns.finish(first), turns.busy, turns.finish(second), turns.busy
+    ('Reading blue', False, 'Reading blue', True, '')
+    """
+
+    _lock: Lock = field(default_factory=Lock, repr=False)
+    _last: RequestToken = RequestToken(0, "")
+    _running: bool = False
+
+    def start(self, description: str) -> RequestToken:
+        """Return a new token; all earlier ones become stale."""
+        with self._lock:
+            self._last, self._running = RequestToken(self._last.number + 1, description), True
+            return self._last
+
+    def wanted(self, token: RequestToken) -> bool:
+        """Return whether the result of a request is still wanted."""
+        with self._lock:
+            return self._running and token.number == self._last.number
+
+    def finish(self, token: RequestToken) -> bool:
+        """End a request; return whether its result is still wanted."""
+        with self._lock:
+            current = self._running and token.number == self._last.number
+            self._running = self._running and not current
+            return current
+
+    def cancel(self) -> bool:
+        """Make the running request stale; return whether there was one."""
+        with self._lock:
+            running, self._running = self._running, False
+            return running
+
+    @property
+    def busy(self) -> str:
+        """Description of the running request; empty if there is none."""
+        with self._lock:
+            return self._last.what if self._running else ""
+
+
+# Job queue that keeps slow work out of viser's few threads, which serve all pages.
+
+
+class JobQueue:
+    """Queue that runs jobs one after another, in a thread that ends when the queue is empty.
+
+    >>> event, worker = threading.Event(), JobQueue()
+    >>> worker.put(event.set)
+    >>> event.wait(5)
+    True
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._jobs: deque[tuple[str, Callable[[], None]]] = deque()
+        self._running = self._ended = False
+
+    def put(self, job: Callable[[], None], key: str = "") -> None:
+        """Add a job to the end of the queue.
+
+        Args:
+            job: must not raise.
+            key: of successive waiting jobs with the same key, only the last one runs; empty: all run.
+        """
+        with self._lock:
+            if self._ended:
+                return
+            if key and self._jobs and self._jobs[-1][0] == key:
+                self._jobs.pop()
+            self._jobs.append((key, job))
+            if self._running:
+                return
+            self._running = True
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def drop(self) -> None:
+        """Discard the waiting jobs; the running one continues."""
+        with self._lock:
+            self._jobs.clear()
+
+    def end(self) -> None:
+        """Discard the waiting jobs and accept no further ones."""
+        with self._lock:
+            self._ended = True
+            self._jobs.clear()
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._jobs:
+                    self._running = False
+                    return
+                _, job = self._jobs.popleft()
+            job()

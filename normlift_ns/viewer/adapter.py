@@ -1,31 +1,213 @@
-"""Adapter for viser in its two versions: 0.2.7, which nerfstudio 1.1.5 pins, and 1.x.
-
-viser 0.2.7 draws Gaussians with a private helper that fails on thin ones: it adds 1e-7 to every entry of a covariance
-before the Cholesky decomposition. It also ignores Gaussians that are sent again under the same name. This module
-therefore builds the message itself, and uses a new name each time. 1.x has `add_gaussian_splats` instead, but cannot be
-installed together with nerfstudio 1.1.5; `make test-viser1` runs the tests of this module with it. Comments mark
-differences between the versions.
-"""
+"""What lets viser's page live in a browser without WebGL."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import http
 import inspect
 import io
 import json
 import math
 import re
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from normlift_ns.viewer.blind.page import picture_script
-from normlift_ns.viewer.serving.guard import guarded
+SCRIPT = """
+(() => {
+  const plain = HTMLCanvasElement.prototype.getContext;
+  const probe = plain.call(document.createElement("canvas"), "webgl2");
+  if (probe) {
+    const extension = probe.getExtension("WEBGL_lose_context");
+    if (extension) extension.loseContext();
+    return;
+  }
+  window.normliftBlind = true;
+  const numbers = {}, names = {};
+  const number = (name) => {
+    if (!(name in numbers)) {
+      numbers[name] = 1 + Object.keys(numbers).length;
+      names[numbers[name]] = name;
+    }
+    return numbers[name];
+  };
+  const parameter = (name) =>
+    name === "VERSION" ? "WebGL 2.0" :
+    name === "SHADING_LANGUAGE_VERSION" ? "WebGL GLSL ES 3.00" :
+    ["VIEWPORT", "SCISSOR_BOX"].includes(name) ? new Int32Array(4) :
+    name && name.startsWith("MAX_") ? 1024 : 0;
+  const answers = {
+    getParameter: (which) => parameter(names[which]),
+    getExtension: () => null,
+    getSupportedExtensions: () => [],
+    getContextAttributes: () => ({}),
+    getShaderPrecisionFormat: () => ({precision: 23, rangeMin: 127, rangeMax: 127}),
+    getProgramParameter: (program, which) => (names[which] || "").startsWith("ACTIVE_") ? 0 : true,
+    getShaderParameter: () => true,
+    getProgramInfoLog: () => "",
+    getShaderInfoLog: () => "",
+    getShaderSource: () => "",
+    getUniformLocation: () => null,
+    getAttribLocation: () => -1,
+    getError: () => 0,
+    isContextLost: () => false,
+    checkFramebufferStatus: () => number("FRAMEBUFFER_COMPLETE"),
+    clientWaitSync: () => number("ALREADY_SIGNALED"),
+  };
+  const context = (canvas) => new Proxy({}, {get: (_, name) =>
+    name === "canvas" ? canvas :
+    name === "constructor" ? {name: "WebGL2RenderingContext"} :
+    name === "drawingBufferWidth" ? canvas.width :
+    name === "drawingBufferHeight" ? canvas.height :
+    name === "drawingBufferColorSpace" ? "srgb" :
+    typeof name !== "string" ? undefined :
+    name in answers ? answers[name] :
+    name === name.toUpperCase() ? number(name) :
+    name.startsWith("create") || name === "fenceSync" ? () => ({}) : () => undefined});
+  const kept = new WeakMap();
+  HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+    if (kind !== "webgl2") return plain.call(this, kind, ...rest);
+    if (!kept.has(this)) kept.set(this, context(this));
+    return kept.get(this);
+  };
+})();
+"""
+"""For the head of the page. Without WebGL, three.js throws and React takes the whole page away, panel and all; so it
+gets a context that draws nothing. Panel, camera and clicks then work as ever, and pictures come from the server.
+"""
 
-SESSION = "Session"
+_PICTURE = """
+(() => {
+  const canvas = document.querySelector("canvas[data-engine]");
+  if (!canvas) return;
+  let shown = document.getElementById("normlift_still");
+  if (!shown) {
+    shown = document.createElement("img");
+    shown.id = "normlift_still";
+    shown.style.cssText = "position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none";
+    canvas.parentElement.append(shown);
+  }
+  shown.src = "data:image/jpeg;base64,CONTENT";
+})();
+"""
+
+
+def with_script(page: bytes) -> bytes:
+    """The page with the script before all others, and without viser's report of every visit to Google.
+
+    >>> with_script(b"<html><head><title>")[:20]
+    b'<html><head><script>'
+    """
+    page = re.sub(rb"<!-- Google tag.*?</script>.*?</script>", b"", page, count=1, flags=re.DOTALL)
+    return page.replace(b"<head>", b"<head><script>" + SCRIPT.encode() + b"</script>", 1)
+
+
+def picture_script(jpeg: bytes) -> str:
+    """What the page runs to show a picture in place of the scene."""
+    return _PICTURE.replace("CONTENT", base64.b64encode(jpeg).decode())
+
+
+# What viser's server serves: the files of its page with our script in it, and nothing else.
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Servers of viser that start within serve the files of its page only, with our script for browsers without WebGL
+    in it, and do not compress.
+
+    By itself 0.2.7 serves every file that a path with .. leads to, and spends seconds on compressing colours.
+    """
+    from viser.infra import _infra as known  # noqa: PLC0415
+
+    _infra: Any = known
+    if not hasattr(_infra, "WebSocketServerProtocol"):  # 1.x
+        with _guarded_one():
+            yield
+        return
+    module = _infra.websockets.server
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of websockets, whose older half viser calls
+        serve = module.serve
+
+    def guarded_serve(handler: Any, host: str, port: int, *, process_request: Any = None, **options: Any) -> Any:
+        async def request(path: str, headers: Any) -> Any:
+            place = unquote(path.partition("?")[0])
+            if headers.get("Upgrade") == "websocket":
+                return await process_request(path, headers)
+            if ".." in place.split("/") or not place.startswith("/"):
+                return http.HTTPStatus.NOT_FOUND, {}, b"404"
+            try:
+                if place not in ("/", "/index.html"):
+                    return await process_request(path, headers)
+                status, told, content = await process_request(path, {})  # not compressed
+            except (OSError, ValueError):  # such as a folder, or a name that is too long
+                return http.HTTPStatus.NOT_FOUND, {}, b"404"
+            return status, told, with_script(content)
+
+        return serve(handler, host, port, process_request=request, **{**options, "compression": None})
+
+    module.serve = guarded_serve
+    try:
+        yield
+    finally:
+        module.serve = serve
+
+
+@contextlib.contextmanager
+def _guarded_one() -> Iterator[None]:
+    """The same of viser 1.x, which lets nobody out of its folder and does not compress."""
+    from viser.infra import _infra  # noqa: PLC0415
+
+    one: Any = _infra
+    module, Headers, Response = one.websockets.asyncio.server, one.Headers, one.Response
+    serve: Any = module.serve
+    missing = (http.HTTPStatus.NOT_FOUND, "Not Found", Headers({"Content-Length": "3"}), b"404")
+
+    def guarded_serve(*handlers: Any, process_request: Any = None, **options: Any) -> Any:
+        def request(connection: Any, asked: Any) -> Any:
+            place = asked.path.partition("?")[0]
+            if asked.headers.get("Upgrade") == "websocket":
+                return process_request(connection, asked)
+            if place.startswith("//"):
+                return Response(*missing)
+            is_page = place in ("/", "/index.html")
+            if is_page:
+                asked.headers.pop("Accept-Encoding", None)
+            try:
+                found = process_request(connection, asked)
+            except (OSError, ValueError):  # such as a name that is too long
+                return Response(*missing)
+            if not is_page:
+                return found
+            content = with_script(found.body)
+            headers = Headers({"Content-Type": "text/html", "Content-Length": str(len(content))})
+            return Response(found.status_code, found.reason_phrase, headers, content)
+
+        return serve(*handlers, process_request=request, **options)
+
+    module.serve = guarded_serve
+    try:
+        yield
+    finally:
+        module.serve = serve
+
+
+# Adapter for viser in its two versions: 0.2.7, which nerfstudio 1.1.5 pins, and 1.x.
+#
+# viser 0.2.7 draws Gaussians with a private helper that fails on thin ones: it adds 1e-7 to every entry of a
+# covariance before the Cholesky decomposition. It also ignores Gaussians that are sent again under the same name.
+# This module therefore builds the message itself, and uses a new name each time. 1.x has `add_gaussian_splats`
+# instead, but cannot be installed together with nerfstudio 1.1.5; `make test-viser1` runs the tests of this module
+# with it. Comments mark differences between the versions.
+
+
+SESSION_LABEL = "Session"
 """Label of the hidden text box through which the page's script sends its token and its link to the server."""
 _EDGES = (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)
 """Corners of a box along a path that contains all edges."""
@@ -87,10 +269,10 @@ _SCRIPT = """
   addEventListener("keyup", (event) => { if (held && event.key === held) hold("", 600); });
   addEventListener("blur", () => { if (held) hold("", 600); });
 })();
-""".replace("SESSION", SESSION)
+""".replace("SESSION", SESSION_LABEL)
 
 
-class Server:
+class ViserServer:
     """viser server with a page for each browser.
 
     Args:
@@ -106,7 +288,7 @@ class Server:
         host: str,
         port: int,
         label: str,
-        on_page: Callable[[Page], None],
+        on_page: Callable[[BrowserPage], None],
         on_gone: Callable[[int], None],
     ) -> None:
         import viser  # noqa: PLC0415 (--help should not wait for it)
@@ -124,7 +306,7 @@ class Server:
 
         @self._server.on_client_connect
         def _(client: Any) -> None:  # viser holds a lock during this call
-            threading.Thread(target=on_page, args=(Page(client),), daemon=True).start()
+            threading.Thread(target=on_page, args=(BrowserPage(client),), daemon=True).start()
 
         @self._server.on_client_disconnect
         def _(client: Any) -> None:
@@ -152,7 +334,7 @@ class Server:
         self._server.stop()
 
 
-class Page:
+class BrowserPage:
     """Page in one browser, for the lifetime of its connection."""
 
     def __init__(self, client: Any) -> None:
@@ -247,7 +429,7 @@ class Page:
         self._client.scene.set_up_direction(direction)
 
     def listen(self) -> None:
-        """Run the script that handles keys; it writes the token, the link and the held key into the box `SESSION`."""
+        """Run the script that handles keys; it writes the token, the link and the held key into the box `SESSION_LABEL`."""
         self._run(_SCRIPT)
 
     def become(self, token: str) -> None:
@@ -328,16 +510,16 @@ def _send_html(connection: Any) -> None:
     def queue_message(message: Any) -> None:
         for props in (getattr(message, "updates", None), vars(getattr(message, "props", connection))):
             if isinstance(props, dict) and isinstance(props.get("_markdown"), str):
-                props["_markdown"] = html_of(props["_markdown"])
+                props["_markdown"] = mdx_to_html(props["_markdown"])
         queue(message)
 
     connection.queue_message = queue_message
 
 
-def html_of(mdx: str) -> str:
+def mdx_to_html(mdx: str) -> str:
     """Convert MDX to HTML: style objects become style strings.
 
-    >>> html_of('<i style={{fontSize: "1em", color: "red"}}>a</i>')
+    >>> mdx_to_html('<i style={{fontSize: "1em", color: "red"}}>a</i>')
     '<i style="font-size: 1em; color: red">a</i>'
     """
 
@@ -381,7 +563,7 @@ def _finite(value: Any) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
+def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
     """Add a row of buttons to a panel; an empty label takes no room.
 
     viser 0.2.7 ignores the button of a group that was pressed last, and initially the first button.
@@ -400,7 +582,7 @@ def button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable
     return group
 
 
-def pass_over_the_gone(server: Any) -> None:
+def ignore_closed_clients(server: Any) -> None:
     """Silence tracebacks about messages from a page that was closed before they were handled.
 
     viser 0.2.7 handles messages in another thread. There, it and nerfstudio 1.1.5 look up the page by its number, and
@@ -439,3 +621,50 @@ def _unpack_splats(buffer: UInt32[np.ndarray, "k 8"]) -> dict[str, np.ndarray]:
         "rgbs": rgba[:, :3],
         "opacities": rgba[:, 3:] / np.float32(255),
     }
+
+
+# The door of a viewer: it serves at once, before torch is imported and the run is read; pages wait meanwhile.
+
+
+OPENING = "Opening the run."
+
+
+class Door:
+    """A server whose pages wait until somebody takes them."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._lock, self._waiting = threading.Lock(), dict[int, BrowserPage]()
+        self._hosts: tuple[Callable[[BrowserPage], None], Callable[[int], None]] | None = None
+        self.server = ViserServer(host, port, "normlift", self._come, self._go)
+
+    def open(self, label: str, come: Callable[[BrowserPage], None], go: Callable[[int], None]) -> None:
+        """Gives away the pages that wait, and all that come.
+
+        Args:
+            label: stands over the panel.
+            come: called for every page that comes.
+            go: called with the number of a page that is gone; it may not have come yet.
+        """
+        self.server.label(label)
+        with self._lock:
+            self._hosts, waiting = (come, go), list(self._waiting.values())
+            self._waiting.clear()
+        for page in waiting:
+            page.notice("")
+            come(page)
+
+    def _come(self, page: BrowserPage) -> None:
+        with self._lock:
+            hosts = self._hosts
+            if hosts is None:
+                self._waiting[page.number] = page
+                page.notice(OPENING)
+        if hosts is not None:
+            hosts[0](page)
+
+    def _go(self, number: int) -> None:
+        with self._lock:
+            hosts = self._hosts
+            self._waiting.pop(number, None)
+        if hosts is not None:
+            hosts[1](number)

@@ -23,8 +23,8 @@ pytestmark = [pytest.mark.slow, needs_shared, needs_chromium]
 
 @pytest.mark.usefixtures("nerfstudio")
 def test_a_person_finds_the_fox(tmp_path: Path, browser: Browser) -> None:
+    from normlift_ns.cli.lift import NormLift  # noqa: PLC0415
     from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
-    from normlift_ns.scripts.lift import NormLift  # noqa: PLC0415
 
     source = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     options, colour = LiftOptions(max_views=6, lift_downscale=4), SourceOptions(encoder="colour")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from normlift_ns.runs.question import load_question
+from normlift_ns.query.question import load_query
 from tests.browser.person import ARMED, RED, YELLOW, changed, coloured, covers, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
 from tests.browser.viewer import Own, Tab
@@ -110,7 +110,7 @@ def test_browsers_have_their_own_questions_and_outlive_the_server(own: Server, b
     alike = two.selected()
     two.press("Save prompts in run")
     two.says("3 prompts")
-    question = load_question(own.config.parent / "normlift")
+    question = load_query(own.config.parent / "normlift")
     assert question is not None and question.texts == ("red", "yellow", "like click 1")
     two.leave()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from normlift_ns.runs.question import load_question
+from normlift_ns.query.question import load_query
 from tests.browser.person import ARMED, BLUE, RED, YELLOW, changed, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
 from tests.browser.viewer import HIDDEN, Tab, overlaid
@@ -171,7 +171,7 @@ def test_a_page_outlives_its_server_and_a_saved_click_is_asked_again(tab: Tab, s
     clicked = tab.selects(lambda count: count > 0, "clicked")
     name = tab.typed("Prompts")
     tab.press("Save prompts in run")
-    tab.until(lambda: len(load_question(stock.config.parent / "normlift").texts) == 3, "saved")  # type: ignore[union-attr]
+    tab.until(lambda: len(load_query(stock.config.parent / "normlift").texts) == 3, "saved")  # type: ignore[union-attr]
     tab.asks("red", answered=1)
     tab.selects(lambda count: count != clicked, "something else")
     stock.stop()

@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.core.disk import claims as module
-from normlift_ns.core.disk.claims import (
-    LEFT,
-    NEW,
+from normlift_ns.io import file_lock as module
+from normlift_ns.io.file_lock import (
+    ABANDONED,
+    UNCLAIMED,
     Claim,
-    State,
-    beat,
-    claim,
-    claims,
-    end,
-    free,
+    ClaimState,
+    finish_claim,
+    is_claimable,
+    iter_claims,
+    read_claim_states,
     read_pulse,
-    read_states,
+    try_claim,
+    write_pulse,
 )
 from tests.processes import together
 
@@ -44,7 +44,7 @@ class Clock:
 
 
 def claimed(folder: Path) -> Claim:
-    found = claim(folder, "a", 0)
+    found = try_claim(folder, "a", 0)
     assert found is not None
     return found
 
@@ -55,30 +55,30 @@ def test_processes_share_work_of_which_each_piece_is_done_once(tmp_path):
 
     def work(i: int) -> list[list[str]]:
         mixed = random.Random(i).sample(keys, len(keys))
-        won = [[key for key in mixed if claim(tmp_path / "race", key, after) is not None] for after in range(3)]
+        won = [[key for key in mixed if try_claim(tmp_path / "race", key, after) is not None] for after in range(3)]
         done = []
-        for mine in claims(tmp_path / "work", keys, {}, PATIENCE, sleep=lambda seconds: time.sleep(0.001)):
+        for mine in iter_claims(tmp_path / "work", keys, {}, PATIENCE, sleep=lambda seconds: time.sleep(0.001)):
             done.append(mine.key)
-            end(mine, "done")
+            finish_claim(mine, "done")
         return [*won, done]
 
     for won in zip(*together(4, work)):
         assert sorted(key for each in won for key in each) == sorted(keys)
-    assert read_states(tmp_path / "race") == dict.fromkeys(keys, State(3, None))
-    assert read_states(tmp_path / "work") == dict.fromkeys(keys, State(1, "done"))
+    assert read_claim_states(tmp_path / "race") == dict.fromkeys(keys, ClaimState(3, None))
+    assert read_claim_states(tmp_path / "work") == dict.fromkeys(keys, ClaimState(1, "done"))
 
 
 @pytest.mark.parametrize("skew", [-1e6, 0.0, 1e6])
 def test_the_work_of_a_dead_owner_is_taken_over_after_the_patience(tmp_path, skew):
     dead = claimed(tmp_path)
     clock, taken = Clock(skew), []
-    for mine in claims(tmp_path, ["a", "b"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
+    for mine in iter_claims(tmp_path, ["a", "b"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
         taken.append((mine.key, mine.number, clock.now - skew))
-        end(mine, "done")
+        finish_claim(mine, "done")
     assert taken[0] == ("b", 1, 0.0)
     ((key, number, seconds),) = taken[1:]
     assert (key, number) == ("a", 2) and PATIENCE <= seconds <= PATIENCE + 5
-    assert not beat(dead, 1)  # which the dead one is told when it comes to life
+    assert not write_pulse(dead, 1)  # which the dead one is told when it comes to life
 
 
 def test_a_heartbeat_keeps_a_claim_until_it_stops(tmp_path):
@@ -86,51 +86,51 @@ def test_a_heartbeat_keeps_a_claim_until_it_stops(tmp_path):
 
     def live(seconds: float) -> None:
         if seconds < 1000:
-            assert beat(other, int(seconds))
+            assert write_pulse(other, int(seconds))
 
     clock, taken = Clock(0.0, live), []
-    for mine in claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
+    for mine in iter_claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
         taken.append(clock.now)
-        end(mine, "done")
+        finish_claim(mine, "done")
     assert len(taken) == 1 and 1000 - 5 + PATIENCE <= taken[0] <= 1000 + PATIENCE + 5
 
 
-@pytest.mark.parametrize(("outcome", "taken"), [("done", 0), ("failed", 0), (LEFT, 1)])
+@pytest.mark.parametrize(("outcome", "taken"), [("done", 0), ("failed", 0), (ABANDONED, 1)])
 def test_what_another_ends_is_waited_for_and_only_what_was_left_is_taken(outcome, taken, tmp_path):
     other = claimed(tmp_path)
-    clock, found = Clock(0.0, lambda seconds: end(other, outcome)), []
-    for mine in claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
+    clock, found = Clock(0.0, lambda seconds: finish_claim(other, outcome)), []
+    for mine in iter_claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
         found.append(mine.number)
         assert 0 < clock.now < PATIENCE / 6 + 5
-        end(mine, "done")
+        finish_claim(mine, "done")
     assert found == [2] * taken
     assert clock.now < PATIENCE / 6 + 5
 
 
 def test_what_had_ended_before_is_tried_again_by_one(tmp_path):
-    end(claimed(tmp_path), "failed")
-    at_start = read_states(tmp_path)
-    one = claims(tmp_path, ["a"], at_start, PATIENCE)
+    finish_claim(claimed(tmp_path), "failed")
+    at_start = read_claim_states(tmp_path)
+    one = iter_claims(tmp_path, ["a"], at_start, PATIENCE)
     again = next(one)
     assert again.number == 2
-    end(again, "failed")
-    assert list(one) == list(claims(tmp_path, ["a"], at_start, PATIENCE)) == []
+    finish_claim(again, "failed")
+    assert list(one) == list(iter_claims(tmp_path, ["a"], at_start, PATIENCE)) == []
 
 
 def test_heartbeats_differ_say_who_writes_them_and_may_fail(tmp_path):
     mine = claimed(tmp_path)
     seen = [read_pulse(mine)]
     for count in (1, 2, 10**11):
-        beat(mine, count)
+        write_pulse(mine, count)
         seen.append(read_pulse(mine))
     assert len(set(seen)) == 4
     assert mine.path.read_text().split()[0] == "100000000000" and len(mine.path.read_text().split()) == 3
     gone = Claim(tmp_path / "gone", "a", 1)
-    assert beat(gone, 1) and read_pulse(gone) == b"" and read_states(tmp_path / "gone") == {}
+    assert write_pulse(gone, 1) and read_pulse(gone) == b"" and read_claim_states(tmp_path / "gone") == {}
 
 
 _ATTEMPTS = st.dictionaries(
-    st.sampled_from("abc"), st.lists(st.sampled_from([None, "done", "failed", LEFT]), min_size=1, max_size=12)
+    st.sampled_from("abc"), st.lists(st.sampled_from([None, "done", "failed", ABANDONED]), min_size=1, max_size=12)
 )
 
 
@@ -141,11 +141,17 @@ def test_the_last_attempt_counts_in_whatever_order_files_are_listed(attempts, dr
         for number, outcome in enumerate(outcomes, start=1):
             names += [f"{key}.{number}", *([] if outcome is None else [f"{key}.{number}.{outcome}"])]
     draw.shuffle(names)
-    assert module.states(names) == {key: State(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()}
+    assert module.claim_states(names) == {
+        key: ClaimState(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()
+    }
 
 
 def test_what_is_free():
-    assert module.BEATS == 6
-    assert free(NEW, NEW) and free(State(1, LEFT), NEW) and free(State(2, "done"), State(2, "done"))
-    assert not any(free(State(2, outcome), State(1, outcome)) for outcome in ("done", "failed"))
-    assert not free(State(1, None), State(1, None))
+    assert module.BEATS_PER_TIMEOUT == 6
+    assert (
+        is_claimable(UNCLAIMED, UNCLAIMED)
+        and is_claimable(ClaimState(1, ABANDONED), UNCLAIMED)
+        and is_claimable(ClaimState(2, "done"), ClaimState(2, "done"))
+    )
+    assert not any(is_claimable(ClaimState(2, outcome), ClaimState(1, outcome)) for outcome in ("done", "failed"))
+    assert not is_claimable(ClaimState(1, None), ClaimState(1, None))

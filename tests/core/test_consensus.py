@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence
-from normlift_ns.core.consensus import agreed, consensus, region_overlaps, sampled_gaussians
+from normlift_ns.core.consensus import apply_consensus, consensus, region_overlaps, sample_gaussians
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from tests.examples import examples
@@ -202,14 +202,14 @@ def test_strength_rises_by_a_tenth_above_the_least():
     evidence = random_evidence(40, [5, 6, 7], 3)
     features = unit_rows(18, 8, 3)
     overlaps = region_overlaps(evidence.rows, evidence.region_view)
-    whole, b = agreed(features, overlaps, least=0.0), overlaps.agreement
+    whole, b = apply_consensus(features, overlaps, least=0.0), overlaps.agreement
     assert b > 0.1
-    assert torch.equal(agreed(features, overlaps, least=b), features)
-    assert torch.equal(agreed(features, overlaps, least=b - 0.11), whole)
+    assert torch.equal(apply_consensus(features, overlaps, least=b), features)
+    assert torch.equal(apply_consensus(features, overlaps, least=b - 0.11), whole)
     others = dense(SparseRows(overlaps.iou.offsets, overlaps.iou.column, overlaps.iou.weight * overlaps.inside), 18)
     half = features + 0.5 * others.to(features.dtype) @ features
     expected = torch.nn.functional.normalize(half, dim=1)
-    assert torch.allclose(agreed(features, overlaps, least=b - 0.05), expected, atol=1e-5)
+    assert torch.allclose(apply_consensus(features, overlaps, least=b - 0.05), expected, atol=1e-5)
 
 
 def large(regions: int, gaussians: int, views: int) -> Evidence:
@@ -239,7 +239,7 @@ def test_a_sample_tells_what_the_whole_does_with_the_same_bits_each_time(device)
 @given(seed=SEEDS, least=st.integers(1, 30))
 def test_every_region_has_its_sample(seed, least):
     evidence = random_evidence(300, VIEWS, seed)
-    chosen, chance = sampled_gaussians(evidence.rows, sum(VIEWS), least)
+    chosen, chance = sample_gaussians(evidence.rows, sum(VIEWS), least)
     count, got = (torch.bincount(r.column, minlength=15) for r in (evidence.rows, evidence.rows.select_rows(chosen)))
     assert bool((got >= count.clamp(max=least)).all())
     assert bool(((chance > 0) & (chance <= 1)).all())

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from normlift_ns.crash import explain, log_traceback
-from normlift_ns.errors import InputError, visible
+from normlift_ns.errors import InputError, describe_error, escape_unprintable, log_traceback
 
 
 def raised(error: Exception) -> Exception:
@@ -37,20 +36,20 @@ def test_mistakes_of_the_user_are_told_as_they_are(state):
         (OSError(28, "No space left on device"), "No space left on device"),
         (MemoryError("the GPU's memory is full"), "the GPU's memory is full"),
     ):
-        assert explain(raised(error)) == (message, 1)
+        assert describe_error(raised(error)) == (message, 1)
     for error, facts in (
         (MemoryError(), ("memory", "--max-views", "--lift-downscale")),
         (torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried 2 GiB"), ("(CUDA out of memory.)", "--device cpu")),
         (RuntimeError("Numpy is not available"), ("pip install 'numpy<2'",)),
     ):
-        message, code = explain(raised(error))
+        message, code = describe_error(raised(error))
         assert code == 1 and all(fact in message for fact in facts), message
     assert not state.exists()
 
 
 @pytest.mark.parametrize("error", [ValueError("wrong"), KeyError("x"), RecursionError("deep"), AssertionError()])
 def test_ours_are_written_to_a_file_of_the_user_alone(error, state):
-    message, code = explain(raised(error))
+    message, code = describe_error(raised(error))
     (log,) = state.iterdir()
     assert code == 70
     assert type(error).__name__ in message and str(log) in message
@@ -68,14 +67,14 @@ def test_without_a_state_folder_the_temporary_one_is_taken(monkeypatch, tmp_path
 
 
 def test_without_any_folder_the_traceback_is_printed(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("normlift_ns.crash._log_folders", lambda: [Path(os.devnull)])
-    message, code = explain(raised(ValueError("x")))
+    monkeypatch.setattr("normlift_ns.errors._log_folders", lambda: [Path(os.devnull)])
+    message, code = describe_error(raised(ValueError("x")))
     assert code == 70 and "bug" in message
     assert "Traceback" in capsys.readouterr().err
 
 
 def test_only_the_first_line_of_a_foreign_message_is_shown():
-    message, _ = explain(raised(RuntimeError("first\nsecond" + "x" * 9999)))
+    message, _ = describe_error(raised(RuntimeError("first\nsecond" + "x" * 9999)))
     assert "RuntimeError: first." in message and "second" not in message
 
 
@@ -88,5 +87,5 @@ def test_control_characters_are_shown_as_escapes():
         ("\udc80", "\\udc80"),
         ("\x9b31m", "\\x9b31m"),
     ):
-        assert visible(text) == shown
-        visible(text).encode("utf8")
+        assert escape_unprintable(text) == shown
+        escape_unprintable(text).encode("utf8")

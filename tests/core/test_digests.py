@@ -19,12 +19,12 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from normlift_ns import Evidence, SemanticField, lift
-from normlift_ns.core.disk.digests import text_digest
-from normlift_ns.core.disk.manifest import MANIFEST, check_files, read_manifest, write_manifest
-from normlift_ns.core.disk.tensors import check_tensor, load_tensors, save_tensors, tensor_digest
+from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.core.storage import StoredEvidence
 from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import check_tensor, load_tensors, save_tensors, tensor_digest
+from normlift_ns.io.atomic import text_digest
+from normlift_ns.io.manifest import MANIFEST_FILE, check_file_digests, read_manifest, write_manifest
 from tests.examples import FACTOR, examples
 from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
 from tests.scenes import generator, random_evidence, unit_rows
@@ -109,9 +109,9 @@ def as_version_0_1(folder: Path) -> None:
         with safe_open(path, "pt") as file:
             facts = {name: value for name, value in (file.metadata() or {}).items() if name != "digest"}
         save_file(load_file(path), path, metadata=facts or None)
-    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest = json.loads((folder / MANIFEST_FILE).read_text())
     facts = {name: value for name, value in manifest.items() if name not in ("digest", "digests")}
-    (folder / MANIFEST).write_text(json.dumps(facts, indent=2) + "\n")
+    (folder / MANIFEST_FILE).write_text(json.dumps(facts, indent=2) + "\n")
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -306,7 +306,7 @@ def test_a_manifest_may_say_anything(tmp_path: Path) -> None:
     facts = {**needed, "digest": "mine", "text": '"digest": ""', "deep": {"digest": "", "ü": [1e-05, None]}}
     write_manifest(tmp_path, facts, {"a": "b"})
     assert read_manifest(tmp_path) == ({k: v for k, v in facts.items() if k != "digest"}, {"a": "b"})
-    path = tmp_path / MANIFEST
+    path = tmp_path / MANIFEST_FILE
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))  # as a copy by way of Windows may have it
     assert read_manifest(tmp_path)[1] == {"a": "b"}
     deep = '{"schema_version": 1, "encoder": ' + "[" * 900 + "]" * 900 + "}"
@@ -333,7 +333,7 @@ def test_manifests_with_hostile_values(sealed: bool, tmp_path: Path) -> None:
     SemanticField(field.scalars, field.source, field.store, {**field.manifest, **more}, field.means).save(tmp_path)
     if not sealed:
         as_version_0_1(tmp_path)
-    facts = json.loads((tmp_path / MANIFEST).read_text())
+    facts = json.loads((tmp_path / MANIFEST_FILE).read_text())
     facts.pop("digest", None)
 
     def seal(content: bytes) -> bytes:
@@ -341,11 +341,11 @@ def test_manifests_with_hostile_values(sealed: bool, tmp_path: Path) -> None:
         return text.replace('"digest": ""', f'"digest": "{text_digest(text)}"', 1).encode()
 
     def load() -> None:
-        survives(lambda: check_files(tmp_path))
+        survives(lambda: check_file_digests(tmp_path))
         SemanticField.load(tmp_path, field.means)
 
     contents = hostile_json(facts)
-    fuzz(15, contents.map(seal) if sealed else contents, tmp_path / MANIFEST, load)
+    fuzz(15, contents.map(seal) if sealed else contents, tmp_path / MANIFEST_FILE, load)
 
 
 @pytest.mark.usefixtures("unchecked")

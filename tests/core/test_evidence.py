@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from normlift_ns import Evidence, lift, rasterize_evidence
 from normlift_ns.core.evidence import MASKED, Entries, _join, _join_by_sorting
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.encoders.source import joint_partition
+from normlift_ns.encoders.base import joint_partition
 from tests.examples import examples
 from tests.scenes import dense, generator, orbit, random_evidence, random_labels, random_scene, unit_rows
 

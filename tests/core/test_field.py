@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from normlift_ns import Lifted, SemanticField, lift, relevancy
 from normlift_ns.core.field import fingerprint
-from normlift_ns.core.lowrank import basis_of_rank, spectral_table
-from normlift_ns.core.storage import StoredEvidence
+from normlift_ns.core.lowrank import StoredEvidence, basis_of_rank, spectral_table
 from tests.captures import clip_vectors, needs_shared
 from tests.scenes import generator, random_evidence, unit_rows
 
@@ -168,7 +167,7 @@ def test_a_full_disk_leaves_no_manifest(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     lifted, means, source = example()
-    monkeypatch.setattr("normlift_ns.core.disk.tensors.save_file", full_disk)
+    monkeypatch.setattr("normlift_ns.io.arrays.save_file", full_disk)
     with pytest.raises(OSError, match=r"f/field\.safetensors cannot be written .*No space"):
         SemanticField.build(lifted, means, source, storage="float16").save(tmp_path / "f")
     assert list((tmp_path / "f").iterdir()) == []

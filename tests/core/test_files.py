@@ -19,11 +19,18 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.core import files
-from normlift_ns.core.disk import atomic, journal
-from normlift_ns.core.disk.journal import write_journal
-from normlift_ns.core.disk.tensors import save_tensors
-from normlift_ns.core.files import clean, draft_directory, new_file, new_files, publish, refuse_existing, write_text
+from normlift_ns.io import atomic
+from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.atomic import (
+    atomic_file,
+    atomic_files,
+    commit_directory,
+    complete_interrupted_writes,
+    draft_directory,
+    refuse_existing,
+    write_journal,
+    write_text_file,
+)
 from tests.processes import FORK, instants, killed_at, together
 
 PROCESSES, TURNS = 4, 3
@@ -46,7 +53,7 @@ def names_in(folder: Path) -> list[str]:
 def test_a_text_never_leaves_its_folder(tmp_path: Path):
     texts = ["../../etc/passwd", 'a\\b:c*?"<>|', "x" * 300, "tea\npot\0", "..", "~", "größe 7"]
     for text in texts:
-        path = tmp_path / f"{files.file_name(text)}.ply"
+        path = tmp_path / f"{atomic.safe_file_name(text)}.ply"
         assert path.resolve().parent == tmp_path.resolve() and len(path.name) <= 44, text
         path.write_text("")
     assert len(names_in(tmp_path)) == len(texts)
@@ -54,11 +61,11 @@ def test_a_text_never_leaves_its_folder(tmp_path: Path):
 
 def test_nothing_is_replaced_unasked(system: str, tmp_path: Path):
     path = tmp_path / "a" / "b.txt"
-    write_text(path, "first")
+    write_text_file(path, "first")
     with pytest.raises(FileExistsError, match=rf"{path} exists"):
-        write_text(path, "second")
+        write_text_file(path, "second")
     assert path.read_text() == "first"
-    write_text(path, "second", overwrite=True)
+    write_text_file(path, "second", overwrite=True)
     assert path.read_text() == "second"
     with pytest.raises(FileExistsError, match=r"b\.txt exists.* --json.*--overwrite"):
         refuse_existing(tmp_path / "c.txt", path, overwrite=False, instead="--json")
@@ -66,15 +73,15 @@ def test_nothing_is_replaced_unasked(system: str, tmp_path: Path):
     path.unlink()
     path.symlink_to("nowhere")
     with pytest.raises(FileExistsError):
-        write_text(path, "third")
+        write_text_file(path, "third")
     assert names_in(path.parent) == ["b.txt"]
 
 
 def test_a_failure_leaves_what_was_there(tmp_path: Path):
     path = tmp_path / "a.txt"
-    write_text(path, "before")
+    write_text_file(path, "before")
     for failure in (OSError(28, "No space left on device"), KeyboardInterrupt(), ValueError("bug")):
-        with pytest.raises(type(failure)) as caught, new_file(path, overwrite=True) as draft:
+        with pytest.raises(type(failure)) as caught, atomic_file(path, overwrite=True) as draft:
             draft.write_text("half")
             raise failure
         assert not isinstance(failure, OSError) or str(caught.value).startswith(f"{path} cannot be written (")
@@ -86,15 +93,15 @@ def test_a_full_disk_names_the_final_file(tmp_path: Path, monkeypatch: pytest.Mo
     numbers = torch.zeros(1000)
 
     def with_torch(path: Path) -> None:
-        with new_file(path) as draft:
+        with atomic_file(path) as draft:
             torch.save(numbers, draft)
 
     def folder(path: Path) -> None:
         with draft_directory(path.parents[1]) as draft:
-            write_text(draft / "inner" / "b.txt", "x" * 2000)
+            write_text_file(draft / "inner" / "b.txt", "x" * 2000)
 
     ways: dict[str, Callable[[Path], Any]] = {
-        "a": lambda path: write_text(path, "x" * 2000),
+        "a": lambda path: write_text_file(path, "x" * 2000),
         "b": lambda path: save_tensors(path, {"a": numbers}),
         "c": with_torch,
         "run/inner/b.txt": folder,
@@ -116,7 +123,7 @@ def test_a_full_disk_names_the_final_file(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=rf"{tmp_path}/file/sub/a.txt cannot be written \(.*delete"):
-        write_text(tmp_path / "file" / "sub" / "a.txt", "")
+        write_text_file(tmp_path / "file" / "sub" / "a.txt", "")
 
 
 def test_files_have_the_rights_of_new_files_and_reach_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -128,9 +135,9 @@ def test_files_have_the_rights_of_new_files_and_reach_the_disk(tmp_path: Path, m
         with draft_directory(tmp_path / "run") as draft:
             save_tensors(draft / "b.safetensors", {"a": torch.zeros(1)})
             flushed.clear()  # of the draft
-            assert publish(draft, tmp_path / "run")
+            assert commit_directory(draft, tmp_path / "run")
             assert {(tmp_path / name).stat().st_ino for name in (".", "run", "run/b.safetensors")} <= set(flushed)
-        write_text(tmp_path / "c.txt", "")
+        write_text_file(tmp_path / "c.txt", "")
     finally:
         os.umask(before)
     assert (tmp_path / "c.txt").stat().st_ino in flushed and flushed[-1] == tmp_path.stat().st_ino
@@ -141,8 +148,8 @@ def test_files_have_the_rights_of_new_files_and_reach_the_disk(tmp_path: Path, m
 def make_folder(path: Path, text: str, *, overwrite: bool = False) -> bool:
     with draft_directory(path) as draft:
         for i in range(2):
-            write_text(draft / "inner" / f"{i}.txt", text)
-        return publish(draft, path, overwrite=overwrite)
+            write_text_file(draft / "inner" / f"{i}.txt", text)
+        return commit_directory(draft, path, overwrite=overwrite)
 
 
 def content(path: Path) -> str:
@@ -160,20 +167,20 @@ def test_of_processes_that_write_at_once_none_loses_anything(system: str, tmp_pa
 
     def number(i: int, place: Path) -> str:
         with draft_directory(place) as draft:
-            write_text(draft / "name.txt", str(i))
-            return next(path.name for path in files.numbered(place) if publish(draft, path))
+            write_text_file(draft / "name.txt", str(i))
+            return next(path.name for path in atomic.numbered_paths(place) if commit_directory(draft, path))
 
     def work(i: int) -> list[tuple[bool, bool, str, bool]]:
         found = []
         for turn in range(TURNS):
             folder, won = tmp_path / str(turn), False
             with suppress(FileExistsError):
-                write_text(folder / "file", str(i))
+                write_text_file(folder / "file", str(i))
                 won = True
             made, named = make_folder(folder / "new", str(i)), number(i, folder / "2024-05-01_120000")
             found.append((won, made, named, make_folder(tmp_path / "replaced", f"{i}", overwrite=True)))
             written, gone = (paths, []) if i % 2 else (paths[:2], paths[2:])
-            with new_files(*written, overwrite=True, remove=gone) as drafts:
+            with atomic_files(*written, overwrite=True, remove=gone) as drafts:
                 for draft in drafts:
                     draft.write_text(f"{i} {turn}")
         return found
@@ -223,7 +230,7 @@ def test_a_killed_process_loses_no_folder(every: int, system: str, tmp_path: Pat
     new, old = (lambda text=text: make_folder(path, text, overwrite=True) for text in ("new", "old"))
     for _ in after_kills(new, old, path.parent, every):
         gaps += not path.exists()
-        clean(path.parent)
+        complete_interrupted_writes(path.parent)
         seen.append(content(path))
         assert list(path.parent.iterdir()) == [path]
     assert (seen[0], seen[-1], content(path)) == ("old", "new", "new")
@@ -245,7 +252,7 @@ def test_files_that_belong_together_are_completed_after_a_kill(every: int, overw
 
     def export() -> None:
         written, gone = (paths[:2], paths[2:]) if overwrite else (paths, [])
-        with new_files(*written, overwrite=overwrite, remove=gone) as drafts:
+        with atomic_files(*written, overwrite=overwrite, remove=gone) as drafts:
             for draft in drafts:
                 draft.write_text("new")
 
@@ -273,10 +280,10 @@ def test_an_export_that_was_never_completed_is_not_completed_over_a_later_one(tm
     left.mkdir()
     (left / "b").write_text("older")
     write_journal(left, {"files": ["a", "b"], "remove": [], "overwrite": True})
-    with new_files(*paths, overwrite=True) as drafts:
+    with atomic_files(*paths, overwrite=True) as drafts:
         for draft in drafts:
             draft.write_text("later")
-    clean(tmp_path)
+    complete_interrupted_writes(tmp_path)
     assert [path.read_text() for path in paths] == ["later", "later"]
     assert sorted(tmp_path.iterdir()) == paths
 
@@ -285,7 +292,7 @@ def test_what_a_running_process_writes_is_left_alone(tmp_path: Path):
     begun = FORK.Event()
 
     def write() -> None:
-        with new_file(tmp_path / "a.txt") as draft:
+        with atomic_file(tmp_path / "a.txt") as draft:
             draft.write_text("half")
             begun.set()
             time.sleep(600)
@@ -294,34 +301,34 @@ def test_what_a_running_process_writes_is_left_alone(tmp_path: Path):
     process.start()
     assert begun.wait(60)
     (temporary,) = tmp_path.iterdir()
-    clean(tmp_path)
-    write_text(tmp_path / "b.txt", "")
+    complete_interrupted_writes(tmp_path)
+    write_text_file(tmp_path / "b.txt", "")
     assert (temporary / "a.txt").read_text() == "half"
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    clean(tmp_path)
+    complete_interrupted_writes(tmp_path)
     assert names_in(tmp_path) == ["b.txt"]
 
 
 def test_without_locks_only_old_leftovers_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """As on Windows and on some network drives."""
-    for module in (files, atomic):
+    for module in (atomic, atomic):
         monkeypatch.setattr(module, "hold", lambda folder: None)
     ages = {f".normlift-{'1' * 16}": 23 * 3600, f".normlift-{'2' * 16}": 25 * 3600, ".other": 10**9}
     for name, seconds in ages.items():
         (tmp_path / name).mkdir()
         os.utime(tmp_path / name, (time.time() - seconds,) * 2)
-    write_text(tmp_path / "a.txt", "text")
+    write_text_file(tmp_path / "a.txt", "text")
     assert names_in(tmp_path) == [f".normlift-{'1' * 16}", ".other", "a.txt"]
 
 
 def test_a_folder_that_another_program_has_locked_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert atomic._LOCK_TIMEOUT == 10
     monkeypatch.setattr(atomic, "_LOCK_TIMEOUT", 0.02)
-    descriptor = atomic.hold(tmp_path)
-    write_text(tmp_path / "a.txt", "text")
-    atomic.release(descriptor)
+    descriptor = atomic.acquire_lock(tmp_path)
+    write_text_file(tmp_path / "a.txt", "text")
+    atomic.release_lock(descriptor)
     assert (tmp_path / "a.txt").read_text() == "text"
 
 
@@ -334,7 +341,7 @@ def test_a_journal_leads_nowhere_else(tmp_path: Path):
     (other / "y").write_text("")
     (tmp_path / "kept").touch()
     write_journal(other, {"files": ["../../away", "../y"], "remove": ["../kept", "../../kept"], "overwrite": True})
-    clean(tmp_path / "runs")
+    complete_interrupted_writes(tmp_path / "runs")
     assert names_in(tmp_path) == ["kept", "runs"]
     assert names_in(tmp_path / "runs") == ["away", "y"]
 
@@ -358,20 +365,20 @@ def test_a_journal_of_somebody_else_is_not_followed(visited: tuple[Path, Path], 
     for text in (json.dumps(STEPS), f"{'0' * 64}\n{json.dumps(STEPS)}", "[" * 200_000, "", "\0"):
         (sent / "steps.journal").write_text(text)
         with pytest.warns(UserWarning, match=f"{sent.name} holds files that another user"):
-            write_text(folder / "other", "", overwrite=True)
+            write_text_file(folder / "other", "", overwrite=True)
         assert [(folder / name).read_text() for name in ("mine", "thesis")] == ["precious"] * 2
         assert (sent / "mine").read_text() == "evil"
     write_journal(sent, STEPS)
     moved = sent.rename(folder / f".normlift-{'b' * 16}")
     with pytest.warns(UserWarning, match="another machine"):
-        clean(folder)
+        complete_interrupted_writes(folder)
     moved.rename(sent)
     with monkeypatch.context() as patch:
-        patch.setattr(journal, "_key", lambda: b"of another user")
+        patch.setattr(atomic, "_key", lambda: b"of another user")
         with pytest.warns(UserWarning, match="another user"):
-            clean(folder)
+            complete_interrupted_writes(folder)
     assert (folder / "thesis").exists()
-    clean(folder)  # where it belongs
+    complete_interrupted_writes(folder)  # where it belongs
     assert (folder / "mine").read_text() == "evil" and not (folder / "thesis").exists() and not sent.exists()
 
 
@@ -384,12 +391,12 @@ def test_nothing_but_leftovers_of_ours_is_touched_and_nothing_makes_us_wait(visi
     (folder / f".normlift-{'d' * 16}").symlink_to(folder / ".normlift-backup")
     os.mkfifo(sent / "steps.journal")
     with pytest.warns(UserWarning, match="another user"):
-        clean(folder)
+        complete_interrupted_writes(folder)
     assert len(list(folder.iterdir())) == 8 and len(list(folder.glob("*/notes"))) == 4
 
 
 def test_the_key_is_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    make = inspect.unwrap(journal._key)
+    make = inspect.unwrap(atomic._key)
     for state in ("new", "unwritable", "broken", "none"):
         folder = tmp_path / state / "normlift_ns"
         monkeypatch.setenv("XDG_STATE_HOME", str(folder.parent))
@@ -399,7 +406,7 @@ def test_the_key_is_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             folder.mkdir(parents=True)
             (folder / "key").write_text("short")
         elif state == "none":
-            monkeypatch.setattr(journal, "state_folder", lambda: None)
+            monkeypatch.setattr(atomic, "user_state_folder", lambda: None)
         first, second = make(), make()
         assert len(first) == len(second) == 32
         assert (first == second) == (state == "new"), state

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from normlift_ns import BACKGROUND_WORDS, CANONICAL_NEGATIVES, relevancy
-from normlift_ns.core.query import strongest
+from normlift_ns.core.relevancy import best_prompt
 from tests.scenes import generator
 
 POSITIVE = torch.rand(50, 3, generator=generator(0), dtype=torch.float64) * 2 - 1
@@ -48,7 +48,7 @@ def test_published_word_lists():
 
 def test_strongest_is_the_selected_prompt_of_largest_relevancy():
     selected = torch.rand(50, 3, generator=generator(2)) < 0.6
-    for row, chosen, found in zip(POSITIVE, selected, strongest(POSITIVE, selected).tolist()):
+    for row, chosen, found in zip(POSITIVE, selected, best_prompt(POSITIVE, selected).tolist()):
         among = [q for q in range(3) if chosen[q]]
         assert found == (max(among, key=lambda q: float(row[q])) if among else -1)
-    assert strongest(POSITIVE[:, :0], selected[:, :0]).tolist() == [-1] * 50
+    assert best_prompt(POSITIVE[:, :0], selected[:, :0]).tolist() == [-1] * 50

@@ -17,10 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import InputError, RefineConfig, lift, nearest_neighbors, refine, refine_variant, unsupported
-from normlift_ns.core.ablations import Variant
-from normlift_ns.core.refine import possible
-from normlift_ns.evaluation.votes import own_vote
-from normlift_ns.options import VOTES, VoteNumbers
+from normlift_ns.core.refine import clamp_k
+from normlift_ns.evaluation.studies import Variant, recorded_vote
+from normlift_ns.options import VOTE_DEFAULTS, VoteParameters
 from tests.examples import examples
 from tests.scenes import generator, random_evidence, unit_rows
 
@@ -101,7 +100,7 @@ def test_equals_the_loop(seed, k, sigma_d, tau, delta, prior):
             means[:3] *= 300
             means[20:] += 40
         own = torch.where(r > 0, 8 * torch.rand(25, generator=generator(seed), dtype=torch.float64), 0.0)
-        for kind in VOTES:
+        for kind in VOTE_DEFAULTS:
             config = RefineConfig(vote=kind, k=k, sigma_d=sigma_d, tau=tau, gamma=0.05, delta=delta, prior=prior)
             assert refine(means, u, r, config, own=own).tolist() == vote(means, u, r, config, own)
 
@@ -233,7 +232,7 @@ def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
     means, u, r = scene(3, n=25)
     means[0] = torch.tensor([1000.0, 0, 0])
     u[0], r[0] = 0, 0
-    for kind, own in itertools.product(VOTES, (torch.zeros(25).double(), 5 * r)):
+    for kind, own in itertools.product(VOTE_DEFAULTS, (torch.zeros(25).double(), 5 * r)):
         config = RefineConfig(vote=kind, k=12)
         best, winner = max(scores(means, u, r, config, own)[0].values()), vote(means, u, r, config, own)[0]
         assert (kind != "paper" or 0 < best < Decimal(10) ** -50_000) and winner != 0
@@ -302,13 +301,13 @@ def test_what_does_not_fit_is_named():
 
 def test_defaults_are_those_of_the_kind_of_vote_and_stand_in_the_help():
     """A number given counts for either kind; the help repeats the table."""
-    assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTES["posterior"]._replace(tau=0.5)
+    assert RefineConfig(vote="posterior", tau=0.5).numbers == VOTE_DEFAULTS["posterior"]._replace(tau=0.5)
     assert RefineConfig(vote="paper") == replace(RefineConfig(vote="posterior"), vote="paper")
-    assert RefineConfig().numbers == VOTES["posterior"] == VoteNumbers(2.0, 0.9, 0.05, 0.0)
-    assert VOTES["paper"] == VoteNumbers(1.0, 0.95, 0.4, 0.0) and RefineConfig().vote == "posterior"
+    assert RefineConfig().numbers == VOTE_DEFAULTS["posterior"] == VoteParameters(2.0, 0.9, 0.05, 0.0)
+    assert VOTE_DEFAULTS["paper"] == VoteParameters(1.0, 0.95, 0.4, 0.0) and RefineConfig().vote == "posterior"
     text = " ".join(inspect.getsource(RefineConfig).split())
-    for name in VoteNumbers._fields:
-        values = {kind: f"{getattr(numbers, name):g}" for kind, numbers in VOTES.items()}
+    for name in VoteParameters._fields:
+        values = {kind: f"{getattr(numbers, name):g}" for kind, numbers in VOTE_DEFAULTS.items()}
         told = [f"{x} for {kind}" if len(set(values.values())) > 1 else x for kind, x in values.items()]
         line = re.search(rf'{name}: float \| None = None """.{{1,300}}?Default: (.*?)"""', text)
         assert line is not None and all(x in line[1] for x in told), (name, line)
@@ -317,14 +316,14 @@ def test_defaults_are_those_of_the_kind_of_vote_and_stand_in_the_help():
 def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
     old = RefineConfig.__new__(RefineConfig)
     old.__setstate__({"k": 36, "sigma_d": 1.0, "tau": 0.95, "gamma": 0.4, "delta": 0.0})
-    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteNumbers(1.0, 0.95, 0.4, 0.0))
+    assert (old.vote, old.prior, old.numbers) == ("paper", 4.0, VoteParameters(1.0, 0.95, 0.4, 0.0))
     manifest = {"options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "beta": 2.0}}
-    own = own_vote(manifest)
-    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteNumbers(2.5, 0.9, 0.4, 0.1))
-    assert own_vote({}).config == RefineConfig()
-    told = asdict(possible(RefineConfig(vote="posterior", tau=0.5), 1000))  # what a manifest of today holds
+    own = recorded_vote(manifest)
+    assert (own.variant, own.config.vote, own.config.numbers) == ("paper", "paper", VoteParameters(2.5, 0.9, 0.4, 0.1))
+    assert recorded_vote({}).config == RefineConfig()
+    told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # what a manifest of today holds
     assert told == {"vote": "posterior", "k": 36, "prior": 4.0, "delta": 0.0, "gamma": 0.05, "sigma_d": 2.0, "tau": 0.5}
-    assert own_vote({"options": {"vote": told}}).variant == "posterior"
+    assert recorded_vote({"options": {"vote": told}}).variant == "posterior"
     new = RefineConfig(vote="posterior", sigma_d=3.0)
     assert copy.copy(new) == pickle.loads(pickle.dumps(new)) == new
 

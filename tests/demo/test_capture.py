@@ -8,7 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.demo import DemoRoom, demo_cameras, held_out_cameras, view_image, view_labels, write_capture
+from normlift_ns.demo.capture import demo_cameras, held_out_cameras, view_image, view_labels, write_capture
+from normlift_ns.demo.room import DemoRoom
 
 
 @pytest.fixture(scope="module")

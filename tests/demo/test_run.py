@@ -11,8 +11,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns import Camera, GaussianScene, render
-from normlift_ns.demo import DemoRoom, write_capture, write_splatfacto_run
-from normlift_ns.demo.run import to_dataparser_world
+from normlift_ns.demo.capture import to_dataparser_world, write_capture, write_splatfacto_run
+from normlift_ns.demo.room import DemoRoom
 from tests.scenes import random_scene
 
 

@@ -23,8 +23,8 @@ def solids() -> dict[str, tuple[shapes.Distance, float]]:
 
 
 def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
-    near = shapes.points_near(shape, LOW, HIGH, density, np.random.default_rng(0))
-    return shapes.projected(shape, near, LOW, HIGH)
+    near = shapes.sample_near_surface(shape, LOW, HIGH, density, np.random.default_rng(0))
+    return shapes.project_to_surface(shape, near, LOW, HIGH)
 
 
 def test_surface_points_are_even_and_on_the_surface_and_normals_point_outward():
@@ -54,7 +54,7 @@ def test_distances():
 def test_cover_tiles_a_plane_with_equal_round_patches():
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(0, 1, (24_000, 2)), np.zeros((24_000, 1))], axis=1)
-    surfels = shapes.cover(lambda p: p[:, 2], points, rng.choice(len(points), 1000, replace=False))
+    surfels = shapes.fit_surfels(lambda p: p[:, 2], points, rng.choice(len(points), 1000, replace=False))
     assert surfels.normals == pytest.approx(np.tile([0, 0, 1], (1000, 1)))
     assert surfels.means[:, 2] == pytest.approx(0)
     patch_radius = math.sqrt(1 / 1000 / math.pi)

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.weights import import_open_clip
-from normlift_ns.encoders.sam.weights import load_sam
+from normlift_ns.encoders.open_clip import import_open_clip
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.segmentation.checkpoint import load_sam
 from tests.encoders.tiny import CLIP, HUB, write_clip, write_sam
 from tests.encoders.tiny_library import write_tiny
 
@@ -68,7 +68,7 @@ def library_weights(made_once: Callable[..., Path]) -> Path:
 @pytest.fixture
 def unsure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Random weights are never sure."""
-    monkeypatch.setattr("normlift_ns.encoders.sam.text_masks.SCORE", 0.2)
+    monkeypatch.setattr("normlift_ns.segmentation.sam3.SCORE_THRESHOLD", 0.2)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.encoders.batches import Batches
+from normlift_ns.encoders.batching import AdaptiveBatches
 
 
 def narrow(room: int):
@@ -21,7 +21,7 @@ def narrow(room: int):
 
 
 def test_batches_shrink_until_they_fit_and_stay_so():
-    batches = Batches(16)
+    batches = AdaptiveBatches(16)
     function, asked = narrow(3)
     assert torch.cat(list(batches(function, torch.arange(10)))).tolist() == list(range(0, 20, 2))
     assert asked == [10, 5, 2, 3, 5, 2, 3]
@@ -44,7 +44,7 @@ def test_batches_are_filled_from_several_parts(counts, size):
         sizes.append(len(items))
         return torch.tensor(items)[:, None] * 2
 
-    for i, rows in enumerate(Batches(size).across(double, parts())):
+    for i, rows in enumerate(AdaptiveBatches(size).across(double, parts())):
         assert [int(row) for row in rows] == list(range(2 * first[i], 2 * (first[i] + counts[i]), 2))
         assert first[len(asked) - 1] < first[i] + counts[i] + size  # no part is asked for without need
     assert asked == list(range(len(counts)))
@@ -53,7 +53,7 @@ def test_batches_are_filled_from_several_parts(counts, size):
 
 def test_what_never_fits_other_errors_and_no_items():
     with pytest.raises(MemoryError, match=r"CUDA out of memory.*2 GiB.*--lift-downscale 2"):
-        list(Batches(16)(narrow(0)[0], torch.arange(10)))
+        list(AdaptiveBatches(16)(narrow(0)[0], torch.arange(10)))
     with pytest.raises(ZeroDivisionError):
-        list(Batches(2)(lambda items: 1 // 0, torch.arange(3)))
-    assert list(Batches(2)(lambda items: items, torch.arange(0))) == []
+        list(AdaptiveBatches(2)(lambda items: 1 // 0, torch.arange(3)))
+    assert list(AdaptiveBatches(2)(lambda items: items, torch.arange(0))) == []

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from normlift_ns.encoders import SourceOptions, make_regions, make_source
-from normlift_ns.encoders.build import resolve_regions
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.sam.masks import SamMasks
+from normlift_ns.encoders.base import PatchFeatures
+from normlift_ns.encoders.build import make_regions, make_source, resolve_regions
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.options import SourceOptions
+from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
+from normlift_ns.segmentation.sam import SamMasks
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import refused
 

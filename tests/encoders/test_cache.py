@@ -10,15 +10,13 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
-from normlift_ns.encoders import RegionFeatures, ViewFeatures, cached
-from normlift_ns.encoders.batches import Batches
-from normlift_ns.encoders.cache import CachedEncoder, CachedRegions
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.regions import Grid, LabelFiles
-from normlift_ns.encoders.source import each_view
-from normlift_ns.encoders.texts.kept import KeptTexts, text_identity
+from normlift_ns.encoders.base import PatchFeatures, RegionFeatures, ViewFeatures, iterate_view_features
+from normlift_ns.encoders.batching import AdaptiveBatches
+from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, cached
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity
+from normlift_ns.segmentation.regions import Grid, LabelFiles
 from tests.encoders.tiny import noise
 
 IMAGE = noise(20, 30)
@@ -48,7 +46,7 @@ class Counted:
 
 @pytest.fixture
 def counted() -> RegionFeatures:
-    return RegionFeatures(Counted(Grid(12)), Counted(ColourEncoder()))
+    return RegionFeatures(Counted(Grid(12)), Counted(ColorEncoder()))
 
 
 def asked(source: RegionFeatures) -> tuple[int, int]:
@@ -60,7 +58,7 @@ def assert_same(a: ViewFeatures, b: ViewFeatures) -> None:
 
 
 def test_a_second_run_computes_nothing(counted, tmp_path):
-    source = RegionFeatures(Grid(12), ColourEncoder())
+    source = RegionFeatures(Grid(12), ColorEncoder())
     kept, expected = cached(source, tmp_path), source.view(IMAGE, "a.jpg")
     identity = {"regions": {"kind": "grid", "count": 12}, "levels": [], "encoder": {"kind": "colour", "sigma": 30.0}}
     assert kept.identity == source.identity == identity
@@ -81,7 +79,7 @@ def test_everything_that_matters_is_in_the_key(tmp_path):
     labels, other = (Grid(count).labels(IMAGE, "")[0] for count in (12, 40))
 
     def features(image=IMAGE, labels=labels):
-        return CachedEncoder(ColourEncoder(), tmp_path).path(image, labels)
+        return CachedEncoder(ColorEncoder(), tmp_path).path(image, labels)
 
     keys = [regions(), regions(changed), regions(name="b.jpg"), regions(count=13), regions(turned)]
     keys += [features(), features(changed), features(labels=other), features(turned)]
@@ -92,7 +90,7 @@ def test_everything_that_matters_is_in_the_key(tmp_path):
 
 def test_another_level_has_the_same_label_maps(tmp_path):
     np.save(tmp_path / "a.npy", np.stack([np.ones((20, 30), int), np.arange(600).reshape(20, 30)]))
-    source = [RegionFeatures(Counted(LabelFiles(tmp_path, level=i)), Counted(ColourEncoder())) for i in range(2)]
+    source = [RegionFeatures(Counted(LabelFiles(tmp_path, level=i)), Counted(ColorEncoder())) for i in range(2)]
     first, second, again = (cached(s, tmp_path / "cache").view(IMAGE, "a.jpg") for s in (*source, source[0]))
     assert [asked(s) for s in source] == [(1, 1), (0, 1)]
     assert torch.equal(first.labels, second.labels)
@@ -103,7 +101,7 @@ def test_another_level_has_the_same_label_maps(tmp_path):
 def test_another_label_file_is_another_entry(tmp_path):
     labels = tmp_path / "labels"
     labels.mkdir()
-    source = cached(RegionFeatures(LabelFiles(labels), ColourEncoder()), tmp_path / "cache")
+    source = cached(RegionFeatures(LabelFiles(labels), ColorEncoder()), tmp_path / "cache")
     for value, regions in ((0, 0), (3, 1)):
         np.save(labels / "a.npy", np.full((20, 30), value))
         assert len(source.view(IMAGE, "a.jpg").features) == regions
@@ -151,7 +149,7 @@ def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
         path.write_bytes(b"half")
         raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr("normlift_ns.core.disk.tensors.save_file", full)
+    monkeypatch.setattr("normlift_ns.io.arrays.save_file", full)
     with pytest.raises(OSError, match=r"labels.*/regions/\w+\.safetensors"):
         cached(counted, tmp_path).view(IMAGE, "a.jpg")
     assert list((tmp_path / "regions").iterdir()) == []
@@ -165,11 +163,11 @@ def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):
     for i in (0, 3):
         source.view(*images[i])
     del sizes[:]
-    for view, one in zip(each_view(source, iter(images)), expected, strict=True):
+    for view, one in zip(iterate_view_features(source, iter(images)), expected, strict=True):
         assert torch.equal(view.labels, one.labels) and torch.equal(view.regions, one.regions)
         torch.testing.assert_close(view.features, one.features, rtol=0, atol=1e-5)
     assert sizes == [8, 8, 8, 8]
-    again = each_view(cached(RegionFeatures(Grid(6), unusable(clip)), tmp_path), images)
+    again = iterate_view_features(cached(RegionFeatures(Grid(6), unusable(clip)), tmp_path), images)
     assert all(torch.equal(view.labels, one.labels) for view, one in zip(again, expected, strict=True))
 
 
@@ -183,11 +181,11 @@ def test_an_interruption_costs_the_views_of_one_batch(clip, tmp_path):
 
     seen = []
     with pytest.raises(KeyboardInterrupt):
-        seen.extend(len(view.features) for view in each_view(source, interrupted()))
+        seen.extend(len(view.features) for view in iterate_view_features(source, interrupted()))
     assert sizes == [8, 8, 8]  # 24 of 30 crops: four views
     assert len(list((tmp_path / "features").iterdir())) == 4 and len(list((tmp_path / "regions").iterdir())) == 5
     del sizes[:]
-    assert len(list(each_view(source, images))) == 6
+    assert len(list(iterate_view_features(source, images))) == 6
     assert sizes == [8, 8]
 
 
@@ -199,7 +197,7 @@ def in_eights(encoder: OpenClipEncoder, folder: Path) -> tuple[RegionFeatures, l
         sizes.append(len(crops))
         return OpenClipEncoder._image_rows(copy, crops)
 
-    vars(copy).update(network=encoder.network, _crops=Batches(8), _image_rows=counted)
+    vars(copy).update(network=encoder.network, _crops=AdaptiveBatches(8), _image_rows=counted)
     return cached(RegionFeatures(Grid(6), copy), folder), sizes
 
 
@@ -210,9 +208,9 @@ def unusable(encoder: OpenClipEncoder) -> OpenClipEncoder:
     return copy
 
 
-def kept_texts(encoder: OpenClipEncoder, folder: Path | None) -> KeptTexts:
-    settings = partial(text_identity, encoder.model, encoder.pretrained, encoder.template)
-    return KeptTexts(settings, lambda: encoder, folder)
+def kept_texts(encoder: OpenClipEncoder, folder: Path | None) -> CachedTextEncoder:
+    settings = partial(open_clip_text_identity, encoder.model, encoder.pretrained, encoder.template)
+    return CachedTextEncoder(settings, lambda: encoder, folder)
 
 
 def test_texts_asked_again_need_no_network(clip, tmp_path):

@@ -17,10 +17,10 @@ SEE_ALL = """
 import sys
 from pathlib import Path
 from normlift_ns.encoders import RegionFeatures, cached, read_image
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
-from normlift_ns.stages import peak_gib
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.base import PatchFeatures
+from normlift_ns.segmentation.sam import MaskRules, SamMasks
+from normlift_ns.progress import peak_gib
 from tests.encoders.tiny import write_clip, write_sam
 
 folder, images = Path(sys.argv[1]), sorted(Path(sys.argv[2]).iterdir())[:12]

@@ -10,12 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.texts import colours as space
-from normlift_ns.encoders.texts.colours import SIGMA, ColourTexts, colour_names
+from normlift_ns.encoders import color as space
+from normlift_ns.encoders.color import KERNEL_SIGMA, ColorEncoder, ColorTextEncoder, find_color_names
 from tests.encoders.tiny import refused
 
-COLOUR = ColourEncoder()
+COLOUR = ColorEncoder()
 rgb = st.tuples(*[st.floats(0, 1, width=32)] * 3)
 
 
@@ -25,7 +24,7 @@ def lab(colours) -> torch.Tensor:
 
 
 def embed(colours: torch.Tensor) -> torch.Tensor:
-    return torch.from_numpy(space.embed(colours.numpy()))
+    return torch.from_numpy(space.embed_colors(colours.numpy()))
 
 
 def shading_coordinates(colours: torch.Tensor) -> torch.Tensor:
@@ -43,12 +42,12 @@ def test_every_name_of_the_survey_is_understood(survey):
     assert {f"xkcd:{name}": colour for name, colour in table.items()} == survey
     for name in survey:
         words = name.removeprefix("xkcd:").replace("/", " ")
-        assert colour_names(words) == [words]
+        assert find_color_names(words) == [words]
     assert len(survey) == 949
 
 
 def test_coarse_names_are_understood_but_not_offered():
-    colour = ColourTexts()
+    colour = ColorTextEncoder()
     assert colour.rows(["shit brown"]).shape == (1, 343)
     for text in ("wooden shield", "pupe", "shift", "vomitt"):
         message = refused(lambda text=text: colour.rows([text]), text)
@@ -62,7 +61,7 @@ def test_the_cosine_is_the_kernel_within_the_documented_error():
     for pair in ((a, b), (a, near), (a**3, b**3)):  # cubes: dark colours
         first, second = map(lab, pair)
         apart = shading_coordinates(first) - shading_coordinates(second)
-        kernel = torch.exp(-(apart**2).sum(dim=1) / (2 * SIGMA**2))
+        kernel = torch.exp(-(apart**2).sum(dim=1) / (2 * KERNEL_SIGMA**2))
         error = ((embed(first) * embed(second)).sum(dim=1) - kernel).abs()
         assert (torch.linalg.vector_norm(embed(first), dim=1) - 1).abs().max() < 1e-12
         assert error.max() < 4e-3
@@ -124,7 +123,7 @@ def test_prompts_are_reduced_to_names():
         "redwood": [],
         "": [],
     }.items():
-        assert colour_names(prompt) == found, prompt
+        assert find_color_names(prompt) == found, prompt
 
 
 def test_what_names_no_colour_is_refused_with_near_names():

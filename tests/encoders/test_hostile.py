@@ -16,14 +16,15 @@ import torch
 from hypothesis import strategies as st
 from PIL import Image
 
-from normlift_ns.core.disk.tensors import load_tensors, save_tensors
-from normlift_ns.encoders import LangSplat, RegionFeatures, cached, read_image
-from normlift_ns.encoders.clip.network import load_clip
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.npy import read_npy
-from normlift_ns.encoders.regions import Grid, LabelFiles
-from normlift_ns.encoders.sam.weights import load_sam
-from normlift_ns.encoders.texts.files import TextVectors, write_text_vectors
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.cache import cached
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.langsplat import LangSplat
+from normlift_ns.encoders.open_clip_network import load_open_clip
+from normlift_ns.encoders.text_files import TextEmbeddingFile, write_text_embeddings
+from normlift_ns.io.arrays import load_tensors, read_npy, save_tensors
+from normlift_ns.segmentation.checkpoint import load_sam
+from normlift_ns.segmentation.regions import Grid, LabelFiles, read_image
 from tests.encoders.test_regions import grey_png
 from tests.encoders.tiny import CLIP, copied, noise, refused
 from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
@@ -63,7 +64,7 @@ def map_loader(folder: Path) -> Callable[[], object]:
 
 def langsplat_loader(folder: Path) -> Callable[[], object]:
     def load() -> None:
-        source = LangSplat(folder, ColourEncoder(), "l", resample=True)
+        source = LangSplat(folder, ColorEncoder(), "l", resample=True)
         source.available([NAME])
         source.size(NAME)
         source.view(IMAGE, NAME)
@@ -84,7 +85,7 @@ def loaders() -> dict[str, tuple[str, bytes, Callable[[Path], Callable[[], objec
         "label map, 16 bits": ("a.png", png((300 * MAP).astype(np.uint16)), map_loader, {}),
         "segment map": ("a_s.npy", npy(np.stack([MAP] * 4).astype("f4")), langsplat_loader, {"a_f.npy": npy(table())}),
         "feature table": ("a_f.npy", npy(table()), langsplat_loader, {"a_s.npy": npy(np.stack([MAP] * 4))}),
-        "text vectors": ("t.npz", texts, lambda folder: lambda: TextVectors(folder / "t.npz").text(["fox"]), {}),
+        "text vectors": ("t.npz", texts, lambda folder: lambda: TextEmbeddingFile(folder / "t.npz").text(["fox"]), {}),
         "picture": ("p.jpg", png(IMAGE.numpy()), lambda folder: lambda: read_image(folder / "p.jpg"), {}),
     }
 
@@ -175,8 +176,8 @@ def test_entries_of_text_vectors_are_checked_before_they_are_read(tmp_path: Path
         (b"PK no archive", ["NPZ"]),
     ):
         (tmp_path / "t.npz").write_bytes(content)
-        refused(lambda: TextVectors(tmp_path / "t.npz").text(["fox"]), "t.npz", *parts)
-    refused(lambda: TextVectors(Path("nowhere.npz")), "nowhere.npz", "--text-vectors", error=FileNotFoundError)
+        refused(lambda: TextEmbeddingFile(tmp_path / "t.npz").text(["fox"]), "t.npz", *parts)
+    refused(lambda: TextEmbeddingFile(Path("nowhere.npz")), "nowhere.npz", "--text-vectors", error=FileNotFoundError)
 
 
 def test_vectors_of_any_length_become_unit_vectors(tmp_path: Path) -> None:
@@ -184,14 +185,14 @@ def test_vectors_of_any_length_become_unit_vectors(tmp_path: Path) -> None:
         np.savez(tmp_path / "t.npz", fox=np.array([0, 3 * length, 4 * length]))
         vector = torch.tensor([0, 3 * length, 4 * length], dtype=torch.float64)
         (tmp_path / "w.npz").unlink(missing_ok=True)
-        write_text_vectors(tmp_path / "w.npz", {"fox": vector})
+        write_text_embeddings(tmp_path / "w.npz", {"fox": vector})
         for file in ("t.npz", "w.npz"):
-            torch.testing.assert_close(TextVectors(tmp_path / file).text(["fox"]), torch.tensor([[0, 0.6, 0.8]]))
+            torch.testing.assert_close(TextEmbeddingFile(tmp_path / file).text(["fox"]), torch.tensor([[0, 0.6, 0.8]]))
 
 
 def test_cache_entries_that_do_not_fit_are_made_again(tmp_path: Path) -> None:
     """Whole, with a digest and the right key."""
-    source = cached(RegionFeatures(Grid(12), ColourEncoder()), tmp_path)
+    source = cached(RegionFeatures(Grid(12), ColorEncoder()), tmp_path)
     expected = source.view(IMAGE, NAME)
     short = torch.zeros(1, 1, 6, 8, dtype=torch.int16)
     labels = [short[..., :7], short[0], short[:0].int(), short - 2, short.float(), short.long()]
@@ -217,7 +218,7 @@ def test_damaged_weights(clip_weights: Path, sam_weights: Path, tmp_path: Path) 
         given = folder if source.parent == folder else path
 
         def load(given: Path = given, clip: bool = source.parent == clip_weights) -> object:
-            return load_clip(CLIP, str(given), "cpu") if clip else load_sam(str(given))
+            return load_open_clip(CLIP, str(given), "cpu") if clip else load_sam(str(given))
 
         fuzz(4, damaged(whole), path, load)
         if source.suffix == ".json":

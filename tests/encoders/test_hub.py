@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
-from normlift_ns.encoders.hub.encoder import HubEncoder
-from normlift_ns.encoders.patches import PatchFeatures, scaled
+from normlift_ns.encoders.base import PatchFeatures, resize_image
+from normlift_ns.encoders.batching import masked_crops, region_boxes
+from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
 from tests.encoders.tiny import HUB, noise
 
 SIDE, PATCH, LENGTH = 32, 8, 16
@@ -25,7 +25,7 @@ class Both:
     """An encoder of ours in float64, and the library's own model and processor."""
 
     def __init__(self, name: str, folder: Path, transformers: Any) -> None:
-        self.name, self.encoder = name, HubEncoder(HUB[name], str(folder))
+        self.name, self.encoder = name, HuggingFaceEncoder(HUB[name], str(folder))
         self.network = self.encoder.network
         self.network.model.double()
         self.network.mean, self.network.std = self.network.mean.double(), self.network.std.double()
@@ -97,12 +97,12 @@ def value_path(both: Both, pixels: torch.Tensor) -> torch.Tensor:
 
 def test_patches_are_those_of_the_value_path(both: Both) -> None:
     for rows, columns in ((4, 4), (3, 5), (6, 2)):
-        pixels = scaled(IMAGE, rows * PATCH, columns * PATCH).round().to(torch.uint8)
+        pixels = resize_image(IMAGE, rows * PATCH, columns * PATCH).round().to(torch.uint8)
         expected = value_path(both, pixels)
         assert expected.shape[:2] == (1, rows * columns)
         torch.testing.assert_close(both.network.patches(pixels), expected, rtol=0, atol=1e-6)
         assert (expected[0, 0] - expected[0, 1]).abs().max() > 1e-3
     view = PatchFeatures(both.encoder, 12).view(IMAGE, "a.jpg")
     assert view.features.shape == (12, both.network.width) and int(view.labels.max()) == 11
-    found = both.network.patches(scaled(IMAGE, 3 * PATCH, 4 * PATCH))[0]
+    found = both.network.patches(resize_image(IMAGE, 3 * PATCH, 4 * PATCH))[0]
     torch.testing.assert_close(view.features.double(), torch.nn.functional.normalize(found, dim=1), rtol=0, atol=1e-6)

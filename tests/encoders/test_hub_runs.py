@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.encoders import SourceOptions, make_source
-from normlift_ns.encoders.build import resolve_regions, source_settings
-from normlift_ns.encoders.hub.encoder import HubEncoder
-from normlift_ns.encoders.patches import PatchFeatures
-from normlift_ns.text_encoders import default_rule, encoder_of, encoder_settings
+from normlift_ns.encoders.base import PatchFeatures
+from normlift_ns.encoders.build import make_source, resolve_regions, source_settings
+from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
+from normlift_ns.options import SourceOptions
+from normlift_ns.query.text_encoder import default_rule, encoder_settings, text_encoder_for
 from tests.encoders.tiny import copied, refused
 
 
@@ -35,27 +35,29 @@ def lifted(folder: Path, regions: Any) -> Any:
 def test_regions_are_patches_where_there_is_no_gpu(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = SourceOptions(encoder="siglip2", encoder_model=str(folder), region_count=12)
     assert resolve_regions(options) == "patches"
-    assert make_source(options) == PatchFeatures(HubEncoder("siglip2", str(folder)), 12)
+    assert make_source(options) == PatchFeatures(HuggingFaceEncoder("siglip2", str(folder)), 12)
     monkeypatch.chdir(folder.parent)
     assert source_settings(SourceOptions(encoder="siglip2", encoder_model="net"))["encoder_model"] == str(folder)
 
 
 def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> None:
     field, of_grid = lifted(folder, "patches"), lifted(folder, "grid")
-    texts = encoder_of(field, cache=tmp_path / "texts")
+    texts = text_encoder_for(field, cache=tmp_path / "texts")
     assert default_rule(field) == ("lerf", ("object", "things", "stuff", "texture"), 0.5)
     expected = texts.rows(["red mug", "table"])
-    assert torch.equal(torch.from_numpy(expected), HubEncoder("siglip2", str(folder)).text(["red mug", "table"]))
-    assert len(encoder_of(of_grid, cache=tmp_path / "texts").rows(["mug"])) == 1
+    assert torch.equal(
+        torch.from_numpy(expected), HuggingFaceEncoder("siglip2", str(folder)).text(["red mug", "table"])
+    )
+    assert len(text_encoder_for(of_grid, cache=tmp_path / "texts").rows(["mug"])) == 1
     config = folder / "tokenizer_config.json"  # other weights in the same place answer nothing new
     config.write_text(config.read_text() + " ")
-    again = encoder_of(of_grid, cache=tmp_path / "texts")
+    again = text_encoder_for(of_grid, cache=tmp_path / "texts")
     assert (again.rows(["red mug"]) == expected[:1]).all()
     refused(lambda: again.rows(["wine"]), "siglip2", "--text-vectors")
     folder.rename(tmp_path / "gone")
     (tmp_path / "manifest.json").write_text(json.dumps(field.manifest))
     program = (
-        "import json, sys; from pathlib import Path; from normlift_ns.text_encoders import encoder_of\n"
+        "import json, sys; from pathlib import Path; from normlift_ns.query.text_encoder import encoder_of\n"
         "class Field: manifest = json.loads(Path(sys.argv[1]).read_text())\n"
         "rows = encoder_of(Field, cache=Path(sys.argv[2])).rows(['table', 'red mug'])\n"
         "assert not {'torch', 'transformers', 'tokenizers'} & set(sys.modules), sys.modules.keys()\n"
@@ -65,5 +67,5 @@ def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> Non
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == expected[::-1].tolist()
-    asked = encoder_of(field, cache=tmp_path / "texts")
+    asked = text_encoder_for(field, cache=tmp_path / "texts")
     refused(lambda: asked.rows(["wine"]), "net", "--encoder-model", error=FileNotFoundError)

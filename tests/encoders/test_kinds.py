@@ -14,12 +14,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from normlift_ns.encoders import SourceOptions, make_encoder
-from normlift_ns.encoders.hub.families import FAMILIES
-from normlift_ns.encoders.hub.places import check_packages
-from normlift_ns.encoders.kinds import BUILT_IN, GROUP, encoder_kind, encoder_names, known_kind
+from normlift_ns.cli.preflight import check_source_options
+from normlift_ns.encoders.build import make_encoder
+from normlift_ns.encoders.huggingface import MODEL_FAMILIES, check_transformers_version
+from normlift_ns.encoders.registry import (
+    BUILT_IN_ENCODERS,
+    ENTRY_POINT_GROUP,
+    encoder_kind,
+    encoder_names,
+    find_encoder_kind,
+)
 from normlift_ns.errors import InputError
-from normlift_ns.scripts.early import check_source
+from normlift_ns.options import SourceOptions
 from tests.encoders.tiny import refused
 
 if sys.version_info >= (3, 11):
@@ -51,13 +57,15 @@ def plugged(folder: Path, package: str, points: str, code: str) -> Iterator[None
 
 
 def points(**encoders: str) -> str:
-    return f"[{GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
+    return f"[{ENTRY_POINT_GROUP}]\n" + "".join(f"{name} = {value}\n" for name, value in encoders.items())
 
 
 def test_ours_are_registered_in_pyproject_and_built_in() -> None:
     """So that they are found without metadata too, as in a source tree on PYTHONPATH."""
-    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"][GROUP]
-    assert registered == BUILT_IN
+    registered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["entry-points"][
+        ENTRY_POINT_GROUP
+    ]
+    assert registered == BUILT_IN_ENCODERS
     assert sorted(registered) == encoder_names() == OURS
     for name in OURS:
         kind = encoder_kind(name)
@@ -70,8 +78,8 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     monkeypatch.syspath_prepend(tmp_path)
     parts = ("'clip'", "--encoder", "colour, metaclip2, open_clip, other, same, siglip, siglip2")
     refused(lambda: encoder_kind("clip"), *parts)
-    refused(lambda: check_source(SourceOptions(encoder="clip"), ()), *parts)
-    assert known_kind("clip") is None and known_kind(3) is None
+    refused(lambda: check_source_options(SourceOptions(encoder="clip"), ()), *parts)
+    assert find_encoder_kind("clip") is None and find_encoder_kind(3) is None
     refused(lambda: encoder_kind("same"), "'same'", "claimed", "plug", "two", "uninstall")
 
 
@@ -83,10 +91,10 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
         ("plug:KIND", "KIND = 3", ["plug:KIND", "int", "EncoderKind"]),
         ("plug:", "", ["cannot be loaded"]),
     )):  # fmt: skip
-        install(tmp_path / str(number), "worse", f"[{GROUP}]\nno value at all\n= = =\n[")
+        install(tmp_path / str(number), "worse", f"[{ENTRY_POINT_GROUP}]\nno value at all\n= = =\n[")
         with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
             refused(lambda: encoder_kind("bad"), "'bad'", "plug", *parts)
-            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.clip.kind"
+            assert encoder_kind("open_clip").make.__module__ == "normlift_ns.encoders.builtin"
             assert encoder_names() == ["bad", *OURS]
 
 
@@ -119,14 +127,14 @@ def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
 
 def test_packages_that_are_too_old_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     versions = {"torch": "2.6.0", "transformers": "5.0.0"}
-    monkeypatch.setattr("normlift_ns.encoders.hub.places.version", lambda package: versions[package])
+    monkeypatch.setattr("normlift_ns.encoders.huggingface.version", lambda package: versions[package])
     options = SourceOptions(encoder="siglip2", encoder_model="/nowhere")
     for package, found, least in (("torch", "2.5.1", "2.6"), ("transformers", "4.49.0", "4.56")):
         versions[package], enough = found, versions[package]
-        for call in (lambda: check_source(options, ()), lambda: make_encoder(options)):
+        for call in (lambda: check_source_options(options, ()), lambda: make_encoder(options)):
             refused(call, "siglip2", f"{package} {least}", found, "--encoder open_clip")
         versions[package] = "10.0"
-        check_packages(FAMILIES["siglip2"])
+        check_transformers_version(MODEL_FAMILIES["siglip2"])
         versions[package] = enough
 
 
@@ -139,7 +147,7 @@ def test_mistakes_are_told_before_torch_is_loaded(empty_hub: Path, monkeypatch: 
         ({}, FileNotFoundError, ["SigLIP 2", "google/siglip2-base-patch16-224"]),
     ):
         source = SourceOptions(encoder="siglip2", **options)
-        refused(lambda source=source: check_source(source, ()), *parts, error=error)
+        refused(lambda source=source: check_source_options(source, ()), *parts, error=error)
 
 
 @pytest.mark.slow

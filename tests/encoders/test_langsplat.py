@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns.encoders import LangSplat, RegionFeatures, SourceOptions, make_source, write_langsplat
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import Grid, LabelFiles
-from normlift_ns.encoders.texts.files import TextVectors, write_text_vectors
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.text_files import TextEmbeddingFile, write_text_embeddings
+from normlift_ns.options import SourceOptions
+from normlift_ns.segmentation.regions import Grid, LabelFiles
 from tests.encoders.tiny import noise, refused
 from tests.examples import FACTOR
 
@@ -72,7 +75,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def source(folder: Path, level: str = "l", **options: object) -> LangSplat:
-    return LangSplat(folder, ColourEncoder(), level, **options)  # type: ignore[arg-type]
+    return LangSplat(folder, ColorEncoder(), level, **options)  # type: ignore[arg-type]
 
 
 def pixels(view) -> torch.Tensor:
@@ -306,7 +309,7 @@ def labels_4(folder: Path, levels: int = 4) -> RegionFeatures:
     rng = np.random.default_rng(0)
     maps = rng.integers(0, 5, (levels, 6, 8)).repeat(5, axis=1).repeat(5, axis=2)
     np.save(folder / "a.npy", maps)
-    return RegionFeatures(LabelFiles(folder, level=1), ColourEncoder())
+    return RegionFeatures(LabelFiles(folder, level=1), ColorEncoder())
 
 
 @pytest.mark.parametrize("levels", [4, 2])
@@ -320,7 +323,7 @@ def test_a_round_trip_is_exact(tmp_path, levels):
     assert segments.max() + 1 == len(table)
     for number, level in enumerate(("default", "s", "m", "l")) if levels == 4 else [(1, "l")]:
         regions = LabelFiles(tmp_path / "labels", level=number)
-        expected_view = RegionFeatures(regions, ColourEncoder()).view(PHOTO, "images/a.jpg")
+        expected_view = RegionFeatures(regions, ColorEncoder()).view(PHOTO, "images/a.jpg")
         found = source(tmp_path / "out", level).view(PHOTO, "images/a.jpg")
         assert torch.equal(found.features, expected_view.features)
         assert torch.equal(pixels(found), pixels(expected_view))
@@ -334,30 +337,30 @@ def test_a_round_trip_is_exact(tmp_path, levels):
 
 
 def test_existing_files_stay_unless_asked(tmp_path):
-    ours = RegionFeatures(Grid(4), ColourEncoder())
+    ours = RegionFeatures(Grid(4), ColorEncoder())
     for _ in range(2):  # the same content: as where an interrupted lift goes on
         write_langsplat(ours, PHOTO, "a.jpg", tmp_path, overwrite=False)
-    other = RegionFeatures(Grid(9), ColourEncoder())
+    other = RegionFeatures(Grid(9), ColorEncoder())
     write = partial(write_langsplat, other, PHOTO, "a.jpg", tmp_path)
     refused(lambda: write(overwrite=False), "a_s.npy", "--overwrite True", error=FileExistsError)
     write(overwrite=True)
     assert len(np.load(tmp_path / "a_f.npy")) > 4
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a_f.npy", "a_s.npy"]
     both = type("Both", (LabelFiles,), {"chosen": (0, 1)})(labels_4(tmp_path, 2).regions.folder)
-    several = RegionFeatures(both, ColourEncoder())  # at once, which have no place in the format
+    several = RegionFeatures(both, ColorEncoder())  # at once, which have no place in the format
     refused(lambda: write_langsplat(several, PHOTO, "a.jpg", tmp_path, overwrite=False), "several selected levels")
 
 
 def test_damage_of_text_vectors_is_noticed(tmp_path):
     file = tmp_path / "texts.npz"
-    write_text_vectors(file, {"fox": torch.tensor([3.0, 4.0]), "file": torch.tensor([0.0, -2.0])})
-    expected = TextVectors(file).text(["fox", "file"]).tolist()
+    write_text_embeddings(file, {"fox": torch.tensor([3.0, 4.0]), "file": torch.tensor([0.0, -2.0])})
+    expected = TextEmbeddingFile(file).text(["fox", "file"]).tolist()
     assert np.allclose(expected, [[0.6, 0.8], [0, -1]])
-    assert TextVectors(file).names == ("fox", "file")
-    refused(lambda: TextVectors(file).text(["fxo"]), "'fxo'", "texts.npz", "fox")
-    refused(lambda: TextVectors(file).text([]))
+    assert TextEmbeddingFile(file).names == ("fox", "file")
+    refused(lambda: TextEmbeddingFile(file).text(["fxo"]), "'fxo'", "texts.npz", "fox")
+    refused(lambda: TextEmbeddingFile(file).text([]))
     with pytest.raises(FileExistsError):
-        write_text_vectors(file, {})
+        write_text_embeddings(file, {})
     whole = file.read_bytes()
     # What is no vector may change, such as the date of an entry
     for bit in range(0, 8 * len(whole), max(1, 41 // FACTOR)):
@@ -365,7 +368,7 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
         changed[bit // 8] ^= 1 << bit % 8
         file.write_bytes(changed)
         try:
-            assert TextVectors(file).text(["fox", "file"]).tolist() == expected
+            assert TextEmbeddingFile(file).text(["fox", "file"]).tolist() == expected
         except ValueError as error:
             assert "texts.npz is damaged or not an NPZ file" in str(error)
     with zipfile.ZipFile(file, "w") as archive, zipfile.ZipFile(io.BytesIO(whole)) as original:
@@ -373,4 +376,4 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
             archive.writestr(name, original.read(other))
         archive.comment = original.comment
     with pytest.raises(ValueError, match=r"texts\.npz is damaged .*digest is 'normlift_ns xxh3_128:\w+', expected"):
-        TextVectors(file).text(["fox"])
+        TextEmbeddingFile(file).text(["fox"])

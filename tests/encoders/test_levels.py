@@ -7,10 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from normlift_ns.encoders import RegionFeatures
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import LabelFiles
-from normlift_ns.encoders.source import joint_partition
+from normlift_ns.encoders.base import RegionFeatures, joint_partition
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.segmentation.regions import LabelFiles
 from tests.encoders.tiny import noise, refused
 
 SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 6))
@@ -52,15 +51,15 @@ def folder(tmp_path):
 
 
 def test_every_level_has_the_same_cells_and_its_own_features(folder):
-    views = [RegionFeatures(LabelFiles(folder, level=i), ColourEncoder()).view(IMAGE, "a.jpg") for i in range(3)]
+    views = [RegionFeatures(LabelFiles(folder, level=i), ColorEncoder()).view(IMAGE, "a.jpg") for i in range(3)]
     assert all(torch.equal(view.labels, views[0].labels) for view in views)
     for level, view in enumerate(views):
         alone = LabelFiles(folder).labels(IMAGE, "a.jpg")[level]
         assert torch.equal(view.region_of_cell[0, view.labels.long()], alone[0])
-        assert torch.equal(view.features, ColourEncoder().encode(IMAGE, alone))
+        assert torch.equal(view.features, ColorEncoder().encode(IMAGE, alone))
     assert views[2].features.shape[0] == 0
     for wrong in (None, 3):
-        source = RegionFeatures(LabelFiles(folder, level=wrong), ColourEncoder())
+        source = RegionFeatures(LabelFiles(folder, level=wrong), ColorEncoder())
         refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "3 levels", "0..2", "--level")
 
 
@@ -68,8 +67,8 @@ def test_several_levels_at_once(folder):
     class Two(LabelFiles):
         chosen = (1, 0)
 
-    view = RegionFeatures(Two(folder), ColourEncoder()).view(IMAGE, "a.jpg")
-    one, zero = (RegionFeatures(LabelFiles(folder, level=i), ColourEncoder()).view(IMAGE, "a.jpg") for i in (1, 0))
+    view = RegionFeatures(Two(folder), ColorEncoder()).view(IMAGE, "a.jpg")
+    one, zero = (RegionFeatures(LabelFiles(folder, level=i), ColorEncoder()).view(IMAGE, "a.jpg") for i in (1, 0))
     assert torch.equal(view.features, torch.cat([one.features, zero.features]))
     offset = torch.where(zero.regions >= 0, zero.regions + len(one.features), -1)
     assert torch.equal(view.regions, torch.cat([one.regions, offset]))

@@ -8,10 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.encoders.sam import folders
-from normlift_ns.encoders.sam.library import load_network
-from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
-from normlift_ns.encoders.sam.rules import Suppression
+from normlift_ns.segmentation import checkpoint
+from normlift_ns.segmentation.mask_filtering import Suppression
+from normlift_ns.segmentation.sam import MaskRules, SamMasks, load_sam_network
 from tests.encoders.tiny import copied, refused
 from tests.encoders.tiny_library import SIDE, write_tiny
 
@@ -31,7 +30,7 @@ def photograph(height: int, width: int) -> torch.Tensor:
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_those_of_transformers(library_weights: Path, kind: str, transformers: Any) -> None:
     folder, points = library_weights / kind, torch.tensor([[3.0, 5.0], [20.5, 30.0], [39.0, 12.0], [10.0, 59.0]])
-    network = load_network(str(folder), "cpu")
+    network = load_sam_network(str(folder), "cpu")
     side = {"height": SIDE, "width": SIDE}
     if kind == "sam2":
         inside, wrapper, made = transformers.Sam2ImageProcessor(size=side), "Sam2Processor", "Sam2Model"
@@ -67,7 +66,7 @@ def test_answers_are_those_of_transformers(library_weights: Path, kind: str, tra
 def test_checkpoints_for_video_hold_the_model_for_images(tmp_path: Path) -> None:
     """Those of SAM 2.1 that are published: config.json says sam2_video, and the weights are more."""
     state = write_tiny(tmp_path, "sam2_video").state_dict()
-    network = load_network(str(tmp_path), "cpu")
+    network = load_sam_network(str(tmp_path), "cpu")
     mine = network._model.state_dict()
     assert type(network._model).__name__ == "Sam2Model" and len(mine) < len(state)
     assert all(torch.equal(value, state[name]) for name, value in mine.items())
@@ -81,7 +80,7 @@ def test_old_versions_are_refused_with_what_works(library_weights: Path, transfo
             refused(lambda kind=kind: SamMasks(str(library_weights / kind)), *parts)
     monkeypatch.delattr(transformers.models.sam2, "Sam2Model", raising=False)
     old = type("Old", (), {"__version__": "4.50.0"})
-    monkeypatch.setattr(folders, "import_transformers", lambda: old)
+    monkeypatch.setattr(checkpoint, "import_transformers", lambda: old)
     refused(lambda: SamMasks(str(library_weights / "sam2")), "SAM 2", "transformers 4.56", "4.50.0")
 
 

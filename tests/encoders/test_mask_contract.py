@@ -12,12 +12,11 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from normlift_ns.encoders.cache import CachedRegions
-from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
-from normlift_ns.encoders.sam import rules, text_masks
-from normlift_ns.encoders.sam.library import load_network
-from normlift_ns.encoders.sam.masks import LEVELS, SamMasks
-from normlift_ns.encoders.sam.rules import Suppression
-from normlift_ns.encoders.sam.text_masks import Sam3Masks, Sam3Network
+from normlift_ns.segmentation import mask_filtering, sam3
+from normlift_ns.segmentation.mask_filtering import Suppression
+from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
+from normlift_ns.segmentation.sam import SAM_LEVELS, SamMasks, load_sam_network
+from normlift_ns.segmentation.sam3 import Sam3Masks, Sam3Network
 from tests.encoders.test_library import LOOSE, photograph
 from tests.encoders.tiny import Largest, copied, refused
 
@@ -60,7 +59,7 @@ def test_labels_have_no_gaps_and_repeat(folders, kind, tmp_path):
     assert int(labels.max()) >= 0
     if kind in NETWORKS[:3]:
         masks = source.masks(IMAGE)
-        assert tuple(masks) == LEVELS and levels == 4 and all(len(level) > 0 for level in masks.values())
+        assert tuple(masks) == SAM_LEVELS and levels == 4 and all(len(level) > 0 for level in masks.values())
         assert not torch.equal(masks["s"][0], masks["l"][0])  # of the three masks of a point
     assert max(source.chosen, default=0) < levels
     kept = CachedRegions(make(kind, folder), tmp_path)
@@ -117,7 +116,7 @@ def test_half_precision_is_within_its_error(folders, kind):
             network.find(IMAGE, ["mug"])
             answers.append((out[0].pred_masks.float(), out[0].pred_logits.float()))
         else:
-            network = load_network(folder, "cpu", precision)
+            network = load_sam_network(folder, "cpu", precision)
             (embedding,) = network.embed(network.pixels([IMAGE]))
             logits, ious = next(network.prompt(embedding, points, (60, 90)))
             answers.append((logits.float(), ious.float()))
@@ -132,8 +131,8 @@ def test_half_precision_is_within_its_error(folders, kind):
 def test_memory_on_a_cpu_is_that_of_a_batch_of_masks(folders, kind, monkeypatch):
     """However many masks there are, few are enlarged at a time."""
     image = photograph(150, 220)
-    monkeypatch.setattr(text_masks, "_TOGETHER", 2)
-    monkeypatch.setitem(rules._CHUNK, "cpu", 2**17)  # of the suppression
+    monkeypatch.setattr(sam3, "_TOGETHER", 2)
+    monkeypatch.setitem(mask_filtering._CHUNK, "cpu", 2**17)  # of the suppression
     source = make(kind, folders[kind])
     if kind != "sam3":
         source = replace(source, rules=replace(EVERY, points_per_side=5))

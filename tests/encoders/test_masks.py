@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from normlift_ns.encoders.sam.rules import Suppression, boxes_of, mask_nms, stack_masks
+from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, masks_to_boxes, stack_masks
 from tests.encoders.tiny import needs_cuda
 from tests.examples import examples
 
@@ -100,7 +100,7 @@ def test_a_gpu_finds_the_same():
     scores = 0.6 + 0.4 * torch.rand(len(masks), generator=torch.Generator().manual_seed(0))
     assert torch.equal(mask_nms(masks.cuda(), scores.cuda()).cpu(), mask_nms(masks, scores))
     assert torch.equal(stack_masks(masks.cuda()).cpu(), stack_masks(masks))
-    assert torch.equal(boxes_of(masks.cuda()).cpu(), boxes_of(masks))
+    assert torch.equal(masks_to_boxes(masks.cuda()).cpu(), masks_to_boxes(masks))
     assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
 
 
@@ -115,7 +115,7 @@ def test_later_masks_lie_on_top_and_none_is_lost_nor_any_box(masks, empty):
         by_hand[mask] = i
         assert ((labels == i).any(axis=0) == mask).all()
         assert ((labels == i).sum(axis=0) <= 1).all()
-    for mask, box in zip(masks, boxes_of(torch.from_numpy(masks)).tolist(), strict=True):
+    for mask, box in zip(masks, masks_to_boxes(torch.from_numpy(masks)).tolist(), strict=True):
         y, x = np.nonzero(mask)
         assert box == ([x.min(), y.min(), x.max(), y.max()] if len(y) > 0 else [0, 0, 0, 0])
     assert (labels[0] == by_hand).all()

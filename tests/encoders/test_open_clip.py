@@ -15,11 +15,12 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from normlift_ns.encoders import SourceOptions, make_encoder
-from normlift_ns.encoders.clip.crops import masked_crops, region_boxes
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.weights import import_open_clip
-from normlift_ns.encoders.texts.kept import text_identity
+from normlift_ns.encoders.batching import masked_crops, region_boxes
+from normlift_ns.encoders.build import make_encoder
+from normlift_ns.encoders.open_clip import import_open_clip
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.encoders.text_files import open_clip_text_identity
+from normlift_ns.options import SourceOptions
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import CLIP as NAME
 from tests.encoders.tiny import DEVICES, noise, refused
@@ -115,7 +116,7 @@ def test_templates_and_their_ensemble(clip, open_clip):
         expected = torch.nn.functional.normalize(clip.text(every).double().mean(dim=0), dim=0)
         torch.testing.assert_close(row.double(), expected, rtol=0, atol=1e-6)
     assert photo.identity == clip.identity  # features of images stay what they are
-    ours, others = (text_identity(x.model, x.pretrained, x.template) for x in (clip, photo))
+    ours, others = (open_clip_text_identity(x.model, x.pretrained, x.template) for x in (clip, photo))
     assert ours != others
 
 

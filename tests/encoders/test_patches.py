@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from normlift_ns.encoders.clip.patches import dense_tokens
-from normlift_ns.encoders.patches import PatchFeatures, patch_grid
+from normlift_ns.encoders.base import PatchFeatures, patch_grid
+from normlift_ns.encoders.open_clip_network import patch_embeddings
 from tests.encoders.tiny import CLIP, noise, refused
 
 IMAGE = noise(48, 80)
@@ -33,7 +33,7 @@ def test_tokens_are_those_of_the_value_path(clip, open_clip):
         open_clip.load_checkpoint(model, clip.pretrained)
         pixels = torch.randn(2, 3, *size, generator=torch.Generator().manual_seed(1))
         expected = value_path(model.eval(), pixels)
-        torch.testing.assert_close(dense_tokens(clip.network.model.visual, pixels), expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(patch_embeddings(clip.network.model.visual, pixels), expected, rtol=0, atol=1e-5)
 
 
 def test_features_are_the_tokens_of_the_scaled_image(clip):
@@ -43,7 +43,7 @@ def test_features_are_the_tokens_of_the_scaled_image(clip):
     pixels = torch.nn.functional.interpolate(
         IMAGE.permute(2, 0, 1)[None].float(), (24, 40), mode="bicubic", antialias=True
     ).clamp(0, 255)
-    tokens = dense_tokens(network.model.visual, (pixels / 255 - network.mean) / network.std)[0]
+    tokens = patch_embeddings(network.model.visual, (pixels / 255 - network.mean) / network.std)[0]
     torch.testing.assert_close(view.features, torch.nn.functional.normalize(tokens, dim=1), rtol=0, atol=1e-5)
     y, x = torch.meshgrid(torch.arange(48) // 16, torch.arange(80) // 16, indexing="ij")
     assert torch.equal(view.labels, (5 * y + x).int())

@@ -5,9 +5,8 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
-from normlift_ns.encoders.sam.network import SamNetwork, resolve_precision
-from normlift_ns.encoders.sam.weights import load_sam
+from normlift_ns.segmentation.checkpoint import load_sam
+from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, resolve_precision
 from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from normlift_ns.encoders import read_image
-from normlift_ns.encoders.regions import Grid, LabelFiles, Superpixels
+from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels, read_image
 from tests.encoders.tiny import noise, refused
 
 

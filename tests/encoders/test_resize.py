@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
-from normlift_ns.encoders.sam.resize import resize_bilinear
+from normlift_ns.segmentation.sam import resize_bilinear
 from tests.encoders.tiny import DEVICES
 from tests.examples import examples
 

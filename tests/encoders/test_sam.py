@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns.encoders.sam.masks import LEVELS, MaskRules, SamMasks, point_grid
-from normlift_ns.encoders.sam.network import SamNetwork
-from normlift_ns.encoders.sam.rules import Suppression
-from normlift_ns.encoders.sam.weights import load_sam, published_config, published_name
+from normlift_ns.segmentation.checkpoint import config_from_weights, load_sam, transformers_name
+from normlift_ns.segmentation.mask_filtering import Suppression
+from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamMasks, SamNetwork, point_grid
 from tests.encoders.test_masks import nms_by_hand, pixels
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import SIDE, copied, needs_cuda, noise, refused, tiny_sam
@@ -53,8 +52,8 @@ def test_metas_files_fit(transformers):
     for kind in ("vit_b", "vit_l", "vit_h"):
         with torch.device("meta"):
             state = import_module("segment_anything").sam_model_registry[kind]().state_dict()
-            expected = transformers.SamModel(published_config(state)).state_dict()
-        found = {published_name(name): value.shape for name, value in state.items()}
+            expected = transformers.SamModel(config_from_weights(state)).state_dict()
+        found = {transformers_name(name): value.shape for name, value in state.items()}
         assert {name: value.shape for name, value in expected.items() if not name.startswith("shared_image")} == found
 
 
@@ -83,7 +82,7 @@ def test_the_masks_are_those_of_metas_generator(sam_weights, monkeypatch, size):
     made = import_module("segment_anything").SamAutomaticMaskGenerator
     generator = made(tiny_sam(seed=1), **same, box_nms_thresh=0.7, crop_n_layers=1)
     predictor = generator.predictor
-    for level, channels in zip(LEVELS, (slice(0, 3), slice(0, 1), slice(1, 2), slice(2, 3)), strict=True):
+    for level, channels in zip(SAM_LEVELS, (slice(0, 3), slice(0, 1), slice(1, 2), slice(2, 3)), strict=True):
 
         def predict(points, *_, channels=channels, **__):
             logits, score = blobs(points[:, 0])
@@ -115,7 +114,7 @@ def test_a_gpu_finds_what_the_cpu_finds(sam_weights, monkeypatch):
     monkeypatch.setattr(SamNetwork, "decode", decode)
     rules = MaskRules(points_per_side=5, predicted_iou=0.6, stability=0.6, region_area=15)
     cpu, gpu = (SamMasks(path, device=device, rules=rules).masks(image) for device in ("cpu", "cuda"))
-    for level in LEVELS:
+    for level in SAM_LEVELS:
         assert gpu[level].shape == cpu[level].shape
         assert float((gpu[level].cpu() != cpu[level]).float().mean()) < 1e-4  # bilinear weights are rounded otherwise
 
@@ -131,7 +130,7 @@ def test_label_maps_hold_all_levels_with_overlaps_beneath(sam_weights, monkeypat
         for i, mask in enumerate(level):
             assert torch.equal((maps == i).any(dim=0), mask)
         assert int(maps.max()) == len(level) - 1
-    assert [replace(sam, level=level).chosen for level in LEVELS] == [(0,), (1,), (2,), (3,)]
+    assert [replace(sam, level=level).chosen for level in SAM_LEVELS] == [(0,), (1,), (2,), (3,)]
     assert SamMasks(str(sam_weights / "tiny")).chosen == (3,)
     # No mask is good enough
     sam = SamMasks(str(sam_weights / "tiny"), rules=MaskRules(points_per_side=2, predicted_iou=9.0))
@@ -195,7 +194,7 @@ def test_weights_of_another_network_are_not_downloaded(empty_hub, monkeypatch, t
         (tmp_path / "config.json").write_text(json.dumps({"model_type": "edgetam_video"}))
         return str(tmp_path)
 
-    monkeypatch.setattr("normlift_ns.encoders.sam.weights.probe", lambda address: None)
+    monkeypatch.setattr("normlift_ns.segmentation.checkpoint.check_server", lambda address: None)
     monkeypatch.setattr(import_module("huggingface_hub"), "snapshot_download", download)
     refused(lambda: SamMasks("someone/edgetam").masks(noise(30, 40)), "'edgetam_video'", "'sam', ")
     assert len(asked) > 0 and all(patterns == ["config.json"] for _, patterns in asked)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
-from normlift_ns.encoders.sam import small_regions
-from normlift_ns.encoders.sam.small_regions import clean_masks
+from normlift_ns.segmentation import mask_filtering
+from normlift_ns.segmentation.mask_filtering import remove_small_regions
 from tests.encoders.tiny import DEVICES
 from tests.examples import examples
 
@@ -39,7 +39,7 @@ def clean_by_hand(mask: np.ndarray, least: int) -> tuple[list[np.ndarray], bool]
 
 def assert_right(masks: np.ndarray, least: int, device: str = "cpu") -> tuple[np.ndarray, list[bool]]:
     given = torch.from_numpy(masks).to(device)
-    cleaned, changed = clean_masks(given, least)
+    cleaned, changed = remove_small_regions(given, least)
     assert torch.equal(given.cpu(), torch.from_numpy(masks))  # is left alone
     assert cleaned.dtype == changed.dtype == torch.bool and cleaned.shape == masks.shape
     assert cleaned.device == changed.device == given.device
@@ -74,22 +74,22 @@ def test_noise_stripes_checkerboards_and_plain_masks(device):
     masks += [(y == 0) & (x == 0), (x + y) % 5 == 0, (x // 4 + y // 4) % 2 == 0, (y < 20) ^ ((y == 3) & (x > 44))]
     for least in (2, 17, 41, 48, 100):
         assert_right(np.stack(masks), least, device)
-    found, different = clean_masks(torch.zeros(0, 4, 5, dtype=torch.bool, device=device), 10)
+    found, different = remove_small_regions(torch.zeros(0, 4, 5, dtype=torch.bool, device=device), 10)
     assert found.shape == (0, 4, 5) and different.shape == (0,)
 
 
 def test_chunks_and_a_gpus_components_change_nothing(monkeypatch):
     noise = np.random.default_rng(0).random((7, 60, 45))
     masks = torch.from_numpy(ndimage.uniform_filter(noise, (0, 5, 5)) > 0.5)
-    expected = clean_masks(masks, 40)
+    expected = remove_small_regions(masks, 40)
     assert expected[1].all() and not torch.equal(expected[0], masks)
     for chunk in (1, 3 * 60 * 45):
-        monkeypatch.setitem(small_regions._CHUNK, "cpu", chunk)
-        assert all(map(torch.equal, clean_masks(masks, 40), expected))
+        monkeypatch.setitem(mask_filtering._REGION_CHUNK, "cpu", chunk)
+        assert all(map(torch.equal, remove_small_regions(masks, 40), expected))
     monkeypatch.undo()
-    turned = clean_masks(masks.permute(0, 2, 1), 40)  # another order in memory
+    turned = remove_small_regions(masks.permute(0, 2, 1), 40)  # another order in memory
     assert torch.equal(turned[0], expected[0].permute(0, 2, 1)) and torch.equal(turned[1], expected[1])
-    monkeypatch.setattr(small_regions, "_components_by_scipy", small_regions._components_by_torch)
-    assert all(map(torch.equal, clean_masks(masks, 40), expected))
+    monkeypatch.setattr(mask_filtering, "_components_by_scipy", mask_filtering._components_by_torch)
+    assert all(map(torch.equal, remove_small_regions(masks, 40), expected))
     order = torch.from_numpy(np.random.default_rng(0).permutation(3000))  # a long chain is one component
-    assert bool((small_regions._components_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())
+    assert bool((mask_filtering._components_by_torch(3000, torch.stack([order[1:], order[:-1]])) == 0).all())

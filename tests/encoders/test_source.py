@@ -2,9 +2,9 @@
 
 import torch
 
-from normlift_ns.encoders import RegionFeatures, ViewFeatures
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import Grid
+from normlift_ns.encoders.base import RegionFeatures, ViewFeatures
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.segmentation.regions import Grid
 from tests.encoders.tiny import refused
 
 UNIT = torch.nn.functional.normalize(torch.arange(1.0, 7.0).reshape(2, 3), dim=1)
@@ -43,7 +43,7 @@ def test_regions_of_cells_must_have_features():
 
 
 def test_other_images_and_texts_are_refused():
-    source = RegionFeatures(Grid(4), ColourEncoder())
+    source = RegionFeatures(Grid(4), ColorEncoder())
     byte = torch.uint8
     for image in (torch.zeros(4, 5, 4, dtype=byte), torch.zeros(4, 5, 3), torch.zeros(0, 5, 3, dtype=byte)):
         refused(lambda image=image: source.view(image, "a/b.png"), "a/b.png", "uint8", "[H, W, 3]")

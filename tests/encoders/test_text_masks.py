@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
-from normlift_ns.encoders.sam import text_masks
-from normlift_ns.encoders.sam.text_masks import Sam3Masks, Sam3Network, TextMasks
+from normlift_ns.segmentation import sam3
+from normlift_ns.segmentation.sam3 import Sam3Masks, Sam3Network, TextMasks
 from tests.encoders.test_library import photograph
 from tests.encoders.tiny import copied, refused
 from tests.encoders.tiny_library import SAM3_SIDE
@@ -37,7 +37,7 @@ def test_masks_are_those_of_transformers(written, unsure, transformers):
             with torch.no_grad():
                 out = model(**exact)
             (expected,) = processor.post_process_instance_segmentation(
-                out, threshold=text_masks.SCORE, mask_threshold=0.5, target_sizes=[size]
+                out, threshold=sam3.SCORE_THRESHOLD, mask_threshold=0.5, target_sizes=[size]
             )
             assert len(ours.scores) > 0
             torch.testing.assert_close(ours.scores.double(), expected["scores"], rtol=0, atol=2e-5)

@@ -11,11 +11,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from normlift_ns.encoders.clip import text_tower
-from normlift_ns.encoders.clip.encoder import OpenClipEncoder
-from normlift_ns.encoders.clip.text_tower import load_text_tower
+from normlift_ns.encoders import open_clip_network
+from normlift_ns.encoders.open_clip_network import OpenClipEncoder, load_text_tower
 from normlift_ns.options import SourceOptions
-from normlift_ns.text_encoders import encoder_of, encoder_settings
+from normlift_ns.query.text_encoder import encoder_settings, text_encoder_for
 from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES
 
 TEXTS = ["fox", "a red fox that sleeps under a very old tree", "ÄÖ 狐 🦊", "word " * 200, "it's 12,5 %"]
@@ -90,7 +89,7 @@ def test_a_text_that_is_new_imports_neither_torchvision_nor_transformers(tmp_pat
         save_file(model.state_dict(), tmp_path / "weights.safetensors")
     program = """
 import sys
-from normlift_ns.encoders.clip.text_tower import load_text_tower
+from normlift_ns.encoders.open_clip_network import load_text_tower
 tower = load_text_tower("ViT-S-32-alt", sys.argv[1], "{}")
 dimension = len(tower.text(["fox"])[0])
 heavy = [name for name in ("open_clip", "torchvision", "transformers", "timm", "nerfstudio") if name in sys.modules]
@@ -105,9 +104,9 @@ def test_a_question_takes_the_tower_and_open_clip_where_there_is_none(clip, monk
     options = SourceOptions(encoder_model=CLIP, encoder_pretrained=clip.pretrained)
     field: Any = SimpleNamespace(manifest={"encoder": encoder_settings(options)})
     made = []
-    real = text_tower.load_text_tower
-    monkeypatch.setattr(text_tower, "load_text_tower", lambda *a: made.append(real(*a)) or made[-1])
-    found = encoder_of(field, "auto").text(["fox"])
-    assert isinstance(made[0], text_tower.TextTower)
-    monkeypatch.setattr(text_tower, "load_text_tower", lambda *a: None)
-    assert (found - encoder_of(field, "cpu").text(["fox"])).abs().max() < 2e-6
+    real = open_clip_network.load_text_tower
+    monkeypatch.setattr(open_clip_network, "load_text_tower", lambda *a: made.append(real(*a)) or made[-1])
+    found = text_encoder_for(field, "auto").text(["fox"])
+    assert isinstance(made[0], open_clip_network.TextTower)
+    monkeypatch.setattr(open_clip_network, "load_text_tower", lambda *a: None)
+    assert (found - text_encoder_for(field, "cpu").text(["fox"])).abs().max() < 2e-6

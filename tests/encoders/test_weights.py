@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from normlift_ns.encoders.clip.weights import check_names
-from normlift_ns.encoders.sam.weights import check_sam
-from normlift_ns.encoders.weights import clip_weights_at_hand, is_cached, sam_weights_at_hand
+from normlift_ns.encoders.open_clip import check_open_clip_names
+from normlift_ns.encoders.registry import has_local_clip_weights, has_local_sam_weights, is_in_hub_cache
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, DEFAULT_SAM
+from normlift_ns.segmentation.checkpoint import check_sam_checkpoint
 from tests.encoders.tiny import refused
 
 REPOSITORY = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -27,46 +27,46 @@ def put(hub: Path, repository: str, file: str, content: bytes = b"") -> None:
 
 
 def test_weights_of_openclip(empty_hub: Path, tmp_path: Path) -> None:
-    assert clip_weights_at_hand(DEFAULT_MODEL, DEFAULT_PRETRAINED) is False
+    assert has_local_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED) is False
     put(empty_hub, REPOSITORY, "README.md")
-    assert clip_weights_at_hand(DEFAULT_MODEL, DEFAULT_PRETRAINED) is False
+    assert has_local_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED) is False
     put(empty_hub, REPOSITORY, "open_clip_model.safetensors")
-    assert clip_weights_at_hand(DEFAULT_MODEL, DEFAULT_PRETRAINED) is True
-    assert clip_weights_at_hand(DEFAULT_MODEL, DEFAULT_PRETRAINED.replace("_", "-")) is True
+    assert has_local_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED) is True
+    assert has_local_clip_weights(DEFAULT_MODEL, DEFAULT_PRETRAINED.replace("_", "-")) is True
     put(empty_hub, "jienengchen/ViTamin-S", "pytorch_model.bin")
-    assert clip_weights_at_hand("ViTamin-S", "datacomp1b") is True
+    assert has_local_clip_weights("ViTamin-S", "datacomp1b") is True
     (tmp_path / "my.pt").touch()
-    assert clip_weights_at_hand("whatever", str(tmp_path / "my.pt")) is True
+    assert has_local_clip_weights("whatever", str(tmp_path / "my.pt")) is True
     for model, tag in (("nothing", "x"), (DEFAULT_MODEL, "x"), (DEFAULT_MODEL, "a\0b"), ("", "")):
-        assert clip_weights_at_hand(model, tag) is None, "cannot be told"
+        assert has_local_clip_weights(model, tag) is None, "cannot be told"
 
 
 def test_all_published_weights_are_known(empty_hub: Path, open_clip: Any) -> None:
     """The table is read from open_clip's source: this fails where another release writes it in another way."""
     published = open_clip.list_pretrained()
     assert len(published) > 100
-    assert all(clip_weights_at_hand(model, tag) is False for model, tag in published[::9])
+    assert all(has_local_clip_weights(model, tag) is False for model, tag in published[::9])
 
 
 def test_weights_of_sam_and_a_broken_cache(empty_hub: Path, tmp_path: Path) -> None:
     for file in ("config.json", "model.safetensors"):
-        assert not sam_weights_at_hand(DEFAULT_SAM)
+        assert not has_local_sam_weights(DEFAULT_SAM)
         put(empty_hub, DEFAULT_SAM, file)
-    assert sam_weights_at_hand(DEFAULT_SAM)
-    assert sam_weights_at_hand(str(tmp_path))
-    assert not sam_weights_at_hand("a/b")
+    assert has_local_sam_weights(DEFAULT_SAM)
+    assert has_local_sam_weights(str(tmp_path))
+    assert not has_local_sam_weights("a/b")
     # A broken cache holds nothing
     put(empty_hub, REPOSITORY, "config.json")
-    assert is_cached(REPOSITORY, "config.json")
+    assert is_in_hub_cache(REPOSITORY, "config.json")
     for content in (b"\xff\xfe", b"a\0b", b"x" * 5000, b""):
         (empty_hub / f"models--{REPOSITORY.replace('/', '--')}" / "refs" / "main").write_bytes(content)
-        assert not is_cached(REPOSITORY, "config.json")
+        assert not is_in_hub_cache(REPOSITORY, "config.json")
 
 
 def test_imports_stay_light() -> None:
     code = """
 import sys
-from normlift_ns.encoders.weights import clip_weights_at_hand
+from normlift_ns.encoders.registry import clip_weights_at_hand
 clip_weights_at_hand("ViT-B-16", "laion2b_s34b_b88k")
 assert {"torch", "open_clip", "transformers", "numpy", "skimage"}.isdisjoint(sys.modules), sys.modules.keys()
 """
@@ -76,5 +76,5 @@ assert {"torch", "open_clip", "transformers", "numpy", "skimage"}.isdisjoint(sys
 def test_what_is_no_weight_file_is_never_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.pt")
     for path in (tmp_path / "a.pt", tmp_path):
-        refused(lambda path=path: check_names(DEFAULT_MODEL, str(path)), f"{path} is not a weight file")
-    refused(lambda: check_sam(str(tmp_path / "a.pt")), str(tmp_path / "a.pt"), "neither a file nor a folder")
+        refused(lambda path=path: check_open_clip_names(DEFAULT_MODEL, str(path)), f"{path} is not a weight file")
+    refused(lambda: check_sam_checkpoint(str(tmp_path / "a.pt")), str(tmp_path / "a.pt"), "neither a file nor a folder")

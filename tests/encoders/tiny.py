@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from normlift_ns.encoders.clip.weights import import_open_clip
+from normlift_ns.encoders.open_clip import import_open_clip
 from normlift_ns.errors import InputError
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")

@@ -15,15 +15,23 @@ from torch.nn.functional import normalize
 
 from normlift_ns import Camera, InputError, LiftOptions, RasterSettings, SourceOptions, rasterize_evidence
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.evaluation.baselines import BASELINES, TOP, VISIBLE, baseline_field, seen_blocks, with_consensus
-from normlift_ns.evaluation.dense import dense_sums, feature_maps, why_not_timed
+from normlift_ns.evaluation.baselines import (
+    BASELINES,
+    TOP,
+    VISIBLE,
+    baseline_field,
+    dense_sums,
+    feature_maps,
+    lifted_batches,
+    timing_obstacle,
+    with_consensus,
+)
+from normlift_ns.evaluation.options import Evaluation
 from normlift_ns.evaluation.protocols import EvaluatedRun
-from normlift_ns.evaluation.results import Evaluation
-from normlift_ns.evaluation.studies import study_ablation, timing
-from normlift_ns.evaluation.votes import voting_scalars
-from normlift_ns.lifting import lift_scene
-from normlift_ns.observing import of_regions
-from normlift_ns.raster.backend import Job
+from normlift_ns.evaluation.studies import study_ablation, study_timing, voting_scalars
+from normlift_ns.evidence_collection import cells_to_regions
+from normlift_ns.pipeline import lift_scene
+from normlift_ns.rasterization.backend import RasterJob
 from tests.scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40
@@ -47,7 +55,7 @@ def observations(lifted: EvaluatedRun) -> list[tuple[Camera, Tensor, Tensor]]:
     """Per view: the camera, A [N, P] in float64, and the feature of every pixel [P, D], 0 without a region."""
     found = []
     pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.int32).view(HEIGHT, WIDTH)
-    for block in seen_blocks(lifted, "cpu"):
+    for block in lifted_batches(lifted, "cpu"):
         for camera, features in zip(block.cameras, feature_maps(block, "cpu")):
             weights = rasterize_evidence(lifted.scene.gaussians, [camera], [pixels]).rows
             found.append((camera, dense(weights, HEIGHT * WIDTH).double(), features.flatten(0, 1).double()))
@@ -115,10 +123,10 @@ def test_ideas_are_their_sums_over_pixels(lifted):
 
 
 def test_the_views_are_those_of_the_lift(lifted):
-    cameras = [camera for block in seen_blocks(lifted, "cpu") for camera in block.cameras]
+    cameras = [camera for block in lifted_batches(lifted, "cpu") for camera in block.cameras]
     every = list(map(id, lifted.scene.train.cameras))
     assert [every.index(id(camera)) for camera in cameras] == [0, 1, 3, 4]
-    few = [camera for block in seen_blocks(lifted, "cpu", most=2) for camera in block.cameras]
+    few = [camera for block in lifted_batches(lifted, "cpu", most=2) for camera in block.cameras]
     assert [every.index(id(camera)) for camera in few] == [0, 4]
 
 
@@ -207,14 +215,14 @@ def test_channels_through_gsplat_are_the_sums_of_evidence_and_are_timed(lifted):
     if not compiled_gsplat():
         pytest.skip("gsplat's compiled part is missing")
     scene = lifted.scene.gaussians.to("cuda")
-    job = Job(scene, False, RasterSettings(), torch.float32)
-    for block in seen_blocks(lifted, "cuda"):
+    job = RasterJob(scene, False, RasterSettings(), torch.float32)
+    for block in lifted_batches(lifted, "cuda"):
         found = dense_sums(job, block.cameras, feature_maps(block, "cuda"), block.features[0].shape[1])
         counts = [regions.shape[1] for regions in block.regions]
         cells = rasterize_evidence(scene, block.cameras, block.labels, num_regions=counts)
-        expected = of_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
+        expected = cells_to_regions(cells, block).rows.matmul(torch.cat(block.features).cuda())
         assert torch.allclose(found, expected.float(), rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
-    (row,) = timing([lifted], "cuda")
+    (row,) = study_timing([lifted], "cuda")
     assert row["timed_views"] == 4
     assert row["dense512_over_evidence_lift"] == pytest.approx(row["dense512_s"] / row["evidence_lift_s"])
     assert row["dense512_all_views_s"] == row["dense512_s"] > 0  # all four
@@ -231,13 +239,13 @@ def test_ideas_are_the_same_on_a_gpu(lifted):
 
 def test_what_is_left_out_is_said(lifted):
     told = []
-    (row,) = timing([lifted], "cpu", told.append)
+    (row,) = study_timing([lifted], "cpu", told.append)
     assert "dense512_s" not in row
     assert row["total_s"] == pytest.approx(sum(value for key, value in row.items() if key.endswith("_s")) / 2)
-    assert len(told) == 1 and why_not_timed(lifted, "cpu") in told[0] and "--device cpu" in told[0]
+    assert len(told) == 1 and timing_obstacle(lifted, "cpu") in told[0] and "--device cpu" in told[0]
     cost = {key: value for key, value in lifted.field.manifest["cost"].items() if key != "store_s"}
     older = changed(lifted, cost=cost)
-    table = timing([lifted, older], "cpu")
+    table = study_timing([lifted, older], "cpu")
     assert [row["scene"] for row in table] == ["made", "made", "mean"]
     assert table[2]["store_s"] == lifted.field.manifest["cost"]["store_s"]  # the other does not say
 
@@ -247,7 +255,7 @@ def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
     seen = observations(lifted)[:2]
     weights = iter([weights for _, weights, _ in seen])
 
-    def project_views(job: Job, cameras: list[Camera]) -> SimpleNamespace:
+    def project_views(job: RasterJob, cameras: list[Camera]) -> SimpleNamespace:
         return SimpleNamespace(means2d=None, conics=None, opacities=None, offsets=None, members=next(weights))
 
     def backward(*given: Any) -> tuple[Any, ...]:
@@ -255,14 +263,14 @@ def test_channels_are_lifted_some_at_a_time(lifted, monkeypatch):
         assert gradient.shape == (1, HEIGHT, WIDTH, 32)
         return None, None, None, (given[10] @ gradient.flatten(0, 2))[None]
 
-    monkeypatch.setattr("normlift_ns.evaluation.dense.project_views", project_views)
+    monkeypatch.setattr("normlift_ns.evaluation.baselines.project_views", project_views)
     monkeypatch.setattr(
-        "normlift_ns.evaluation.dense.compiled_rasterizer",
+        "normlift_ns.evaluation.baselines.compiled_rasterizer",
         lambda: (lambda *drawing: (None, torch.zeros(1, HEIGHT, WIDTH, 1), None), backward),
     )
     g = generator(0)
     maps = [torch.rand(HEIGHT, WIDTH, 45, generator=g, dtype=torch.float64) for _ in seen]
-    job = Job(lifted.scene.gaussians, False, RasterSettings(), torch.float32)
+    job = RasterJob(lifted.scene.gaussians, False, RasterSettings(), torch.float32)
     found = dense_sums(job, [camera for camera, _, _ in seen], maps, 45)
     expected = sum(w @ features.flatten(0, 1) for (_, w, _), features in zip(seen, maps))
     assert torch.allclose(found.double(), expected, rtol=1e-5, atol=1e-5)

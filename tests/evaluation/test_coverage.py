@@ -18,11 +18,17 @@ from normlift_ns import Camera, GaussianScene, SemanticField, lift, rasterize_ev
 from normlift_ns.core.scene import camera_summary
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.coverage import gain, photographs, poses
-from normlift_ns.evaluation.coverage.gain import FAINT, Known, choose_views, gains
-from normlift_ns.evaluation.coverage.photographs import lifted_names
-from normlift_ns.evaluation.coverage.study import Coverage, coverage_of
-from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.evaluation import coverage
+from normlift_ns.evaluation.coverage import (
+    FAINT,
+    Coverage,
+    ReliabilityModel,
+    choose_views,
+    coverage_of,
+    gains,
+    lifted_names,
+)
+from normlift_ns.rasterization.settings import RasterSettings
 from tests.scenes import Photographs, generator, made_scene
 
 NONE = Photographs([], [])
@@ -115,7 +121,7 @@ def test_photographs_of_the_other_side_come_first(monkeypatch):
     photographs_ = coverage_of(scene, lifted(scene, [0, 1])).photographs
     assert {photograph.name for photograph in photographs_[:2]} <= {"4.png", "5.png", "6.png", "7.png", "h.png"}
     assert photographs_[0].gain > 3 * photographs_[-1].gain
-    monkeypatch.setattr(photographs, "MOST_VIEWS", 2)  # of more, some are looked at
+    monkeypatch.setattr(coverage, "MAX_IMAGES", 2)  # of more, some are looked at
     found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert {photograph.name for photograph in found.photographs} == {"4.png", "h.png"}
     assert any("5" in remark and "2" in remark for remark in found.remarks)
@@ -131,7 +137,7 @@ def test_scale_of_the_pictures_does_not_matter(one_side):
     assert [photograph.gain for photograph in one] == pytest.approx([photograph.gain for photograph in other])
 
 
-def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[Known, SparseRows, Tensor]:
+def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[ReliabilityModel, SparseRows, Tensor]:
     g = generator(seed)
     dense = torch.rand(n, views, generator=g, dtype=torch.float64) * (torch.rand(n, views, generator=g) < 0.6)
     before = torch.rand(n, 3, generator=g, dtype=torch.float64) * (torch.rand(n, 3, generator=g) < 0.5)
@@ -139,10 +145,14 @@ def random_case(seed: int, n: int = 7, views: int = 5) -> tuple[Known, SparseRow
     norm = torch.rand(n, generator=g, dtype=torch.float64)
     row, column = dense.nonzero(as_tuple=True)
     sparse = SparseRows.from_coo(row, column, dense[row, column], n)
-    return Known(norm, before.sum(1), (before**2).sum(1), surface, 0.7), sparse, torch.cat([before, dense], 1)
+    return (
+        ReliabilityModel(norm, before.sum(1), (before**2).sum(1), surface, 0.7),
+        sparse,
+        torch.cat([before, dense], 1),
+    )
 
 
-def looped(known: Known, columns: Tensor, view: int, chosen: list[int]) -> float:
+def looped(known: ReliabilityModel, columns: Tensor, view: int, chosen: list[int]) -> float:
     """The gain by the formula, one Gaussian after the other."""
     total = 0.0
     for j in range(len(known.norm)):
@@ -175,11 +185,11 @@ def test_gains_are_those_of_a_loop():
 
 
 def test_similar_views_gain_little_after_each_other_and_faint_ones_nothing():
-    def case(norms: int, columns: list[list[float]]) -> tuple[Known, SparseRows]:
+    def case(norms: int, columns: list[list[float]]) -> tuple[ReliabilityModel, SparseRows]:
         ones, zeros = torch.ones(norms, dtype=torch.float64), torch.zeros(norms, dtype=torch.float64)
         row, column, weight = (torch.tensor(part) for part in zip(*columns))
         sparse = SparseRows.from_coo(row.long(), column.long(), weight.double(), norms)
-        return Known(ones, zeros, zeros, ones, beta=1.0), sparse
+        return ReliabilityModel(ones, zeros, zeros, ones, beta=1.0), sparse
 
     known, views = case(2, [[0, 0, 1.0], [0, 1, 1.0], [1, 2, 0.9]])
     assert [view for view, _ in choose_views(known, views, 3, 3)] == [0, 2, 1]
@@ -190,8 +200,8 @@ def test_similar_views_gain_little_after_each_other_and_faint_ones_nothing():
 
 def test_weights_are_shares_of_the_picture():
     scene = wall()
-    drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
-    small, large = (gain.view_weights(drawn, scene.train.cameras, pixels=pixels) for pixels in (1728, 10**9))
+    drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
+    small, large = (coverage.view_weights(drawn, scene.train.cameras, pixels=pixels) for pixels in (1728, 10**9))
     share = float(large.row_sums().sum())
     assert small.row_sums().sum() == pytest.approx(share, rel=0.1)  # the blur of a pixel is wider in the small one
     assert 0.1 < share / 8 < 1
@@ -255,8 +265,8 @@ def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
     found = coverage_of(scene, lifted(scene, [0, 1, 2, 3]))
     assert 1 <= len(found.poses) <= 5
     pose = found.poses[0]
-    drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
-    seen = gain.view_weights(drawn, [pose.camera, aslant]).select_rows(torch.arange(SIDE * SIDE, 2 * SIDE * SIDE))
+    drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
+    seen = coverage.view_weights(drawn, [pose.camera, aslant]).select_rows(torch.arange(SIDE * SIDE, 2 * SIDE * SIDE))
     whole, slanted = (float(seen.weight[seen.column == view].sum()) for view in (0, 1))
     assert whole > 0.05  # share of the picture
     assert whole > 0.5 * slanted
@@ -272,8 +282,8 @@ def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
 
 def test_free_places():
     scene = wall()
-    drawn = gain.Drawn(scene.gaussians, "classic", RasterSettings(), 1)
-    space = poses.space_of(drawn, scene.train.cameras[:4])
+    drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
+    space = coverage.free_space(drawn, scene.train.cameras[:4])
     assert space.up.tolist() == pytest.approx([0, 0, 1], abs=0.1)
     assert space.depth == pytest.approx(2.85, abs=0.1)
     assert space.spacing == pytest.approx(0.6)
@@ -331,11 +341,11 @@ def test_poses_and_pictures_are_written(one_side, tmp_path, monkeypatch):
 
 
 def test_the_reliability_is_drawn_over_the_gray_image(tmp_path):
-    from normlift_ns.evaluation.coverage.files import Picture, save_picture  # noqa: PLC0415 (imports matplotlib)
+    from normlift_ns.evaluation.coverage import PoseRender, save_pose_render  # noqa: PLC0415 (imports matplotlib)
 
     image = torch.zeros(20, 30, 3, dtype=torch.uint8)
     image[:, 20:] = 160
-    save_picture(tmp_path / "a.png", "title", Picture(image, torch.full((20, 30), torch.nan)))
+    save_pose_render(tmp_path / "a.png", "title", PoseRender(image, torch.full((20, 30), torch.nan)))
     drawn = np.asarray(Image.open(tmp_path / "a.png").convert("L"))
     row = drawn[drawn.shape[0] // 2, drawn.shape[1] // 2 : -drawn.shape[1] // 8]  # without the color bar
     assert (row == 0).sum() / (row == 160).sum() == pytest.approx(2, abs=0.5)  # frames are black too
@@ -343,7 +353,7 @@ def test_the_reliability_is_drawn_over_the_gray_image(tmp_path):
 
 def test_a_camera_that_looks_straight_down():
     up = torch.tensor([0.0, 0, 1]).double()
-    down = poses.look_at(2 * up, torch.zeros(3).double(), up, looking((1.0, 0, 0)))
+    down = coverage.look_at(2 * up, torch.zeros(3).double(), up, looking((1.0, 0, 0)))
     there = down.world_to_camera @ torch.tensor([0.0, 0, 0, 1])
     assert there.tolist() == pytest.approx([0, 0, 2, 1], abs=1e-6)
 

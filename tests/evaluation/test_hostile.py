@@ -16,10 +16,10 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
-from normlift_ns.encoders.regions import LabelFiles
-from normlift_ns.evaluation.instance_masks import read_classes, read_names
-from normlift_ns.evaluation.lerf_labels import read_frame
+from normlift_ns.evaluation.lerf import read_frame
+from normlift_ns.evaluation.protocols import read_classes, read_names
 from normlift_ns.evaluation.scannet import read_labels
+from normlift_ns.segmentation.regions import LabelFiles
 from tests.hostile import VALUES, damaged, fuzz, hostile_json, no_files, survives
 
 SQUARE = [[2.0, 3], [7, 3], [7, 8], [2, 8]]

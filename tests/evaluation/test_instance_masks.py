@@ -10,9 +10,9 @@ from PIL import Image
 
 from normlift_ns import Evidence
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.encoders.regions import LabelFiles
-from normlift_ns.evaluation.instance_masks import evaluate_masks, gaussian_truth, read_classes, read_names
-from normlift_ns.evaluation.results import Evaluation, write_evaluation
+from normlift_ns.evaluation.options import Evaluation, write_evaluation
+from normlift_ns.evaluation.protocols import evaluate_masks, gaussian_truth, read_classes, read_names
+from normlift_ns.segmentation.regions import LabelFiles
 
 
 def test_names_join_equal_classes(tmp_path):

@@ -8,8 +8,18 @@ import pytest
 import torch
 
 from normlift_ns.errors import InputError
-from normlift_ns.evaluation.lerf import FrameScores, box_filtered, found_mask, frame_rows, in_boxes, summarize_lerf
-from normlift_ns.evaluation.lerf_labels import LabeledFrame, match_views, read_frame, read_frames
+from normlift_ns.evaluation.lerf import (
+    FrameScores,
+    LabeledFrame,
+    box_filtered,
+    frame_rows,
+    in_boxes,
+    match_views,
+    prompt_mask,
+    read_frame,
+    read_frames,
+    summarize_lerf,
+)
 
 
 def write_frame(folder, stem, objects, width=40, height=30):
@@ -109,10 +119,10 @@ def test_the_majority_is_langsplats_up_to_the_border():
         scaled = (relevancy - relevancy.min()) / (relevancy - relevancy.min()).max()
         expected = smoothed(2 * scaled - 1 > 0.4)
         none = relevancy[..., None][..., :0]
-        assert torch.equal(found_mask(relevancy, none, "langsplat", margin=0, instances=1), expected)
+        assert torch.equal(prompt_mask(relevancy, none, "langsplat", margin=0, instances=1), expected)
     inside = torch.zeros(20, 20)
     inside[-2:] = 1.0
-    assert not found_mask(inside, none, "langsplat", margin=0, instances=1)[-3].any()
+    assert not prompt_mask(inside, none, "langsplat", margin=0, instances=1)[-3].any()
 
 
 def test_two_empty_masks():

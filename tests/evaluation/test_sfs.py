@@ -16,8 +16,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from normlift_ns.evaluation.lerf import found_mask
-from normlift_ns.evaluation.sfs import cleaned, histogram_threshold
+from normlift_ns.evaluation.lerf import clean_mask, histogram_threshold, prompt_mask
 
 CHANNELS = 9
 """Of the maps that SFS's code looks at: a prompt and eight background words, side by side in memory."""
@@ -109,12 +108,12 @@ def test_thresholds_and_cleaning_are_those_of_sfs():
     for name, values in maps():
         score = in_memory(values)
         for instances, selected in expected["thresholds"][name].items():
-            found = found_mask(score, score[:, :, None][:, :, :0], "auto", margin=0, instances=int(instances))
+            found = prompt_mask(score, score[:, :, None][:, :, :0], "auto", margin=0, instances=int(instances))
             assert selected is None or summary(found.numpy()) == selected, (name, instances)
         names.append(name)
     assert names == list(expected["thresholds"])
     for name, mask in shapes():
-        assert summary(cleaned(torch.from_numpy(mask)).numpy()) == expected["cleaned"][name], name
+        assert summary(clean_mask(torch.from_numpy(mask)).numpy()) == expected["cleaned"][name], name
 
 
 def test_thresholds_by_hand():
@@ -134,7 +133,7 @@ def test_a_constant_map_selects_everything():
     for value in (0.3, 0.1, -0.7, 0.0, 1e-30):
         for size in ((1, 1), (10, 10), (300, 301)):
             score = torch.full(size, value)
-            assert found_mask(score, score[..., None][..., :0], "auto", margin=0, instances=1).all(), (value, size)
+            assert prompt_mask(score, score[..., None][..., :0], "auto", margin=0, instances=1).all(), (value, size)
 
 
 def test_more_pixels_than_torch_takes_quantiles_of():

@@ -11,9 +11,16 @@ from scipy import stats
 
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.metrics import NO_CLASS
-from normlift_ns.evaluation.signals import SceneSignals, signals
-from normlift_ns.evaluation.studies import POOLED, signal_rows
-from normlift_ns.evaluation.votes import BETA, SWEEPS, own_vote, sweeps
+from normlift_ns.evaluation.studies import (
+    BETA,
+    POOLED_SCENE,
+    SWEEPS,
+    SceneSignals,
+    recorded_vote,
+    signal_rows,
+    signal_statistics,
+    sweeps,
+)
 from normlift_ns.options import RefineConfig
 from tests.scenes import generator
 
@@ -34,7 +41,7 @@ def scene(seed: int, n: int = 400) -> SceneSignals:
 
 def test_groups_name_refined_and_unrefined_answers():
     one = scene(0)
-    found, zero = signals(one), one.scalars.reliability == 0
+    found, zero = signal_statistics(one), one.scalars.reliability == 0
     counted = one.truth != NO_CLASS
     for name, group in (("zero", zero), ("seen", ~zero), ("all", zero | ~zero)):
         chosen = (group & counted).nonzero().squeeze(1).tolist()
@@ -48,7 +55,7 @@ def test_groups_name_refined_and_unrefined_answers():
 
 def test_correlations_are_of_all_gaussians_with_their_p_values():
     one = scene(1, n=30_000)  # of which 20,000 have R > 0
-    found, seen = signals(one), one.scalars.reliability > 0
+    found, seen = signal_statistics(one), one.scalars.reliability > 0
     r, o = (x[seen].double().numpy() for x in (one.scalars.reliability, one.opacity))
     for name, expected in (("spearman", stats.spearmanr(r, o)), ("kendall", stats.kendalltau(r, o))):
         assert found[f"opacity.{name}"] == pytest.approx(expected.statistic, abs=1e-12)
@@ -59,7 +66,7 @@ def test_correlations_are_of_all_gaussians_with_their_p_values():
 def test_scenes_are_pooled_gaussian_by_gaussian():
     scenes = [scene(2, n=300), scene(3, n=900)]
     rows = signal_rows(["a", "b"], scenes)
-    assert [row["scene"] for row in rows] == ["a", "b", POOLED]
+    assert [row["scene"] for row in rows] == ["a", "b", POOLED_SCENE]
     of_a, of_b, pooled = rows
     assert pooled["zero.share"] == pytest.approx((300 * of_a["zero.share"] + 900 * of_b["zero.share"]) / 1200)
     r = torch.cat([s.scalars.reliability for s in scenes])
@@ -71,15 +78,15 @@ def test_scenes_are_pooled_gaussian_by_gaussian():
 
 def test_without_a_truth_there_are_no_accuracies():
     one = scene(4)
-    found = signals(SceneSignals(one.scalars, one.opacity))
+    found = signal_statistics(SceneSignals(one.scalars, one.opacity))
     assert not any("accuracy" in key or "bin" in key for key in found)
     assert math.isfinite(found["opacity.kendall_p"])
-    assert not any("accuracy" in key for key in signals(one, SceneSignals(one.scalars, one.opacity)))
+    assert not any("accuracy" in key for key in signal_statistics(one, SceneSignals(one.scalars, one.opacity)))
 
 
 def test_sweeps_contain_and_mark_the_default_and_the_run():
     config = replace(RefineConfig(), k=17, tau=0.123)
-    own = own_vote({"options": {"beta": 3.5, "vote": vars(config)}})
+    own = recorded_vote({"options": {"beta": 3.5, "vote": vars(config)}})
     labels = [each[0].label for each in sweeps([own])]
     for parameter, values in SWEEPS.items():
         some = [label for label in labels if label["parameter"] == parameter]
@@ -91,7 +98,7 @@ def test_sweeps_contain_and_mark_the_default_and_the_run():
 
 
 def test_runs_lifted_differently_are_swept_over_the_same_values():
-    owns = [own_vote({"options": {"vote": vars(replace(RefineConfig(), sigma_d=s))}}) for s in (0.77, 1.33)]
+    owns = [recorded_vote({"options": {"vote": vars(replace(RefineConfig(), sigma_d=s))}}) for s in (0.77, 1.33)]
     every = list(sweeps(owns))
     of_sigma = [each for each in every if each[0].label["parameter"] == "sigma_d"]
     assert {0.77, 1.33} <= {each[0].label["value"] for each in of_sigma}
@@ -101,7 +108,7 @@ def test_runs_lifted_differently_are_swept_over_the_same_values():
 
 
 def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
-    from normlift_ns.evaluation.plots import plot_sweeps, sweeps_figure  # noqa: PLC0415
+    from normlift_ns.evaluation.studies import plot_sweeps, sweeps_figure  # noqa: PLC0415
 
     rows = [{"parameter": "$\\frac{$", "value": x, "$\\frac{$": x} for x in (1.0, 2.0)]  # not mathematics
     plot_sweeps(rows, "$\\frac{$", "$\\frac{$", tmp_path / "a.svg")
@@ -120,7 +127,7 @@ def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
 
 
 def test_every_scene_has_its_signals_drawn():
-    from normlift_ns.evaluation.plots import signals_figure  # noqa: PLC0415
+    from normlift_ns.evaluation.studies import signals_figure  # noqa: PLC0415
 
     one = {"zero.share": 0.5, "histogram.0.00": 0.2, "histogram.0.50": 0.3}
     rows = [{"scene": "a$", **one, "reliability.bin1": 0.1, "reliability.bin2": 0.9}, {"scene": "b", **one}]

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.captures import SHARED
 from benchmarks.plain_room import plain_room
-from normlift_ns.demo import write_capture, write_splatfacto_run
+from normlift_ns.demo.capture import write_capture, write_splatfacto_run
 from tests.captures import needs_shared
 from tests.golden.summary import compare, run_commands, summarize
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import GaussianScene, InputError
+from normlift_ns.analysis.objects import find_floaters
 from normlift_ns.core.lift import Scalars
-from normlift_ns.insight.floaters import find_floaters
-from normlift_ns.options import FLOATER_LIMIT
+from normlift_ns.options import FLOATER_THRESHOLD
 from tests.examples import examples
 from tests.scenes import generator
 
@@ -71,7 +71,7 @@ def test_what_is_never_drawn_is_no_floater_and_nobodys_neighbour():
 
 def test_limits_and_lifts_that_do_not_fit():
     scene, known = wall_and_specks(0)
-    assert find_floaters(scene, known, limit=100).mask.sum() == 0 < FLOATER_LIMIT
+    assert find_floaters(scene, known, limit=100).mask.sum() == 0 < FLOATER_THRESHOLD
     for other, limit, hint in ((known, float("nan"), "floater_limit"), (scalars(torch.ones(3)), 1.0, "3 .* 405")):
         with pytest.raises(InputError, match=hint):
             find_floaters(scene, other, limit=limit)

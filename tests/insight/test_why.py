@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, InputError, lift
+from normlift_ns.analysis.explain import Why, draw_outlines, explain_selection
 from normlift_ns.core.evidence import Entries
-from normlift_ns.insight.outline import outlined
-from normlift_ns.insight.why import Why, explain_selection
 from tests.examples import examples
 from tests.scenes import generator, unit_rows
 
@@ -137,7 +136,7 @@ def test_an_outline_lies_within_and_around_its_region():
     masks = torch.zeros(2, 200, 640, dtype=torch.bool)
     masks[0, 50:100, 100:300] = True
     masks[1, 150:, :50] = True  # reaches the border of the picture
-    shown = outlined(image, masks)
+    shown = draw_outlines(image, masks)
     line = (shown == torch.tensor([255, 176, 0], dtype=torch.uint8)).all(dim=2)
     assert bool(masks.any(0)[line].all())
     assert line[50:52, 100:300].all()  # two pixels wide at 640
@@ -145,4 +144,4 @@ def test_an_outline_lies_within_and_around_its_region():
     assert line[198:, :50].all()
     assert (shown[75, 200] == 100).all()
     assert (shown[10, 10] == 45).all()
-    assert torch.equal(outlined(image, masks[:0]), torch.full_like(image, 45))
+    assert torch.equal(draw_outlines(image, masks[:0]), torch.full_like(image, 45))

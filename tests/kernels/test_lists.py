@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Camera, GaussianScene, RasterSettings
-from normlift_ns.raster import triton
-from normlift_ns.raster.backend import Batch, Job
-from normlift_ns.raster.projection import assign_tiles, camera_depths, project, to_world
+from normlift_ns.rasterization import triton
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.projection import assign_tiles, camera_depths, prepare_gaussians, project
 from tests.examples import examples
 from tests.kernels.test_regions import DEVICE, NEEDLES, hard_scene
 from tests.scenes import generator, orbit, random_labels, random_scene
@@ -19,8 +19,8 @@ RULES = ("1.4", "1.5", "1.6")
 
 
 def see(scene, cameras, rules="1.4", antialiased=False, cull=True):
-    job = Job(scene.to(DEVICE), antialiased, RasterSettings.of_gsplat(rules), torch.float32)
-    grid, seen, lists = triton.see(job, cameras, cull=cull)
+    job = RasterJob(scene.to(DEVICE), antialiased, RasterSettings.of_gsplat(rules), torch.float32)
+    grid, seen, lists = triton.project_and_bin(job, cameras, cull=cull)
     return grid, *(type(x)(*(y.cpu() for y in x)) for x in (seen, lists))
 
 
@@ -45,7 +45,7 @@ def test_lists_are_those_of_the_reference(kind, antialiased, rules, monkeypatch)
     constants = RasterSettings.of_gsplat(rules)
     bounds = lists.offsets.tolist()
     for view, camera in enumerate(cameras):
-        projected = project(to_world(scene, torch.float32), camera, constants, antialiased)
+        projected = project(prepare_gaussians(scene, torch.float32), camera, constants, antialiased)
         tiles = assign_tiles(projected, camera.width, camera.height, constants.tile_size)
         faint = projected.opacities < constants.min_alpha  # no pixel draws them
         for tile in range(grid.cells):
@@ -98,8 +98,8 @@ def test_leaving_cells_out_changes_no_bit(seed, rules, antialiased):
     scene = wild_scene(seed)
     cameras = orbit(1, width=20, height=18)
     labels = [random_labels(cameras[0], 3, seed=seed).to(DEVICE)]
-    job = Job(scene.to(DEVICE), antialiased, RasterSettings.of_gsplat(rules), torch.float32)
-    found, whole = (triton.views_evidence(job, Batch(cameras, labels, [3]), cull=cull) for cull in (True, False))
+    job = RasterJob(scene.to(DEVICE), antialiased, RasterSettings.of_gsplat(rules), torch.float32)
+    found, whole = (triton.views_evidence(job, RasterBatch(cameras, labels, [3]), cull=cull) for cull in (True, False))
     for ours, theirs in zip(found[:3], whole[:3]):
         assert torch.equal(ours, theirs)
 
@@ -126,8 +126,8 @@ def test_an_empty_scene_and_an_empty_view():
     for scene in (empty, far):
         grid, seen, lists = see(scene, [camera])
         assert (len(seen.seen), len(lists.members), len(lists.offsets)) == (0, 0, grid.cells + 1)
-        job = Job(scene.to(DEVICE), False, RasterSettings(), torch.float32)
-        entries = triton.views_evidence(job, Batch([camera], [random_labels(camera, 3).to(DEVICE)], [3]))
+        job = RasterJob(scene.to(DEVICE), False, RasterSettings(), torch.float32)
+        entries = triton.views_evidence(job, RasterBatch([camera], [random_labels(camera, 3).to(DEVICE)], [3]))
         assert len(entries.weight) == 0
         image, alpha = triton.composite(job, camera, torch.ones(len(scene), 2, device=DEVICE))
         assert image.shape == (camera.height, camera.width, 2)

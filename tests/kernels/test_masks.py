@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from normlift_ns.encoders.sam.network import taps
-from normlift_ns.encoders.sam.rules import measured
-from normlift_ns.kernels.masks import measure_masks
+from normlift_ns.kernels.sam import measure_masks
+from normlift_ns.segmentation.mask_filtering import measure_logits
+from normlift_ns.segmentation.sam import bilinear_weights
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 CLOSE = 1e-5
@@ -37,11 +37,11 @@ def test_equals_masks_that_are_made(side, scaled, size, dtype):
     logits = smooth(7, side // 4).to(dtype)
     logits[-1] = -5.0  # an empty mask
     logits[-2] = 5.0  # a full one
-    rows, columns = (taps(side // 4, side, s, n) for s, n in zip(scaled, size))
+    rows, columns = (bilinear_weights(side // 4, side, s, n) for s, n in zip(scaled, size))
     low, *weights = (x.to(DEVICE) for x in (logits, *rows, *columns))
     inner, outer, boxes = measure_masks(low, *weights, offset=1.0)
     large = enlarged(logits, side, scaled, size)
-    expected = measured(large, 1.0)
+    expected = measure_logits(large, 1.0)
     close = CLOSE * float(large.abs().max())
     for found, exact, bound in ((inner, expected.inner, 1.0), (outer, expected.outer, -1.0)):
         undecided = ((large - bound).abs() < close).flatten(1).sum(dim=1)
@@ -57,7 +57,7 @@ def test_equals_masks_that_are_made(side, scaled, size, dtype):
 
 def test_three_logits_make_a_pixel():
     for count, side, scaled, size in ((8, 32, 20, 31), (256, 1024, 757, 731), (3, 12, 12, 5)):
-        first, weights = taps(count, side, scaled, size)
+        first, weights = bilinear_weights(count, side, scaled, size)
         line = torch.randn(count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
         whole = interpolate(line[None, None], side, mode="linear", align_corners=False)[:, :, :scaled]
         expected = interpolate(whole, size, mode="linear", align_corners=False)[0, 0]

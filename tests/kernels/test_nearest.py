@@ -27,12 +27,12 @@ LARGER = [pytest.param(150, 12, marks=pytest.mark.extra), pytest.param(70, 36, m
 @pytest.mark.parametrize(("n", "k"), [(45, 12), (5, 12), (1, 3), *LARGER])
 def test_equals_the_cpu(n, k):
     points = uneven(n).to(DEVICE)
-    found = nearest.nearest(points, k)
+    found = nearest.find_nearest(points, k)
     expected = _on_cpu(points.cpu(), k)
     unsure = (~found.certain).nonzero().squeeze(1)  # the far one: to float32 the cluster is one point
     assert (n - 1 in unsure.tolist()) == (n > k)
     if unsure.numel() > 0:
-        for array, exact in zip(found, nearest.nearest_of_rows(points, unsure, k)):
+        for array, exact in zip(found, nearest.brute_force_nearest(points, unsure, k)):
             array[unsure] = exact
     assert torch.equal(found.index.cpu(), expected.index)
     assert torch.allclose(found.distance.cpu().double(), expected.distance, rtol=1e-7, atol=0)
@@ -45,7 +45,7 @@ def test_what_it_cannot_order_is_reported():
     coincident[30:] = torch.randn(8, 3, generator=generator(1))
     lattice = torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.arange(4.0))
     for points, surely_not in ((lattice, 0), (coincident, 30)):
-        found, expected = nearest.nearest(points.to(DEVICE), 12), _on_cpu(points, 12)
+        found, expected = nearest.find_nearest(points.to(DEVICE), 12), _on_cpu(points, 12)
         certain = found.certain.cpu()
         assert torch.equal(found.index.cpu()[certain], expected.index[certain])
         assert not certain.all() and not certain[:surely_not].any()
@@ -57,7 +57,7 @@ def test_nodes_sorted_each_for_itself_are_the_same_tree(monkeypatch):
     trees = []
     for most in (0, 64, 10**9):
         monkeypatch.setattr(nearest, "_SORTED_IN_A_BLOCK", most)
-        trees.append(nearest.build_tree(points.to(DEVICE)))
+        trees.append(nearest.build_kd_tree(points.to(DEVICE)))
     assert all(torch.equal(a, b) for tree in trees[1:] for a, b in zip(tree, trees[0]))
 
 
@@ -67,7 +67,7 @@ def test_looking_at_all_points_equals_the_cpu_where_everything_ties(monkeypatch)
     points[3] = points[90]
     rows = torch.tensor([0, 3, 62, 90, 124])
     for k in (1, 12, 130):
-        found, expected = nearest.nearest_of_rows(points, rows, k), _on_cpu(points, k)
+        found, expected = nearest.brute_force_nearest(points, rows, k), _on_cpu(points, k)
         assert torch.equal(found.index, expected.index[rows])
         assert torch.allclose(found.distance.double(), expected.distance[rows], rtol=1e-7)
         assert torch.equal(found.spacing, expected.spacing[rows])

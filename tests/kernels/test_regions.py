@@ -5,9 +5,9 @@ import torch
 
 from normlift_ns import Evidence, GaussianScene, RasterSettings, rasterize_evidence
 from normlift_ns.core.evidence import MASKED, UNLABELED
-from normlift_ns.kernels import regions
-from normlift_ns.raster import triton
-from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.kernels import compositing
+from normlift_ns.rasterization import triton
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from tests.scenes import dense, generator, orbit, random_labels, random_scene
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -17,12 +17,12 @@ NEEDLES = 8
 
 
 def job(scene, antialiased=False, weight_power=1, settings=SETTINGS):
-    return Job(scene.to(DEVICE), antialiased, settings, torch.float32, weight_power)
+    return RasterJob(scene.to(DEVICE), antialiased, settings, torch.float32, weight_power)
 
 
 def kernel_evidence(scene, cameras, labels, counts, weight_power=1):
     """Evidence by the kernels, all views in flight at once."""
-    batch = Batch(cameras, [x.to(DEVICE) for x in labels], counts)
+    batch = RasterBatch(cameras, [x.to(DEVICE) for x in labels], counts)
     entries = triton.views_evidence(job(scene, weight_power=weight_power), batch)
     return Evidence.from_entries([entries], len(scene), weight_power=weight_power).to("cpu")
 
@@ -91,7 +91,7 @@ def test_chunks_of_tiles_change_nothing(monkeypatch):
     scene, cameras = random_scene(20, seed=2, dtype=torch.float32), orbit(1, width=21, height=17)
     labels = [random_labels(cameras[0], 4, seed=2)]
     whole = kernel_evidence(scene, cameras, labels, [4])
-    monkeypatch.setattr(regions, "_MOST_SLOTS", 50)
+    monkeypatch.setattr(compositing, "_MOST_SLOTS", 50)
     parts = kernel_evidence(scene, cameras, labels, [4])
     assert torch.equal(whole.rows.weight, parts.rows.weight)
     assert torch.equal(whole.rows.column, parts.rows.column)
@@ -100,10 +100,12 @@ def test_chunks_of_tiles_change_nothing(monkeypatch):
 def test_keys_are_as_wide_as_they_must_be():
     scene, cameras = random_scene(8, seed=2, dtype=torch.float32), orbit(1, width=21, height=17)
     labels = torch.stack([random_labels(cameras[0], 4, seed=2)]).to(DEVICE)
-    grid, seen, lists = triton.see(job(scene), cameras)
+    grid, seen, lists = triton.project_and_bin(job(scene), cameras)
     limits = triton._limits(SETTINGS)
     found = {
-        columns: regions.region_sums(seen.splats, lists, labels, grid, columns=columns, limits=limits, weight_power=1)
+        columns: compositing.sum_regions(
+            seen.splats, lists, labels, grid, columns=columns, limits=limits, weight_power=1
+        )
         for columns in (5, 2**30)
     }
     assert (found[5].key.dtype, found[2**30].key.dtype) == (torch.int32, torch.int64)

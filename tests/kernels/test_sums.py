@@ -5,8 +5,8 @@ import torch
 
 from normlift_ns import Evidence, lift
 from normlift_ns.core.lift import _sums
-from normlift_ns.core.sparse import CANCELLED, MANY_ENTRIES, SparseRows, segment_sum
-from normlift_ns.kernels import sums
+from normlift_ns.core.sparse import CANCELLATION_RATIO, MANY_ENTRIES, SparseRows, segment_sum
+from normlift_ns.kernels import sparse
 from tests.scenes import generator, random_evidence, unit_rows
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -19,18 +19,20 @@ def on_device(*tensors):
 def kernel_norms(evidence, table):
     rows = evidence.rows
     arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
-    return [x.cpu() for x in sums.row_norms(*arrays, CANCELLED, MANY_ENTRIES)]
+    return [x.cpu() for x in sparse.row_norms(*arrays, CANCELLATION_RATIO, MANY_ENTRIES)]
 
 
 def test_segments_and_products_with_a_vector_are_added_in_float64():
     values = 10 ** (18 * torch.rand(500, generator=generator(0)) - 12)
     offsets = torch.tensor([0, 0, 1, 4, 4, 200, 500, 500])
-    found = sums.segment_sum(*on_device(values, offsets)).cpu()
+    found = sparse.segment_sum(*on_device(values, offsets)).cpu()
     assert torch.allclose(found, segment_sum(values, offsets), rtol=1e-15, atol=0)
     assert found[0] == found[3] == found[6] == 0
     evidence = random_evidence(300, [3, 4], 1, dtype=torch.float32)
     vector = torch.randn(7, generator=generator(1), dtype=torch.float64)
-    found = sums.product(*on_device(evidence.rows.offsets, evidence.rows.column, evidence.rows.weight, vector)).cpu()
+    found = sparse.multiply_vector(
+        *on_device(evidence.rows.offsets, evidence.rows.column, evidence.rows.weight, vector)
+    ).cpu()
     expected = evidence.rows.matmul(vector[:, None]).squeeze(1)
     assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
 
@@ -60,7 +62,7 @@ def test_cancelled_sums_are_right():
     assert torch.allclose(total, torch.stack([sum(within), exact[4] - exact[5]]), rtol=1e-12)
     assert torch.allclose(by_view, torch.stack([sum(within), exact[4] + exact[5]]), rtol=1e-12)
     arrays = on_device(torch.arange(2), offsets, region, weight, table, torch.ones(2))
-    found = sums.unit_sums(*arrays, torch.float32, CANCELLED, MANY_ENTRIES).cpu()
+    found = sparse.unit_sums(*arrays, torch.float32, CANCELLATION_RATIO, MANY_ENTRIES).cpu()
     assert torch.equal(found, torch.eye(1, 8).expand(2, -1))
 
 
@@ -68,13 +70,13 @@ def test_sums_of_many_entries_are_taken_in_float64():
     evidence, table = random_evidence(3, [40, 40], 8, dtype=torch.float32), unit_rows(80, 16, 2, torch.float32)
     rows = evidence.rows
     arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
-    found, exact = sums.row_norms(*arrays, 0.0, 2), _sums(evidence, table.double())
+    found, exact = sparse.row_norms(*arrays, 0.0, 2), _sums(evidence, table.double())
     for ours, theirs in zip(found, exact):
         assert torch.allclose(ours.cpu().double(), theirs.double(), rtol=1e-12, atol=0)
-    single = sums.row_norms(*arrays, 0.0, 1000)
+    single = sparse.row_norms(*arrays, 0.0, 1000)
     assert (single.total.cpu() - exact.total).abs().max() > 1e-9 * exact.total.max()
     arrays = on_device(torch.arange(3), rows.offsets, rows.column, rows.weight, table, torch.ones(3))
-    units = sums.unit_sums(*arrays, torch.float32, 0.0, 10).cpu()
+    units = sparse.unit_sums(*arrays, torch.float32, 0.0, 10).cpu()
     sums_of_rows = rows.matmul(table.double())
     expected = sums_of_rows / sums_of_rows.norm(dim=1, keepdim=True)
     assert torch.equal(units, expected.float())
@@ -88,7 +90,7 @@ def test_directions_equal_those_of_the_cpu():
     arrays = on_device(rows, given.offsets, given.column, given.weight, lifted.features, lifted.scalars.norm)
     for dtype, close in ((torch.float32, 2e-7), (torch.float16, 5e-4)):
         found = torch.empty(30, 20, dtype=dtype)
-        found[rows] = sums.unit_sums(*arrays, dtype, CANCELLED, MANY_ENTRIES).cpu()
+        found[rows] = sparse.unit_sums(*arrays, dtype, CANCELLATION_RATIO, MANY_ENTRIES).cpu()
         assert torch.allclose(found.float(), lifted.directions(), atol=close)
         assert not found[lifted.scalars.norm == 0].any()
         assert torch.equal(lifted.directions(dtype=dtype), lifted.directions().to(dtype))

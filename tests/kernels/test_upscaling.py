@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import conv_transpose2d, gelu, layer_norm
 
-from normlift_ns.kernels.upscaling import upscaled_masks
+from normlift_ns.kernels.sam import upscale_masks
 
 CUDA = torch.cuda.is_available()
 DEVICE = "cuda" if CUDA else "cpu"
@@ -33,7 +33,7 @@ def test_equals_transposed_convolutions(prompts, height, side, channels, dtype, 
     biases, norm = (made(middle), made(last)), (made(middle), made(middle))
     wanted = made(prompts, 3, last)
     weights = tuple(w.permute(2, 3, 1, 0).flatten(0, 2).contiguous().to(DEVICE) for w in (first, second))
-    found = upscaled_masks(
+    found = upscale_masks(
         keys.to(DEVICE), weights, tuple(b.to(DEVICE) for b in biases), (*(n.to(DEVICE) for n in norm), EPS),
         wanted.to(DEVICE), side,
     )  # fmt: skip

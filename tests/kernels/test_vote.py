@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Neighbors, RefineConfig, nearest_neighbors, refine, unsupported
-from normlift_ns.core.portions import spatial_order
+from normlift_ns.core.partition import spatial_order
 from normlift_ns.core.refine import decay_width, posterior_weights, voting_weights
-from normlift_ns.kernels.vote import any_reliable, members, vote
+from normlift_ns.kernels.vote import has_reliable_neighbor, vote, voters_and_neighbors
 from tests.examples import examples
 from tests.scenes import generator, unit_rows
 
@@ -129,7 +129,7 @@ def test_winners_are_those_of_float64_up_to_rounding(
 def test_the_first_halves_decide_what_is_clear_and_nothing_else():
     means, directions, reliability = close_calls(5, 24, 40, 0.3)
     neighbors = nearest_neighbors(means, 12)
-    known = any_reliable(neighbors.index.to(DEVICE), reliability.to(DEVICE)).cpu()[:14]
+    known = has_reliable_neighbor(neighbors.index.to(DEVICE), reliability.to(DEVICE)).cpu()[:14]
 
     def sure(neighbors, directions, reliability, **shape):
         return cast(neighbors, directions, reliability, RefineConfig(**shape), voters=14, precision="first")[:14] >= 0
@@ -178,17 +178,17 @@ def test_members_and_their_reliability():
         index = torch.randint(-1, max(n, 1), (n, k), generator=g, dtype=torch.int32)
         index[: n // 4] = -1
         reliability = torch.where(torch.rand(n, generator=g) < 0.9, 0.0, torch.rand(n, generator=g))
-        found = any_reliable(index.to(DEVICE), reliability.to(DEVICE)).cpu()
+        found = has_reliable_neighbor(index.to(DEVICE), reliability.to(DEVICE)).cpu()
         assert found.tolist() == [any(j >= 0 and reliability[j] > 0 for j in row) for row in index.tolist()]
         voters = torch.randperm(n, generator=g)[: n // 3]
         held = {j for i in voters.tolist() for j in (i, *index[i].tolist()) if j >= 0}
-        assert members(voters.to(DEVICE), index.to(DEVICE), len(index)).tolist() == sorted(held)
+        assert voters_and_neighbors(voters.to(DEVICE), index.to(DEVICE), len(index)).tolist() == sorted(held)
 
 
 @pytest.mark.parametrize("kind", [pytest.param("paper", marks=pytest.mark.extra), "posterior"])
 def test_refine_with_kernels_gives_one_answer_however_directions_are_given(monkeypatch, kind):
     """The route of a GPU, here also through Triton's interpreter."""
-    monkeypatch.setattr("normlift_ns.core.refine.kernels_apply", lambda tensor: True)
+    monkeypatch.setattr("normlift_ns.core.refine.can_use_triton", lambda tensor: True)
     monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (17, 17))
     means, directions, reliability = (x.to(DEVICE) for x in close_calls(3, 45, 33, 0.3))
     means[35:] += 100

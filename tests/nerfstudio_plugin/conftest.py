@@ -13,12 +13,12 @@ import torch
 
 from benchmarks.captures import SHARED
 from normlift_ns import SemanticField, lift, rasterize_evidence
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.io.run_dir import load_field, run_directory
 from normlift_ns.options import SourceOptions
-from normlift_ns.question import Question
-from normlift_ns.runs.files import load_field, run_directory
-from normlift_ns.runs.write import write_run
-from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
-from normlift_ns.text_encoders import ENCODER_KEYS
+from normlift_ns.pipeline import write_run
+from normlift_ns.query.question import Query
+from normlift_ns.query.text_encoder import ENCODER_KEYS
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
 
 
@@ -67,7 +67,7 @@ def stock_lifted(stock: StockRun, field: SemanticField, made_once: Callable[...,
     """config.yml of a lifted copy of the stock run with two stored queries."""
     encoder = {key: getattr(SourceOptions(encoder="colour"), key) for key in ENCODER_KEYS}
     colored = replace(field, manifest={**field.manifest, "encoder": encoder})
-    question = Question(("left", "right"), torch.eye(8)[:2])
+    question = Query(("left", "right"), torch.eye(8)[:2])
 
     def make(folder: Path) -> None:
         write(opened(stock.config), colored, question=question, output_dir=folder, timestamp="run")
@@ -94,25 +94,25 @@ def capture(request: pytest.FixtureRequest) -> Path:
 
 def opened(config: Path, **how: Any) -> Any:
     """The scene of a run."""
-    from normlift_ns.front_door import open_scene  # noqa: PLC0415
+    from normlift_ns.api import open_scene  # noqa: PLC0415
 
     return open_scene(config, **how)
 
 
 def read(path: Path) -> Any:
     """config.yml in nerfstudio's classes."""
-    from normlift_ns.nerfstudio_plugin.config import read_config  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin.views import read_nerfstudio_config  # noqa: PLC0415
 
-    return read_config(path)
+    return read_nerfstudio_config(path)
 
 
 def set_up(config: Path) -> Any:
     """The pipeline that stock nerfstudio's `eval_setup` makes of a run, from any directory; takes `registered`."""
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
 
-    from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin.views import relocate_config  # noqa: PLC0415
 
-    return eval_setup(config, update_config_callback=lambda loaded: rerooted(loaded, config))[1]
+    return eval_setup(config, update_config_callback=lambda loaded: relocate_config(loaded, config))[1]
 
 
 def lifted_field(run: NerfstudioScene) -> SemanticField:

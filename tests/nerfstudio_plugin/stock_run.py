@@ -31,10 +31,10 @@ from PIL import Image
 from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
-from normlift_ns.raster import reference
-from normlift_ns.raster.colors import view_colors
-from normlift_ns.raster.projection import assign_tiles, project, to_world
-from normlift_ns.raster.settings import RasterSettings
+from normlift_ns.rasterization import projection
+from normlift_ns.rasterization.projection import assign_tiles, prepare_gaussians, project
+from normlift_ns.rasterization.rasterize import view_colors
+from normlift_ns.rasterization.settings import RasterSettings
 
 WIDTH, HEIGHT, FOCAL, K1 = 48, 36, 40.0, 0.06
 """Of the images in the dataset, before undistortion."""
@@ -197,13 +197,13 @@ def rasterization(**how: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """gsplat.rasterization of one camera, differentiable, as far as splatfacto calls it."""
     means, colors, viewmat, width, height = (how[name] for name in ("means", "colors", "viewmats", "width", "height"))
     settings, camera = RasterSettings(), Camera(how["Ks"][0], viewmat[0], width, height)
-    scene = to_world(GaussianScene(means, how["quats"], how["scales"], how["opacities"]), means.dtype)
+    scene = prepare_gaussians(GaussianScene(means, how["quats"], how["scales"], how["opacities"]), means.dtype)
     projected = project(scene, camera, settings, how["rasterize_mode"] == "antialiased")
     tiles = assign_tiles(projected, width, height, settings.tile_size)
     rgb = colors if how["sh_degree"] is None else view_colors(means, colors, camera, how["sh_degree"])
     depth = means @ viewmat[0, 2, :3, None] + viewmat[0, 2, 3]
     values = torch.cat([rgb, depth], dim=1)[projected.gaussian]
-    image, alpha = reference.composite(projected, tiles, values, width, height, settings)
+    image, alpha = projection.composite(projected, tiles, values, width, height, settings)
     alpha = alpha[..., None]
     channels = [image[..., :-1]]
     if how["render_mode"] == "RGB+ED":

@@ -14,10 +14,8 @@ import pytest
 import yaml
 from hypothesis import strategies as st
 
+from normlift_ns.data.nerfstudio.config import CONFIG_TARGETS, check_config_values, locate_run, read_trainer_config
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.nerfstudio.allowed import PAIRS
-from normlift_ns.scenes.nerfstudio.checks import check_config
-from normlift_ns.scenes.nerfstudio.config import locate, read_config
 from tests.hostile import fuzz
 from tests.nerfstudio_plugin.conftest import read
 
@@ -51,7 +49,7 @@ def written(folder: Path, made: Any) -> Path:
 def refusal(folder: Path, made: Any) -> str:
     before = set(os.listdir(folder)) | {"config.yml"}
     with pytest.raises(InputError) as caught:
-        read_config(written(folder, made))
+        read_trainer_config(written(folder, made))
     assert set(os.listdir(folder)) == before
     assert str(folder / "config.yml") in str(caught.value)
     assert len(str(caught.value)) < 1200
@@ -73,7 +71,7 @@ def test_what_ns_train_saves_is_read_whole(tmp_path: Path, config: Any) -> None:
 
 
 def test_the_pairs_are_those_of_the_classes() -> None:
-    for name, pair in PAIRS.items():
+    for name, pair in CONFIG_TARGETS.items():
         cls: Any = resolve_name(":".join(name.rsplit(".", 1)))
         target = getattr(cls() if "Scheduler" not in name else cls, "_target", None)
         assert not isinstance(target, type) or resolve_name(":".join(str(pair).rsplit(".", 1))) is target, name
@@ -149,7 +147,7 @@ def hostile_values() -> dict[str, list[object]]:
 
 
 def test_values_of_other_types_and_ranges_are_named(tmp_path: Path, texts: tuple[str, str]) -> None:
-    made, path = read_config(written(tmp_path, texts[1])), tmp_path / "config.yml"
+    made, path = read_trainer_config(written(tmp_path, texts[1])), tmp_path / "config.yml"
     for name, values in hostile_values().items():
         holder: Any = made
         *steps, last = name.split(".")
@@ -160,15 +158,15 @@ def test_values_of_other_types_and_ranges_are_named(tmp_path: Path, texts: tuple
         for value in values:
             fields[last] = value
             with pytest.raises(InputError) as caught:
-                check_config(made, path)
+                check_config_values(made, path)
             message = str(caught.value)
             assert last in message and str(path) in message and len(message) < 1200, (name, value)
         fields[last] = before
-    check_config(made, path)
+    check_config_values(made, path)
     made.pipeline.model.sh_degree = made.pipeline.datamanager.dataparser.downscale_factor = 4
     made.pipeline.model.sh_degree_interval = made.pipeline.datamanager.dataparser.eval_interval = 1
     made.pipeline.datamanager.camera_res_scale_factor = made.pipeline.datamanager.dataparser.train_split_fraction = 1.0
-    check_config(made, path)  # the ends of the ranges
+    check_config_values(made, path)  # the ends of the ranges
     assert "sh_degree" in refusal(tmp_path, re.sub(r"sh_degree: \d", "sh_degree: 9", texts[1]))
 
 
@@ -214,7 +212,7 @@ def test_a_bomb_of_references_costs_nothing(tmp_path: Path, texts: tuple[str, st
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 30)]
     bomb = texts[0] + "\n".join(lines)
-    read_config(written(tmp_path, bomb))  # of fields that nobody has; left out
+    read_trainer_config(written(tmp_path, bomb))  # of fields that nobody has; left out
     bare = bomb.replace("\nprompt: null", "\ny: z", 1)
     target = "!!python/object:nerfstudio.configs.base_config.LocalWriterConfig {_target: *a29, enable: true}"
     for line, problem in (
@@ -230,7 +228,7 @@ def test_no_folder_is_no_config(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.yml")
     for name in ("config.yml", "pipe.yml"):
         with pytest.raises(FileNotFoundError, match=name):
-            read_config(tmp_path / name)
+            read_trainer_config(tmp_path / name)
 
 
 def test_a_run_that_was_moved_is_lifted_below_the_current_directory(tmp_path: Path, monkeypatch, config: Any) -> None:
@@ -239,7 +237,7 @@ def test_a_run_that_was_moved_is_lifted_below_the_current_directory(tmp_path: Pa
     for place in (Path("/etc/outputs"), Path("../../outputs"), tmp_path.parent / "elsewhere"):
         made = config()
         made.output_dir = place
-        assert locate(made, tmp_path / "config.yml").output_dir == tmp_path / "outputs"
+        assert locate_run(made, tmp_path / "config.yml").output_dir == tmp_path / "outputs"
 
 
 @st.composite

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.captures import SHARED
-from normlift_ns.raster.rasterize import render_picture
+from normlift_ns.rasterization.rasterize import render_image
 from tests.nerfstudio_plugin.conftest import opened
 
 pytestmark = pytest.mark.slow
@@ -35,6 +35,6 @@ def test_the_run_is_loaded_whole(capture: Path, tmp_path: Path, monkeypatch: pyt
         assert np.abs(camera.world_to_camera.numpy() - fixture["w2c"]).max() < 1e-6
         assert (camera.height, camera.width) == fixture["labels"].shape
     views = [run.train[i] for i in range(0, len(run.train), 6)]
-    gaps = [(render_picture(run, view.camera).float() - view.image.float()) / 255 for view in views]
+    gaps = [(render_image(run, view.camera).float() - view.image.float()) / 255 for view in views]
     measured = [float(-10 * gap.square().mean().log10()) for gap in gaps]
     assert abs(np.mean(measured) - EXPECTED[name]["psnr"]) < 0.7

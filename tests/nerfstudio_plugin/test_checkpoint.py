@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
+from normlift_ns.data.checkpoint import GAUSSIAN_PARAMETERS, find_checkpoint, read_checkpoint
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto
 

@@ -8,7 +8,7 @@ from pathlib import Path, PureWindowsPath
 import pytest
 import yaml
 
-from normlift_ns.scenes.nerfstudio.config import locate, read_config
+from normlift_ns.data.nerfstudio.config import locate_run, read_trainer_config
 from tests.nerfstudio_plugin.conftest import opened, read
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 
@@ -18,7 +18,7 @@ HEADER = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: 
 def refused(path: Path, text: str, problem: str) -> None:
     path.write_text(text)
     with pytest.raises(ValueError, match=problem) as caught:
-        read_config(path)
+        read_trainer_config(path)
     assert str(path) in str(caught.value)
 
 
@@ -27,7 +27,7 @@ def test_a_stock_config_is_read_as_nerfstudio_reads_it(stock: StockRun, tmp_path
     assert read(stock.config) == yaml.load(text, Loader=yaml.Loader)
     path = tmp_path / "config.yml"
     path.write_text(text.replace("pathlib.PosixPath", "pathlib.WindowsPath"))  # of another operating system
-    output_dir = read_config(path).output_dir
+    output_dir = read_trainer_config(path).output_dir
     assert output_dir == Path("outputs") and not isinstance(output_dir, PureWindowsPath)
 
 
@@ -48,7 +48,7 @@ def test_runs_of_nerfstudios_main_branch_are_read(stock: StockRun, tmp_path: Pat
     named = re.sub("(?m)^method_name: .*$", "method_name: splatfacto-mcmc", text)
     path.write_text(re.sub("(?m)^(  model: .*\n)", lambda found: found[1] + news, named))
     assert "strategy: mcmc" in path.read_text()
-    assert read_config(path).pipeline == read_config(stock.config).pipeline
+    assert read_trainer_config(path).pipeline == read_trainer_config(stock.config).pipeline
 
 
 def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
@@ -61,9 +61,9 @@ def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
     ):
         refused(tmp_path / "config.yml", text, problem)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
-        read_config(tmp_path / "nowhere.yml")
+        read_trainer_config(tmp_path / "nowhere.yml")
     with pytest.raises(FileNotFoundError, match=f"{stock.config} exists"):
-        read_config(stock.config.parent)
+        read_trainer_config(stock.config.parent)
 
 
 def test_a_config_runs_no_code(tmp_path: Path) -> None:
@@ -84,14 +84,14 @@ def test_a_config_runs_no_code(tmp_path: Path) -> None:
 def test_files_are_found_from_the_place_of_the_config(stock: StockRun, copied: Path, tmp_path: Path) -> None:
     moved = tmp_path / "moved"
     with working_directory(tmp_path):
-        location = locate(read_config(copied), copied.relative_to(tmp_path))
+        location = locate_run(read_trainer_config(copied), copied.relative_to(tmp_path))
     assert (location.root, location.output_dir, location.moved_data) == (moved, moved / "outputs", False)
     assert location.data == location.folder == moved / "scene"
     assert location.portable(moved / "outputs" / "x") == Path("outputs/x")
     assert location.portable(tmp_path) == tmp_path
     assert opened(copied).train.files[0] == moved / "scene" / "images" / "000.jpg"
     with working_directory(stock.workspace / "outputs"):  # outputs/scene/ is the experiment, not the dataset
-        assert locate(read_config(stock.config), stock.config).data == stock.workspace / "scene"
+        assert locate_run(read_trainer_config(stock.config), stock.config).data == stock.workspace / "scene"
     shutil.copytree(copied.parent, tmp_path / "alone")  # out of its folders
     with working_directory(moved):
         location = opened(tmp_path / "alone" / "config.yml").location
@@ -100,9 +100,9 @@ def test_files_are_found_from_the_place_of_the_config(stock: StockRun, copied: P
 
 
 def test_beside_an_absolute_output_directory_relative_data_is_found(copied: Path) -> None:
-    config, moved = read_config(copied), copied.parents[4]
+    config, moved = read_trainer_config(copied), copied.parents[4]
     config.output_dir = moved / "runs" / "all"
-    location = locate(config, config.output_dir / copied.relative_to(moved / "outputs"))
+    location = locate_run(config, config.output_dir / copied.relative_to(moved / "outputs"))
     assert (location.root, location.data, location.moved_data) == (None, moved / "scene", True)
     assert location.output_dir == location.portable(config.output_dir) == config.output_dir
 

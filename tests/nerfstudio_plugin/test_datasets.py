@@ -15,8 +15,8 @@ import pytest
 import torch
 from PIL import Image
 
+from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.frames import Frame, Intrinsics
 from tests.hostile import fuzz, hostile_json
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, train_splatfacto, write_dataset
@@ -94,7 +94,7 @@ def test_missing_small_images_are_refused_without_a_question(moved: Path, tmp_pa
     (scene / "images").rename(scene / name)
     folder = "images_path: !!python/object/apply:pathlib.PosixPath\n      - "
     text = moved.read_text().replace(f"{folder}images", f"{folder}'{name}'")
-    monkeypatch.setattr("normlift_ns.scenes.nerfstudio.datasets.MAX_AUTO_RESOLUTION", 24)
+    monkeypatch.setattr("normlift_ns.data.nerfstudio.dataparsers.MAX_AUTO_RESOLUTION", 24)
     monkeypatch.setattr("nerfstudio.data.dataparsers.colmap_dataparser.MAX_AUTO_RESOLUTION", 24)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("builtins.input", lambda *args: pytest.fail("nerfstudio asked"))

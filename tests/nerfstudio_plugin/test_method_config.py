@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from normlift_ns.scenes.nerfstudio.config import SUPPORTED_METHODS
+from normlift_ns.data.nerfstudio.config import SUPPORTED_METHODS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -45,7 +45,7 @@ def test_nerfstudio_discovers_the_method_by_its_entry_point() -> None:
 
 
 def test_it_trains_as_splatfacto_does_and_the_demo_is_a_run_of_splatfacto(nerfstudio: Any) -> None:
-    from normlift_ns.demo.run import splatfacto_config  # noqa: PLC0415
+    from normlift_ns.demo.capture import splatfacto_config  # noqa: PLC0415
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
     from normlift_ns.nerfstudio_plugin.model import NormLiftModelConfig  # noqa: PLC0415
 

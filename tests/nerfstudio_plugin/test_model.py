@@ -14,11 +14,12 @@ import pytest
 import torch
 import yaml
 
-from normlift_ns import SemanticField, asking
-from normlift_ns.question import Question
-from normlift_ns.raster.rasterize import render, render_picture
-from normlift_ns.raster.settings import RasterSettings
-from normlift_ns.viewer.display import make_display
+from normlift_ns import SemanticField
+from normlift_ns.query import engine
+from normlift_ns.query.question import Query
+from normlift_ns.rasterization.rasterize import render, render_image
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.rendering.figures import make_display
 from tests.nerfstudio_plugin.conftest import lifted_field, opened, set_up, write
 from tests.nerfstudio_plugin.stock_run import SmallLpips, StockRun, splatfacto_on_cpu, train_splatfacto
 
@@ -27,8 +28,8 @@ LPIPS = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
 SEMANTIC = ["reliability", "reliability_value", "n_eff", "selection", "segmentation", "overlay"]
 
 
-def question() -> Question:
-    return Question(("left", "right"), torch.eye(8)[:2])
+def question() -> Query:
+    return Query(("left", "right"), torch.eye(8)[:2])
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_outputs_are_those_of_stock_splatfacto_and_of_the_run(pipeline: Any, sto
         assert theirs["rgb"].std() > 0.02
         for name, value in theirs.items():
             torch.testing.assert_close(ours[name], value, atol=2e-5, rtol=1e-4)
-        picture = render_picture(run, run.train.cameras[index])
+        picture = render_image(run, run.train.cameras[index])
         torch.testing.assert_close(picture.float() / 255, ours["rgb"], atol=0.51 / 255, rtol=0)
 
 
@@ -103,7 +104,7 @@ def test_colors_without_spherical_harmonics(workspace: Path, registered: None, t
         cameras = trained.pipeline.datamanager.train_cameras
         theirs = trained.pipeline.model.eval().get_outputs_for_camera(cameras[1:2])
     torch.testing.assert_close(_outputs(pipeline, 1)["rgb"].cpu(), theirs["rgb"], atol=2e-5, rtol=1e-4)
-    picture = render_picture(run, run.train.cameras[1])
+    picture = render_image(run, run.train.cameras[1])
     torch.testing.assert_close(picture.float() / 255, theirs["rgb"], atol=0.51 / 255, rtol=0)
     assert pipeline.model.splats()[1:] == (False, "antialiased")  # as a PLY file of it has to say
 
@@ -112,7 +113,7 @@ def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticF
     run = opened(stock.config)
     outputs = _outputs(pipeline, 3)
     assert list(outputs) == [*STOCK, "relevancy_0", "relevancy_1", *SEMANTIC]
-    answer = asking.answer(field, run.gaussians.means, question())
+    answer = engine.run_query(field, run.gaussians.means, question())
     chosen = answer.selected.any(dim=1).float()
     columns = {"relevancy_0": answer.relevancy[:, 0], "relevancy_1": answer.relevancy[:, 1], "selection": chosen}
     columns |= {"reliability_value": field.scalars.reliability, "n_eff": field.scalars.n_eff}
@@ -171,7 +172,7 @@ def test_cuda_outputs_are_those_of_the_cpu(stock_lifted: Path, registered: None)
 
 def test_relevancy_of_stored_queries_uses_their_negatives(pipeline: Any, stock: StockRun) -> None:
     field, negatives = pipeline.model.field, torch.eye(8)[1:2]
-    pipeline.model.attach(field, Question(("left",), torch.eye(8)[:1], ("right",), negatives, rule="lerf"))
+    pipeline.model.attach(field, Query(("left",), torch.eye(8)[:1], ("right",), negatives, rule="lerf"))
     values = field.relevancy(torch.eye(8)[:1], negatives, rule="lerf")
     run = opened(stock.config)
     expected, _ = render(run.gaussians, run.train.cameras[0], values)
@@ -192,7 +193,7 @@ def test_without_a_question_only_the_relevancies_are_missing(pipeline: Any) -> N
 
 def test_hidden_gaussians_are_not_drawn_at_all(pipeline: Any, stock: StockRun) -> None:
     model, run = pipeline.model, opened(stock.config)
-    answer = asking.answer(model.field, model.means, question())
+    answer = engine.run_query(model.field, model.means, question())
     for alone, on_cpu in itertools.product((False, True), (False, True)):
         drawn = answer.selected[:, 0] == alone
         assert 5 < int(drawn.sum()) < 55
@@ -212,8 +213,8 @@ def test_hidden_gaussians_are_not_drawn_at_all(pipeline: Any, stock: StockRun) -
 
 def test_an_overlay_costs_one_pass_of_scalars(pipeline: Any) -> None:
     model, channels = pipeline.model, []
-    asked = Question(("left",) * 20, torch.eye(8)[:1].expand(20, 8))
-    overlay = make_display(model.field, asking.answer(model.field, model.means, asked))
+    asked = Query(("left",) * 20, torch.eye(8)[:1].expand(20, 8))
+    overlay = make_display(model.field, engine.run_query(model.field, model.means, asked))
 
     def counted(*args: Any, **options: Any) -> Any:
         channels.append(args[2].shape[1])
@@ -235,7 +236,7 @@ def test_a_crop_box_crops_the_scalars_too(pipeline: Any) -> None:
     above = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, middle + 5]), torch.tensor([10.0, 10.0, 10.0]))
     nowhere = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 50.0]), torch.tensor([1.0, 1.0, 1.0]))
     assert 0 < int(above.within(model.means).sum()) < 60
-    everyone = asking.answer(model.field, model.means, Question(("all",), torch.eye(8)[:1], threshold=-2.0))
+    everyone = engine.run_query(model.field, model.means, Query(("all",), torch.eye(8)[:1], threshold=-2.0))
     assert bool(everyone.valid.all())
     model.show(make_display(model.field, everyone))
     for on_cpu in (False, True):
@@ -258,7 +259,7 @@ def test_what_is_hidden_cannot_be_clicked(pipeline: Any, stock: StockRun) -> Non
     weights = model.in_sight(pose[:3, 3], pose[:3, 2])
     front = int(weights.argmax())
     assert float(weights[front]) > 0.01
-    answer = asking.answer(model.field, model.means, question())
+    answer = engine.run_query(model.field, model.means, question())
     answer.selected[:] = (torch.arange(60) == front)[:, None]
     model.show(make_display(model.field, answer, drawn=~answer.mask))
     behind, others = model.in_sight(pose[:3, 3], pose[:3, 2]), torch.arange(60) != front

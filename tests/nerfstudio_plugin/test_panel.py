@@ -24,26 +24,25 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from normlift_ns.asking import answer
-from normlift_ns.insight.floaters import find_floaters
-from normlift_ns.nerfstudio_plugin.said import found_table
+from normlift_ns.analysis.objects import find_floaters
+from normlift_ns.nerfstudio_plugin.panel_view import prompt_table
 from normlift_ns.options import LiftOptions, SourceOptions
-from normlift_ns.question import Question
-from normlift_ns.runs.question import load_question
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import Query, load_query
 from normlift_ns.session import actions
-from normlift_ns.session.found import found_objects
-from normlift_ns.session.prompts import MOST_PROMPTS
-from normlift_ns.session.space import Space
+from normlift_ns.session.actions import threshold_suggestion
+from normlift_ns.session.objects import list_objects
+from normlift_ns.session.prompts import MAX_PROMPTS
+from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
-from normlift_ns.session.verdicts import suggested
 from tests.nerfstudio_plugin.conftest import set_up
 from tests.nerfstudio_plugin.stock_run import StockRun
 
 NAMES = {"left": 0, "right": 1, "up": 2}
 
 
-def asking(*texts: str) -> Question:
-    return Question(texts, torch.eye(8)[[NAMES[text] for text in texts]])
+def asking(*texts: str) -> Query:
+    return Query(texts, torch.eye(8)[[NAMES[text] for text in texts]])
 
 
 class Browser:
@@ -107,7 +106,7 @@ def viewer(viewed: tuple[Any, Any]) -> Any:
 @pytest.fixture
 def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The pipeline as loaded; what the panel writes goes to a folder of the test."""
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.insights._DELAY", 0.01)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.panel_view._DELAY", 0.01)
     model, output = viewed[0].model, viewed[1].control_panel._output_render
     field = model.field
     model.config.semantics = tmp_path / "run" / "normlift"
@@ -189,7 +188,7 @@ def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: An
     assert parse_object(pipeline, ViewerElement, "x") == []  # nothing far down in another tab
     assert [element for _, element in parse_object(pipeline, ViewerControl, "x")] == [panel.control]
     assert (panel._asker.encoder, panel._widgets.prompts.value, panel._widgets.threshold.value) == ([], "left", 0.5)
-    expected = answer(pipeline.model.field, pipeline.model.means, asking("left")).selected[:, 0]
+    expected = run_query(pipeline.model.field, pipeline.model.means, asking("left")).selected[:, 0]
     assert torch.equal(chosen(pipeline), expected)
     assert f"**{int(expected.sum())}** of 60" in said(panel)
     assert not any("normlift" in name for name in pipeline.state_dict())
@@ -198,13 +197,13 @@ def test_the_first_tab_shows_the_stored_question_without_an_encoder(pipeline: An
 def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any) -> None:
     """One walk; the picture follows, and the first answer switches to the overlay."""
     model, widgets, output = pipeline.model, panel._widgets, viewer.control_panel._output_render
-    both = answer(model.field, model.means, asking("left", "right")).selected
+    both = run_query(model.field, model.means, asking("left", "right")).selected
     ask(panel, " left , right;; ")
     assert (panel.answer.texts, output.value) == (("left", "right"), "overlay")
     assert list(outputs(pipeline))[4:7] == ["relevancy_left", "relevancy_right", "reliability"]
     assert torch.equal(chosen(pipeline), both.any(dim=1))
     best = panel.answer.relevancy[panel.answer.valid].amax(dim=0).tolist()
-    rows = [[cell.strip() for cell in line.split("|")] for line in found_table(panel.state).splitlines()[-2:]]
+    rows = [[cell.strip() for cell in line.split("|")] for line in prompt_table(panel.state).splitlines()[-2:]]
     expected = [(text, str(int(n)), f"{peak:.2f}") for text, n, peak in zip(panel.answer.texts, both.sum(dim=0), best)]
     assert [(row[2], row[3], row[4]) for row in rows] == expected
     widgets.shown.value = "2: right"
@@ -241,7 +240,7 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     ask(panel, "left")
     assert panel.answer.question.min_reliability == pytest.approx(least)
     panel.act("Suggested")
-    assert widgets.threshold.value == pytest.approx(suggested(panel.state), abs=1e-6)
+    assert widgets.threshold.value == pytest.approx(threshold_suggestion(panel.state), abs=1e-6)
     panel.act("colormap", "magma")
     assert pipeline.model._display.colormap == "magma" == panel._colormap
 
@@ -308,8 +307,8 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
 
 def test_what_cannot_be_asked_says_why_and_keeps_the_answer_before(panel: Any, pipeline: Any) -> None:
     before = chosen(pipeline)
-    many = ";".join(f"left {i}" for i in range(MOST_PROMPTS + 1))
-    for prompts, message in ((" , ;", "Type"), ("x" * 10_000, "I do not know"), (many, str(MOST_PROMPTS + 1))):
+    many = ";".join(f"left {i}" for i in range(MAX_PROMPTS + 1))
+    for prompts, message in ((" , ;", "Type"), ("x" * 10_000, "I do not know"), (many, str(MAX_PROMPTS + 1))):
         ask(panel, prompts)
         assert message in said(panel)
         assert len(said(panel)) < 3000
@@ -383,7 +382,7 @@ def press_row(group: Any, deed: str, browser: Browser) -> None:
 def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline: Any) -> None:
     ask(panel, "left; right")
     groups, browser = listed(panel), Browser()
-    objects = found_objects(panel.state).objects
+    objects = list_objects(panel.state).objects
     assert len(groups) == len(objects) > 0
     assert panel._widgets.histograms.content.count("data:image/svg+xml") == 2
     first, camera = objects[0], browser.camera
@@ -394,7 +393,7 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     assert 0 < PlyData.read(io.BytesIO(browser.files["left_1.ply"]))["vertex"].count <= first.size
     press_row(groups[0], "hide", browser)
     assert torch.equal(pipeline.model._display.drawn, ~first.mask)
-    assert len(listed(panel)) == len(found_objects(panel.state).objects) < len(objects)
+    assert len(listed(panel)) == len(list_objects(panel.state).objects) < len(objects)
     panel.act("Undo")
     press_row(listed(panel)[0], "only", browser)
     assert torch.equal(pipeline.model._display.drawn, first.mask)
@@ -425,7 +424,7 @@ def test_floaters_are_selected(panel: Any, pipeline: Any, monkeypatch: pytest.Mo
 
 def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_path: Path, panel: Any) -> None:
     import normlift_ns as nl  # noqa: PLC0415
-    from normlift_ns.nerfstudio_plugin.insights import reasons_of  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin.panel_view import explanation_of_run  # noqa: PLC0415
 
     for prompts in ("up", "left"):
         ask(panel, prompts)
@@ -435,10 +434,10 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     assert panel._widgets.reasons.content == ""
     how = {"source": SourceOptions(encoder="colour"), "lift": LiftOptions(storage="evidence")}
     run = nl.lift_run(stock.config, **how, output_dir=tmp_path, timestamp="one")
-    reasons = reasons_of(run.folder / "normlift", run.field)
+    reasons = explanation_of_run(run.folder / "normlift", run.field)
     device = panel.state.space.means.device
     field, means = run.field.to(device), run.scene.gaussians.means.to(device)
-    state = actions.select(State(Space(field, means)), field.scalars.weight > 0)
+    state = actions.select(State(SelectionContext(field, means)), field.scalars.weight > 0)
     reasons.find(reasons.start(state), state)
     why = run.why(state.selection.cpu())
     text = html.unescape(reasons.content)
@@ -469,7 +468,7 @@ class Slow(Words):
 def slow(pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Slow, list[str]]]:
     """An encoder that takes its time, loaded at the first query, and the devices it was loaded on."""
     encoder, loaded = Slow(), []
-    encoder_of = "normlift_ns.nerfstudio_plugin.asker.encoder_of"
+    encoder_of = "normlift_ns.nerfstudio_plugin.panel.text_encoder_for"
     monkeypatch.setattr(encoder_of, lambda _, device, __: loaded.append(device) or encoder)
     yield encoder, loaded
     encoder.go_on.set()
@@ -548,7 +547,7 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     assert "one prompt" in said(panel)
     ask(panel, "left")
     assert panel.answer.question.threshold == 0.5  # not that of the click
-    pipeline.model.attach(field, load_question(pipeline.model.config.semantics))  # as after a restart
+    pipeline.model.attach(field, load_query(pipeline.model.config.semantics))  # as after a restart
     assert panel._clicks.known == {}
     ask(panel, "left")
     ask(panel, "like click 1")
@@ -622,7 +621,7 @@ def test_a_browser_that_comes_or_goes_leaves_no_other_with_an_old_picture(panel:
 
 def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
     def stored() -> Any:
-        return load_question(pipeline.model.config.semantics)
+        return load_query(pipeline.model.config.semantics)
 
     replace = panel._widgets.replace
     for prompts, negatives in (("left", ""), ("right, left", ""), ("up", "left")):  # the last of another rule

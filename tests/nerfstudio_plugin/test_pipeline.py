@@ -13,12 +13,11 @@ import torch
 import yaml
 from PIL import Image
 
-from normlift_ns.asking import answer
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig, SourceOptions
-from normlift_ns.question import make_question
-from normlift_ns.runs.question import load_question
-from normlift_ns.text_encoders import encoder_of
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import load_query, make_query
+from normlift_ns.query.text_encoder import text_encoder_for
 from tests.nerfstudio_plugin.conftest import field_of, opened, set_up
 from tests.nerfstudio_plugin.stock_run import HEIGHT, WIDTH, StockRun, train_splatfacto
 
@@ -37,7 +36,7 @@ def methods() -> dict[str, Any]:
 @pytest.fixture
 def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable]:
     """`ns-train normlift --pipeline.source.encoder colour …`; keywords are those of the pipeline's config."""
-    monkeypatch.setattr("normlift_ns.raster.gsplat.composite", None)  # splatfacto's is replaced, ours not wanted
+    monkeypatch.setattr("normlift_ns.rasterization.gsplat.composite", None)  # splatfacto's is replaced, ours not wanted
 
     def train(timestamp, method="normlift", checkpoint=None, model=None, how=None, **pipeline: Any) -> StockRun:
         def configure(config: Any) -> None:
@@ -69,10 +68,12 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     assert {p.name for p in run_dir.glob("[!e]*")} == expected_names | {"nerfstudio_models"}  # and events
     assert [p.name for p in (run_dir / "nerfstudio_models").iterdir()] == ["step-000000001.ckpt"]
     run = opened(trained.config)
-    field, question = field_of(run), load_question(run_dir / "normlift")
+    field, question = field_of(run), load_query(run_dir / "normlift")
     assert len(field) == 60 and field.scalars.reliability.max() > 0.2
     assert question is not None and question.texts == ("red", "sky blue")
-    expected = answer(field, run.gaussians.means, make_question(field, encoder_of(field).rows, ["red", "sky blue"]))
+    expected = run_query(
+        field, run.gaussians.means, make_query(field, text_encoder_for(field).rows, ["red", "sky blue"])
+    )
 
     model = trained.pipeline.model  # the viewer of the training
     assert torch.equal(model.normlift.answer.relevancy.cpu(), expected.relevancy)

@@ -21,17 +21,15 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from normlift_ns.data.nerfstudio import config_classes
+from normlift_ns.data.nerfstudio.cameras import apply_pose_adjustments
+from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config, set_dataset, skip_seed_points
+from normlift_ns.data.nerfstudio.config_classes import NAMED_COLORS
+from normlift_ns.data.nerfstudio.dataparsers import parse_dataset
+from normlift_ns.data.nerfstudio.load import TrainedViews, _reading
 from normlift_ns.errors import InputError
-from normlift_ns.runs.files import FIELD_FOLDER
-from normlift_ns.runs.write import _lifted_config
-from normlift_ns.scenes.nerfstudio import classes
-from normlift_ns.scenes.nerfstudio.allowed import dump_config
-from normlift_ns.scenes.nerfstudio.appearance import COLORS
-from normlift_ns.scenes.nerfstudio.config import read_config, set_data, skip_seed_points
-from normlift_ns.scenes.nerfstudio.load import _reading
-from normlift_ns.scenes.nerfstudio.parsers import parse
-from normlift_ns.scenes.nerfstudio.poses import adjusted
-from normlift_ns.scenes.nerfstudio.views import TrainedViews
+from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.pipeline import _lifted_config
 from tests.examples import examples
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun
@@ -40,14 +38,14 @@ GREY = torch.tensor([0.2, 0.4, 0.7])
 
 
 def as_nerfstudios(config: Any) -> Any:
-    from normlift_ns.nerfstudio_plugin import config as module  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin import views as module  # noqa: PLC0415
 
-    return module.as_nerfstudios(config)
+    return module.to_nerfstudio_config(config)
 
 
 def test_mirrors_have_the_fields_and_defaults_of_nerfstudios_classes() -> None:
-    for mirror, path in classes.NAMES.items():
-        if mirror is classes.EventName:
+    for mirror, path in config_classes.CONFIG_CLASS_NAMES.items():
+        if mirror is config_classes.EventName:
             continue
         original: Any = resolve_name(":".join(path.rsplit(".", 1)))
         theirs, ours = ({item.name: item for item in fields(cls)} for cls in (original, mirror))
@@ -59,15 +57,15 @@ def test_mirrors_have_the_fields_and_defaults_of_nerfstudios_classes() -> None:
             assert isinstance(mine.default, tuple) or mine.default == item.default, (path, name)
             if hints[name] in (int, float, bool, str, Path):
                 assert hints[name] is known[name] or name == "vis", (path, name)
-        if "_target" in ours and mirror is not classes.SchedulerConfig:
+        if "_target" in ours and mirror is not config_classes.SchedulerConfig:
             target: Any = ours["_target"].default_factory
             made = theirs["_target"]
             found: Any = made.default if made.default is not MISSING else made.default_factory()  # type: ignore[misc]
             assert target().name == f"{found.__module__}.{found.__qualname__}", path
     events, colors = (resolve_name(f"nerfstudio.utils.{name}") for name in ("writer:EventName", "colors:COLORS_DICT"))
-    assert {item.name: item.value for item in classes.EventName} == {item.name: item.value for item in events}
+    assert {item.name: item.value for item in config_classes.EventName} == {item.name: item.value for item in events}
     expected = {name: value.tolist() for name, value in colors.items()}
-    assert {name: list(value) for name, value in COLORS.items()} == expected
+    assert {name: list(value) for name, value in NAMED_COLORS.items()} == expected
 
 
 def test_a_config_is_written_as_nerfstudio_writes_it(nerfstudio: Any, tmp_path: Path) -> None:
@@ -77,9 +75,11 @@ def test_a_config_is_written_as_nerfstudio_writes_it(nerfstudio: Any, tmp_path: 
         config.experiment_name, config.timestamp = "scene", "now"
         path = tmp_path / "config.yml"
         path.write_text(yaml.dump(config))
-        read = read_config(path)
+        read = read_trainer_config(path)
         assert yaml.load(dump_config(read), Loader=yaml.Loader) == as_nerfstudios(read) == config
-    made = as_nerfstudios(classes.TrainerConfig(method_name="normlift", pipeline=classes.VanillaPipelineConfig()))
+    made = as_nerfstudios(
+        config_classes.TrainerConfig(method_name="normlift", pipeline=config_classes.VanillaPipelineConfig())
+    )
     for part in (made.pipeline.model, made.pipeline.datamanager, made.viewer, made.logging):  # of splats
         assert part == type(part)() and type(part).__module__.startswith("nerfstudio.")
 
@@ -97,7 +97,7 @@ def test_the_config_of_a_lifted_run_is_the_edited_one(stock: StockRun) -> None:
         config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
         config.pipeline.model = NormLiftModelConfig.upgrade(config.pipeline.model, semantics=Path(FIELD_FOLDER))
         if config.output_dir.is_absolute():
-            set_data(config, scene.location.data)
+            set_dataset(config, scene.location.data)
         skip_seed_points(config)
         config.pipeline.datamanager.cache_images = "gpu"
         assert yaml.load(dump_config(_lifted_config(scene, run_dir)), Loader=yaml.Loader) == config
@@ -111,15 +111,15 @@ def attempt(action: Callable[[], Any]) -> Any:
         return str(error)
 
 
-def assert_equal(datamanager: classes.FullImageDatamanagerConfig, folder: Path) -> None:
+def assert_equal(datamanager: config_classes.FullImageDatamanagerConfig, folder: Path) -> None:
     """The views and the world of a data set are those of nerfstudio's own data manager."""
     from nerfstudio.cameras.cameras import CameraType  # noqa: PLC0415
 
     from normlift_ns.nerfstudio_plugin.views import DatasetViews  # noqa: PLC0415
 
-    config = classes.TrainerConfig(pipeline=classes.VanillaPipelineConfig(datamanager=datamanager))
+    config = config_classes.TrainerConfig(pipeline=config_classes.VanillaPipelineConfig(datamanager=datamanager))
     manager: Any = as_nerfstudios(config).pipeline.datamanager.setup(device="cpu", test_mode="test")
-    parsed = parse(datamanager)
+    parsed = parse_dataset(datamanager)
     outputs = manager.train_dataparser_outputs
     assert torch.equal(parsed.transform, outputs.dataparser_transform)
     assert parsed.scale == outputs.dataparser_scale
@@ -228,9 +228,9 @@ def test_data_sets_with_transforms(
             meta |= {"test_filenames": [f["file_path"] for f in frames[:2]], "val_filenames": []}
         (folder / "transforms.json").write_text(json.dumps(meta))
         parser = with_held_out(parser, lists)
-        config = classes.NerfstudioDataParserConfig(data=folder, **parser)
+        config = config_classes.NerfstudioDataParserConfig(data=folder, **parser)
         how: Any = {"dataparser": config, "camera_res_scale_factor": 0.5 if shrunk else 1.0}
-        assert_equal(classes.FullImageDatamanagerConfig(data=folder, **how), folder)
+        assert_equal(config_classes.FullImageDatamanagerConfig(data=folder, **how), folder)
 
 
 @examples(8)
@@ -270,11 +270,11 @@ def test_data_sets_of_colmap(parser: dict[str, Any], seed: int, model: str, flag
             (folder / "train_list.txt").write_text("\n".join(names[2:]) + "\n")
             (folder / "test_list.txt").write_text("\n".join(names[:2]) + "\n")
         parser = with_held_out(parser, lists)
-        config = classes.ColmapDataParserConfig(
+        config = config_classes.ColmapDataParserConfig(
             data=folder, **parser, load_3D_points=False, assume_colmap_world_coordinate_convention=flip,
             masks_path=Path("masks") if masks else None, downscale_rounding_mode=rounding,
         )  # fmt: skip
-        assert_equal(classes.FullImageDatamanagerConfig(data=folder, dataparser=config), folder)
+        assert_equal(config_classes.FullImageDatamanagerConfig(data=folder, dataparser=config), folder)
 
 
 def test_data_sets_of_blender(tmp_path: Path) -> None:
@@ -285,9 +285,9 @@ def test_data_sets_of_blender(tmp_path: Path) -> None:
             frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": p} for i, p in enumerate(poses(rng, 3))]
             meta = {"camera_angle_x": 0.691, "frames": frames}
             (folder / f"transforms_{split}.json").write_text(json.dumps(meta))
-        parser = classes.BlenderDataParserConfig(data=folder, alpha_color=color, scale_factor=0.6)
+        parser = config_classes.BlenderDataParserConfig(data=folder, alpha_color=color, scale_factor=0.6)
         how = {"data": folder, "dataparser": parser, "camera_res_scale_factor": 0.5 if number % 3 == 0 else 1.0}
-        assert_equal(classes.FullImageDatamanagerConfig(**how), folder)
+        assert_equal(config_classes.FullImageDatamanagerConfig(**how), folder)
 
 
 def test_optimized_poses_are_nerfstudios() -> None:
@@ -300,7 +300,7 @@ def test_optimized_poses_are_nerfstudios() -> None:
         optimizer = CameraOptimizerConfig(mode=mode).setup(num_cameras=9, device="cpu")  # type: ignore[arg-type]
         with torch.no_grad():
             optimizer.pose_adjustment.copy_(moves)
-            for i, found in enumerate(adjusted(given_poses, moves, mode)):  # type: ignore[arg-type]
+            for i, found in enumerate(apply_pose_adjustments(given_poses, moves, mode)):  # type: ignore[arg-type]
                 change = optimizer(torch.tensor([i]))
                 rotated = torch.bmm(change[..., :3, :3], given_poses[i : i + 1, :3, :3])
                 expected = torch.cat([rotated, given_poses[i : i + 1, :3, 3:] + change[..., :3, 3:]], dim=-1)

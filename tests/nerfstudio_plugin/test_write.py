@@ -11,11 +11,10 @@ import pytest
 import torch
 
 from normlift_ns import SemanticField
-from normlift_ns.core.disk import atomic
-from normlift_ns.question import Question
-from normlift_ns.runs.files import cache_folder, run_directory
-from normlift_ns.runs.question import load_question
-from normlift_ns.runs.write import write_run
+from normlift_ns.io import atomic
+from normlift_ns.io.run_dir import cache_folder, run_directory
+from normlift_ns.pipeline import write_run
+from normlift_ns.query.question import Query, load_query
 from tests.nerfstudio_plugin.conftest import field_of, opened, read, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory
 from tests.processes import killed_at
@@ -23,8 +22,8 @@ from tests.processes import killed_at
 CHECKPOINT = "step-000000002.ckpt"
 
 
-def asking(text: str) -> Question:
-    return Question((text,), torch.eye(8)[:1])
+def asking(text: str) -> Query:
+    return Query((text,), torch.eye(8)[:1])
 
 
 def test_a_lifted_run_is_its_source_with_another_model(copied: Path, field: SemanticField, tmp_path: Path) -> None:
@@ -43,7 +42,7 @@ def test_a_lifted_run_is_its_source_with_another_model(copied: Path, field: Sema
     assert slim.keys() == {"step", "pipeline"}
     assert slim["pipeline"].keys() == {name for name in full["pipeline"] if "lpips" not in name}
     assert all(torch.equal(value, full["pipeline"][name]) for name, value in slim["pipeline"].items())
-    config, question = read(run_dir / "config.yml"), load_question(run_dir / "normlift")
+    config, question = read(run_dir / "config.yml"), load_query(run_dir / "normlift")
     assert (config.method_name, config.pipeline.model.semantics) == ("normlift", Path("normlift"))
     assert question is not None and question.texts == ("a",)
 
@@ -158,7 +157,7 @@ def test_of_lifts_at_once_all_are_numbered_or_all_but_one_refused(copied: Path, 
         found = list(pool.map(lift_there, range(2)))
     (refused,) = (error for error in found if isinstance(error, FileExistsError))
     assert str(chosen) in str(refused)
-    kept = load_question(chosen / "normlift")
+    kept = load_query(chosen / "normlift")
     assert kept is not None and kept.texts == (str(found.index(chosen)),)
     assert sorted(names) == [f"2024-05-01_120000{end}" for end in ("", "_2", "_3")]
     assert sorted([*names, "now"]) == sorted(os.listdir(default.parent))
@@ -203,12 +202,12 @@ def test_what_a_killed_lift_left_is_cleaned_and_a_running_one_is_not(copied: Pat
     for folder in folders:
         (folder / dead / "now").mkdir(parents=True)
         (folder / live / "now").mkdir(parents=True)
-    held = [atomic.hold(folder / live) for folder in folders]
+    held = [atomic.acquire_lock(folder / live) for folder in folders]
     try:
         write_run(source, field, place)
         assert [[path.name for path in folder.glob(".normlift-*")] for folder in folders] == [[live]] * 2
     finally:
         for descriptor in held:
-            atomic.release(descriptor)
+            atomic.release_lock(descriptor)
     write_run(source, field, place, overwrite=True)
     assert list(place.parent.rglob(".normlift-*")) == []

@@ -20,9 +20,9 @@ from pathlib import Path
 import torch
 from normlift_ns import LiftOptions, SourceOptions, open_scene
 from normlift_ns.encoders.build import make_source
-from normlift_ns.lifting import lift_scene
-from normlift_ns.planning.measure import load_kernels, measure
-from normlift_ns.planning.plan import make_plan
+from normlift_ns.pipeline import lift_scene
+from normlift_ns.planning import load_kernels, measure
+from normlift_ns.planning import make_plan
 torch.set_num_threads(1)
 scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
 source, options = make_source(SourceOptions(encoder="colour")), LiftOptions(max_views=9)

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from normlift_ns.observing import Block
-from normlift_ns.planning.measure import _observe_loaded, _Observed
-from normlift_ns.planning.plan import Facts, Rate, make_plan
+from normlift_ns.evidence_collection import ViewBatch
+from normlift_ns.planning import Measurements, Rate, _observe_loaded, _Observed, make_plan
 
-FACTS = Facts(
+FACTS = Measurements(
     device="cpu, 2 threads", views=40, gaussians=1000, dimension=8, regions=10, entries=500, entry_bytes=8,
     before_s={"start": 1.0, "open": 2.0}, load_s=5.0, features_s=0.5, kept_features_s=0.1, features_kept=0.25,
     evidence_s=0.2, kept_evidence_s=0.01, evidence_kept=0.5,
@@ -72,7 +71,7 @@ def test_the_time_until_networks_are_loaded_is_no_view_s(first_s: float, at_once
     def observe(indices: Sequence[int]) -> _Observed:
         seconds = sum(0.5 if seen or i > 0 else first_s for i in range(len(indices)))
         seen.extend(indices)
-        return _Observed(Block([], [], [], []), seconds)
+        return _Observed(ViewBatch([], [], [], []), seconds)
 
     found, load_s = _observe_loaded([3, 5, 7, 9], observe, at_once)
     assert seen == [3, 5, 7, 9][:looked_at]

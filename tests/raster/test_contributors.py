@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Contributors, GaussianScene, RasterSettings, contributors, rasterize_evidence, render
-from normlift_ns.options import KNOWN_RULES
+from normlift_ns.options import GSPLAT_VERSIONS
 from tests.examples import examples
 from tests.raster.oracle import compositing_matrix
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
@@ -28,7 +28,9 @@ def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
 
 
 @examples(5)
-@given(seed=st.integers(0, 2**31), count=st.integers(1, 40), rules=st.sampled_from(KNOWN_RULES), blurred=st.booleans())
+@given(
+    seed=st.integers(0, 2**31), count=st.integers(1, 40), rules=st.sampled_from(GSPLAT_VERSIONS), blurred=st.booleans()
+)
 def test_they_are_those_of_the_python_loops(seed, count, rules, blurred):
     scene, camera = random_scene(40, seed=seed, size=0.4), orbit_camera(seed % 7, width=37, height=21)
     scene.opacities[::3] = 0.999  # which rules cap

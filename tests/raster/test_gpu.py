@@ -9,9 +9,9 @@ import torch
 
 from benchmarks.captures import SHARED, trained_scene, training_cameras
 from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
-from normlift_ns.core import gpu
-from normlift_ns.raster import gsplat, triton
-from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.core import device
+from normlift_ns.rasterization import gsplat, triton
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from tests.captures import fixture_view, needs_shared, weight_fixtures
 from tests.kernels.test_regions import hard_scene
 from tests.raster.test_gsplat_fixtures import fixture_difference
@@ -42,11 +42,11 @@ def test_gpu_backends_refuse_other_scenes(backend):
             render(scene, cameras[0], torch.ones(5, 1), backend=backend, dtype=dtype)
     if backend == "gsplat":
         with pytest.raises(ValueError, match=r'weight_power 2.*backend="triton"'):
-            gsplat.views_evidence(replace(job(scene), weight_power=2), Batch([], [], []))
+            gsplat.views_evidence(replace(job(scene), weight_power=2), RasterBatch([], [], []))
 
 
 def job(scene, **constants):
-    return Job(scene, False, RasterSettings(**constants), torch.float32)
+    return RasterJob(scene, False, RasterSettings(**constants), torch.float32)
 
 
 class OnGpu:
@@ -79,8 +79,8 @@ def test_gsplat_draws_what_its_compiled_code_can(on_gpu, monkeypatch):
         ("1.6.0", "1.4", "min_compensation, max_alpha"),
         ("1.6.0", "1.6", None),
     ):
-        monkeypatch.setattr(gsplat, "installed_version", lambda installed=installed: installed)
-        wanted = Job(on_gpu, False, RasterSettings.of_gsplat(rules), torch.float32)
+        monkeypatch.setattr(gsplat, "installed_gsplat_version", lambda installed=installed: installed)
+        wanted = RasterJob(on_gpu, False, RasterSettings.of_gsplat(rules), torch.float32)
         if changed is None:
             gsplat.check(wanted)
         else:
@@ -100,11 +100,11 @@ def test_a_missing_or_unknown_gsplat_is_said(monkeypatch):
         raise PackageNotFoundError(name)
 
     for version, told in ((missing, "not installed"), (lambda name: "7.1.0", r"7\.1\.0.* 1\.4, 1\.5, 1\.6")):
-        gsplat.installed_version.cache_clear()
+        gsplat.installed_gsplat_version.cache_clear()
         monkeypatch.setattr(gsplat, "version", version)
         with pytest.raises(ValueError, match=told):
-            gsplat.installed_rules()
-    gsplat.installed_version.cache_clear()
+            gsplat.installed_settings()
+    gsplat.installed_gsplat_version.cache_clear()
 
 
 def test_a_full_gpu_is_answered_by_smaller_parts():
@@ -116,14 +116,14 @@ def test_a_full_gpu_is_answered_by_smaller_parts():
             raise torch.cuda.OutOfMemoryError("no room")
         return sum(items)
 
-    assert gpu.in_parts(run, [1, 2, 3, 4, 5], "buy memory") == [3, 3, 9]
+    assert device.retry_in_halves(run, [1, 2, 3, 4, 5], "buy memory") == [3, 3, 9]
     assert asked == [5, 2, 3, 1, 2]
 
     def never(items):
         raise torch.cuda.OutOfMemoryError("no room")
 
     with pytest.raises(MemoryError, match=r"memory is full \(no room\); buy memory"):
-        gpu.in_parts(never, [1, 2], "buy memory")
+        device.retry_in_halves(never, [1, 2], "buy memory")
 
 
 @needs_gpu
@@ -171,9 +171,9 @@ def test_projection_is_that_of_gsplat_bit_for_bit(kind, mode):
         scene, camera = trained_scene("fox"), training_cameras("fox")[3]
     else:
         scene = hard_scene() if kind == "hard" else random_scene(20_000, seed=1, dtype=torch.float32, size=0.05)
-    rules = gsplat.installed_rules()
-    ready = Job(scene.to("cuda"), mode == "antialiased", rules, torch.float32)
-    _, seen, _ = triton.see(ready, [camera])
+    rules = gsplat.installed_settings()
+    ready = RasterJob(scene.to("cuda"), mode == "antialiased", rules, torch.float32)
+    _, seen, _ = triton.project_and_bin(ready, [camera])
     theirs = gsplat.project_views(ready, [camera])
     drawn = (theirs.radii[0].view(len(scene), -1) > 0).all(1) & (theirs.opacities[0] >= rules.min_alpha)
     found = torch.zeros_like(drawn)
@@ -199,9 +199,10 @@ def test_leaving_cells_out_changes_no_bit_on_a_gpu(rules, mode):
     scene = random_scene(20_000, seed=3, dtype=torch.float32, size=0.1).to("cuda")
     cameras = orbit(3, width=333, height=201, focal=300.0)
     labels = [random_labels(camera, 40, seed=v).cuda() for v, camera in enumerate(cameras)]
-    constants = Job(scene, mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
+    constants = RasterJob(scene, mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
     found, whole, again = (
-        triton.views_evidence(constants, Batch(cameras, labels, [40] * 3), cull=cull) for cull in (True, False, True)
+        triton.views_evidence(constants, RasterBatch(cameras, labels, [40] * 3), cull=cull)
+        for cull in (True, False, True)
     )
     for ours, theirs, repeated in zip(found[:3], whole[:3], again[:3]):
         assert torch.equal(ours, theirs)

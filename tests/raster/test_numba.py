@@ -14,11 +14,11 @@ import torch
 
 import normlift_ns
 from normlift_ns import Camera, GaussianScene, RasterSettings, rasterize_evidence, render
-from normlift_ns.raster import numba as backend
-from normlift_ns.raster import numba_kernels as kernels
-from normlift_ns.raster.backend import Batch, Job
-from normlift_ns.raster.numba_compiling import cached_njit
-from normlift_ns.raster.projection import assign_tiles, project
+from normlift_ns.rasterization import numba as backend
+from normlift_ns.rasterization import numba_kernels as kernels
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.numba_kernels import cached_njit
+from normlift_ns.rasterization.projection import assign_tiles, project
 from tests.scenes import dense, generator, orbit_camera, random_labels, random_scene
 
 DTYPES = [torch.float32, torch.float64]
@@ -35,7 +35,7 @@ def shapes_of_all_kinds(n: int, seed: int, dtype: torch.dtype) -> GaussianScene:
 
 
 def listed(scene: GaussianScene, camera: Camera, dtype: torch.dtype, rules: RasterSettings):
-    job = Job(scene, False, rules, dtype)
+    job = RasterJob(scene, False, rules, dtype)
     projected = project(job.world, camera, rules, antialiased=False)
     return job, projected, backend._tiles(projected, camera, rules)
 
@@ -56,9 +56,9 @@ def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed):
     first, used = np.cumsum(most) - most, np.zeros(len(most), np.int64)
     slots = tuple(np.empty(most.sum(), t) for t in (np.int32, np.int32, np.float64))
     regions = (projected.gaussian.numpy(), labels.numpy(), 1, 16)
-    kernels.fill(offsets, members, *arrays, everywhere, *regions, limits, first, used, slots, 3)
-    expected = kernels.merge(first, used, slots, 300, 7)
-    found = backend.views_evidence(job, Batch([camera], [labels], [6]))
+    kernels.sum_tiles(offsets, members, *arrays, everywhere, *regions, limits, first, used, slots, 3)
+    expected = kernels.merge_slots(first, used, slots, 300, 7)
+    found = backend.views_evidence(job, RasterBatch([camera], [labels], [6]))
     for got, exact in zip(found[:3], expected):
         assert torch.equal(got, torch.from_numpy(exact).to(got.dtype))
     assert len(found.weight) > 300
@@ -114,7 +114,7 @@ def test_exp_is_exact_to_the_last_bits(dtype, bound):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_what_is_warmed_is_what_is_called(dtype):
     """A call after `warm` finds every kernel with its types: it adds no signature."""
-    backend.warm(dtype).join()
+    backend.compile_kernels(dtype).join()
     before = {kernel: list(kernel.signatures) for kernel, _ in backend.kernel_signatures(dtype)}
     scene, camera = random_scene(20, dtype=dtype, size=0.4), orbit_camera(0.0)
     rasterize_evidence(scene, [camera], [random_labels(camera, 3)], backend="numba")
@@ -124,7 +124,7 @@ def test_what_is_warmed_is_what_is_called(dtype):
 
 CHILD = """
 import torch
-from normlift_ns.raster import numba as backend
+from normlift_ns.rasterization import numba as backend
 backend.warm(torch.float32).join()
 kernels = [kernel for kernel, _ in backend.kernel_signatures(torch.float32)]
 print(sum(sum(k.stats.cache_hits.values()) for k in kernels), sum(sum(k.stats.cache_misses.values()) for k in kernels))

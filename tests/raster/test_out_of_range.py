@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.raster import triton
-from normlift_ns.raster.backend import Batch, Job
+from normlift_ns.rasterization import triton
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from tests.examples import examples
 from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.scenes import dense, orbit, orbit_camera, random_labels, random_scene
@@ -131,8 +131,8 @@ def test_the_gpu_backend_leaves_out_and_draws_the_same(mode, rules):
     scene.means[32], scene.means[33, 1], scene.quats[34], scene.quats[35] = 1e19, torch.nan, 1e-30, 0
     scene.quats[36], scene.opacities[37] = 1e20, torch.nan
     labels = [random_labels(camera, 3, seed=v) for v, camera in enumerate(cameras)]
-    job = Job(scene.to(DEVICE), mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
-    entries = triton.views_evidence(job, Batch(cameras, [x.to(DEVICE) for x in labels], [3, 3]))
+    job = RasterJob(scene.to(DEVICE), mode == "antialiased", RasterSettings.of_gsplat(rules), torch.float32)
+    entries = triton.views_evidence(job, RasterBatch(cameras, [x.to(DEVICE) for x in labels], [3, 3]))
     found = Evidence.from_entries([entries], len(scene)).to("cpu")
     expected = evidence_of(scene, cameras, labels, "torch", rasterize_mode=mode, settings=job.settings)
     assert expected.num_excluded == 9

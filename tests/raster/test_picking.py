@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from normlift_ns import Camera, GaussianScene, render
-from normlift_ns.raster.picking import ray_weights
+from normlift_ns.rasterization.rasterize import ray_weights
 from tests.scenes import generator, random_scene
 
 

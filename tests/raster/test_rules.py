@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
-from normlift_ns.options import KNOWN_RULES
-from normlift_ns.raster import gsplat, triton
-from normlift_ns.raster.backend import Batch, Job
-from normlift_ns.raster.projection import assign_tiles, project, to_world
+from normlift_ns.options import GSPLAT_VERSIONS
+from normlift_ns.rasterization import gsplat, triton
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.projection import assign_tiles, prepare_gaussians, project
 from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.raster.oracle import compositing_matrix
 from tests.scenes import dense, generator, orbit, random_labels, random_scene
@@ -43,7 +43,7 @@ def drawn_by(rules: str, antialiased: bool):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_every_backend_draws_by_the_rules_and_these_differ(antialiased):
     found = []
-    for rules in KNOWN_RULES:
+    for rules in GSPLAT_VERSIONS:
         scene, camera, labels, weights, expected = drawn_by(rules, antialiased)
         found.append(weights)
         for backend in ("torch", "numba"):
@@ -68,8 +68,8 @@ def test_every_backend_draws_by_the_rules_and_these_differ(antialiased):
 def test_the_kernels_draw_by_the_rules(rules, antialiased):
     scene, camera, labels, _, expected = drawn_by(rules, antialiased)
     single = GaussianScene(*(x.float().to(DEVICE) for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
-    job = Job(single, antialiased, RasterSettings.of_gsplat(rules), torch.float32)
-    entries = triton.views_evidence(job, Batch([camera], [labels.to(DEVICE)], [4]))
+    job = RasterJob(single, antialiased, RasterSettings.of_gsplat(rules), torch.float32)
+    entries = triton.views_evidence(job, RasterBatch([camera], [labels.to(DEVICE)], [4]))
     found = torch.zeros(18, 5)
     found[entries.gaussian.long().cpu(), entries.column.long().cpu()] = entries.weight.cpu()
     assert (found[:, 1:] - expected).abs().max() < 1e-3 * expected.max()
@@ -80,9 +80,9 @@ def test_versions_have_rules(monkeypatch):
     assert RasterSettings.of_gsplat("1.4.0") == RasterSettings()
     with pytest.raises(ValueError, match=r"0\.9.* 1\.4, 1\.5, 1\.6"):
         RasterSettings.of_gsplat("0.9")
-    monkeypatch.setattr(gsplat, "installed_version", lambda: "1.5.3")
+    monkeypatch.setattr(gsplat, "installed_gsplat_version", lambda: "1.5.3")
     asked = (("auto", None), ("auto", "1.5"), ("1.6", "1.4"), ("installed", "1.4"))
-    assert [gsplat.rules_named(*x) for x in asked] == ["1.4", "1.5", "1.6", "1.5"]
+    assert [gsplat.resolve_gsplat_rules(*x) for x in asked] == ["1.4", "1.5", "1.6", "1.5"]
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def stock(monkeypatch):
             scene = GaussianScene(means, quats, scales, torch.ones(n))
             constants = RasterSettings.of_gsplat("1.5" if later else "1.4")
             known = options.get("opacities", torch.full((n,), 1e4))  # without, they shrink no rectangle
-            world = to_world(scene, torch.float32)
+            world = prepare_gaussians(scene, torch.float32)
             seen = project(world._replace(opacities=known[world.gaussian]), camera, constants, antialiased)
             radii, means2d, conics = torch.zeros(n, 2), torch.zeros(n, 2), torch.zeros(n, 3)
             compensations, at = torch.zeros(n), seen.gaussian
@@ -132,8 +132,8 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
     scene.scales[0] = 4.8e8
     settings = RasterSettings.of_gsplat(rules)
     stock(later, camera, antialiased)
-    found = gsplat.project_views(Job(scene, antialiased, settings, torch.float32), [camera])
-    seen = project(to_world(scene, torch.float32), camera, settings, antialiased)
+    found = gsplat.project_views(RasterJob(scene, antialiased, settings, torch.float32), [camera])
+    seen = project(prepare_gaussians(scene, torch.float32), camera, settings, antialiased)
     tiles = assign_tiles(seen, camera.width, camera.height, settings.tile_size)
     bounds = [*found.offsets.flatten().tolist(), len(found.members)]
     for tile, (first, last) in enumerate(itertools.pairwise(bounds)):
@@ -151,7 +151,7 @@ def test_stock_gsplat_of_any_version_gives_the_lists_of_the_rules(later, rules, 
 
 def test_pictures_of_any_number_of_channels():
     scene, (camera,) = hard_scene(), orbit(1, width=18, height=17)
-    job = Job(scene.to(DEVICE), False, RasterSettings(), torch.float32)
+    job = RasterJob(scene.to(DEVICE), False, RasterSettings(), torch.float32)
     for channels in (0, 19):
         values = torch.rand(len(scene), channels, generator=generator(0))
         found = triton.composite(job, camera, values.to(DEVICE))

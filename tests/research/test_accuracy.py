@@ -15,13 +15,7 @@ from benchmarks.variants import (
     only,
     refined_scores,
 )
-from normlift_ns import (
-    RefineConfig,
-    lift,
-    nearest_neighbors,
-    rasterize_evidence,
-    refine_variant,
-)
+from normlift_ns import RefineConfig, lift, nearest_neighbors, rasterize_evidence, refine_variant
 from tests.research import quick
 from tests.research.tiny import CLASSES, WORDS
 from tests.scenes import dense

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.box_overlap import box_iou, half_spaces, intersection_volume
-from normlift_ns.objects.boxes import OrientedBox
+from normlift_ns.analysis.objects import OrientedBox
 from tests.examples import examples
 
 

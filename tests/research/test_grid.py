@@ -14,7 +14,7 @@ from benchmarks.pieces import KINDS, observe_pieces, pieces
 from benchmarks.second_room import second
 from benchmarks.worlds import World, made_words
 from normlift_ns import RefineConfig, lift, nearest_neighbors
-from normlift_ns.core.ablations import variant_source
+from normlift_ns.evaluation.studies import variant_source
 from tests.research import ROOT, quick
 from tests.research.tiny import CLASSES, WORDS
 from tests.scenes import generator

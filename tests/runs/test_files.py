@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from normlift_ns.core.disk.manifest import MANIFEST, check_files, read_manifest
-from normlift_ns.core.files import refuse_existing, refuse_run_files
-from normlift_ns.encoders.texts.files import write_text_vectors
+from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
-from normlift_ns.runs.files import check_run, digests_beside, refuse_existing_run, sealed
+from normlift_ns.io.atomic import refuse_existing, refuse_run_files
+from normlift_ns.io.manifest import MANIFEST_FILE, check_file_digests, read_manifest
+from normlift_ns.io.run_dir import add_digest_comment, check_run, refuse_existing_run, run_file_digests
 from tests.core.test_digests import as_version_0_1, example, flipped
 from tests.hostile import no_files
 
@@ -23,14 +23,14 @@ CONFIG = "method_name: normlift\ntimestamp: größe\n"
 def write_run(run: Path, seed: int = 0) -> Path:
     """What surrounds a field; its loaders are tested elsewhere."""
     run.mkdir(parents=True)
-    (run / "config.yml").write_text(sealed(CONFIG), "utf8")
+    (run / "config.yml").write_text(add_digest_comment(CONFIG), "utf8")
     (run / "dataparser_transforms.json").write_text(json.dumps({"scale": 1.0, "seed": seed}))
     (run / "nerfstudio_models").mkdir()
     (run / "nerfstudio_models" / "step-000000007.ckpt").write_bytes(bytes(range(seed, seed + 99)))
-    write_text_vectors(run / "normlift" / "texts.npz", {"fox": torch.arange(1.0 + seed, 5.0 + seed)})
+    write_text_embeddings(run / "normlift" / "texts.npz", {"fox": torch.arange(1.0 + seed, 5.0 + seed)})
     beside = [*run.glob("*.json"), *run.glob("*/*.ckpt"), *run.glob("*/*.npz"), run / "absent.json", run.parent / "x"]
     (run.parent / "x").write_text("elsewhere")
-    example("float16").save(run / "normlift", beside=digests_beside(run / "normlift", beside))
+    example("float16").save(run / "normlift", beside=run_file_digests(run / "normlift", beside))
     return run
 
 
@@ -95,12 +95,12 @@ def test_a_manifest_leads_nowhere_else(tmp_path: Path) -> None:
     for i, name in enumerate(["/etc/passwd", "../../x", "../a/b", "..", ".", "", "a/b", "a\0", "\udcff", "../.x"]):
         example("float16").save(tmp_path / str(i), beside={name: "xxh3_128:0"})
         with pytest.raises(InputError, match=r"manifest\.json is damaged"):
-            check_files(tmp_path / str(i))
+            check_file_digests(tmp_path / str(i))
 
 
 def test_what_is_no_file_is_refused_or_absent(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    paths = [run / BESIDE[0], run / "config.yml", run / "normlift" / MANIFEST]
+    paths = [run / BESIDE[0], run / "config.yml", run / "normlift" / MANIFEST_FILE]
     for kinds in zip(*map(no_files, paths)):
         if kinds[0] in ("nothing", "a link to nothing", "a link to itself"):
             check_run(run)

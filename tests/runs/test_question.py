@@ -13,26 +13,25 @@ from hypothesis import HealthCheck, given
 from safetensors.torch import save_file
 
 from normlift_ns import InputError
-from normlift_ns.core.disk.manifest import read_manifest, write_manifest
-from normlift_ns.core.disk.tensors import save_tensors
-from normlift_ns.question import Question
-from normlift_ns.runs.question import load_question, save_question
-from normlift_ns.text_encoders import encoder_digest
+from normlift_ns.io.arrays import save_tensors
+from normlift_ns.io.manifest import read_manifest, write_manifest
+from normlift_ns.query.question import Query, load_query, save_query
+from normlift_ns.query.text_encoder import encoder_digest
 from tests.core.test_digests import flipped
 from tests.examples import examples
 from tests.hostile import damaged, fuzz, hostile_json, no_files, survives
 
-WHOLE = Question(
+WHOLE = Query(
     ("a; b", "größe\n"), torch.eye(3)[:2], ("c",), torch.ones(1, 3), "margin", 0.02, min_reliability=0.5, refined=False
 )
 
 
 def test_what_is_stored_is_loaded(tmp_path: Path) -> None:
-    assert load_question(tmp_path) is None
-    save_question(tmp_path, Question(("old",), torch.ones(1, 3)))
-    for question in (WHOLE, Question(("a",), torch.eye(3)[:1])):
-        save_question(tmp_path, question)
-        loaded = load_question(tmp_path)
+    assert load_query(tmp_path) is None
+    save_query(tmp_path, Query(("old",), torch.ones(1, 3)))
+    for question in (WHOLE, Query(("a",), torch.eye(3)[:1])):
+        save_query(tmp_path, question)
+        loaded = load_query(tmp_path)
         assert loaded is not None
         for name, value in vars(question).items():
             if isinstance(value, np.ndarray):
@@ -44,12 +43,12 @@ def test_what_is_stored_is_loaded(tmp_path: Path) -> None:
 
 def test_nothing_is_stored_in_a_run_that_is_gone_or_was_replaced(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"normlift "):
-        save_question(tmp_path / "normlift", WHOLE)
+        save_query(tmp_path / "normlift", WHOLE)
     assert list(tmp_path.iterdir()) == []
     manifest = {"num_gaussians": 1, "means_fingerprint": "", "form": "float16", "schema_version": 1, "features": {}}
     write_manifest(tmp_path, {**manifest, "dimension": 4}, {})
     with pytest.raises(InputError, match=r" 3 .* 4"):
-        save_question(tmp_path, WHOLE)
+        save_query(tmp_path, WHOLE)
     assert not (tmp_path / "queries.safetensors").exists()
 
 
@@ -66,19 +65,19 @@ def test_a_damaged_file_says_what_to_do(tmp_path: Path) -> None:
         metadata = None if facts is None else {"question": facts}
         save_file({"vectors": torch.eye(3)[:1]}, tmp_path / "queries.safetensors", metadata=metadata)
         with damaged_question(""):
-            load_question(tmp_path)
-    path = save_question(tmp_path, WHOLE)
+            load_query(tmp_path)
+    path = save_query(tmp_path, WHOLE)
     whole = path.read_bytes()
     for bit in range(0, 8 * len(whole), 43):
         path.write_bytes(flipped(whole, bit))
         with damaged_question(""):
-            load_question(tmp_path)
+            load_query(tmp_path)
     for what in no_files(path):
         if what == "nothing":
-            assert load_question(tmp_path) is None
+            assert load_query(tmp_path) is None
         else:
             with pytest.raises(InputError, match=r"queries\.safetensors is damaged"):
-                load_question(tmp_path)
+                load_query(tmp_path)
 
 
 def store(folder: Path, facts: object, **tensors: torch.Tensor) -> Path:
@@ -110,7 +109,7 @@ def test_facts_have_their_types_and_ranges(tmp_path: Path) -> None:
     ):
         store(tmp_path, {**FACTS, **changes})
         with damaged_question(message):
-            load_question(tmp_path)
+            load_query(tmp_path)
 
 
 def test_a_question_of_another_run_is_refused(tmp_path: Path) -> None:
@@ -119,19 +118,19 @@ def test_a_question_of_another_run_is_refused(tmp_path: Path) -> None:
         features = {} if weights is None else {"encoder": {"kind": "open_clip", "pretrained": weights}}
         write_manifest(tmp_path / name, {**manifest, "features": features}, {})
     first = encoder_digest(read_manifest(tmp_path / "a")[0])
-    path = save_question(tmp_path / "a", replace(WHOLE, encoder=first))
-    assert load_question(tmp_path / "a") is not None
+    path = save_query(tmp_path / "a", replace(WHOLE, encoder=first))
+    assert load_query(tmp_path / "a") is not None
     for name in ("b", "c"):
         shutil.copy(path, tmp_path / name)
     with pytest.raises(InputError, match=r"queries\.safetensors is damaged .*another encoder"):
-        load_question(tmp_path / "b")
-    assert load_question(tmp_path / "c") is not None  # nobody knows
-    save_question(tmp_path / "b", WHOLE)  # of a click
-    assert load_question(tmp_path / "b") is not None
+        load_query(tmp_path / "b")
+    assert load_query(tmp_path / "c") is not None  # nobody knows
+    save_query(tmp_path / "b", WHOLE)  # of a click
+    assert load_query(tmp_path / "b") is not None
     (tmp_path / "a" / "manifest.json").unlink()
     write_manifest(tmp_path / "a", {**manifest, "dimension": 4}, {})
     with pytest.raises(InputError, match=r" 3 .* 4"):
-        load_question(tmp_path / "a")
+        load_query(tmp_path / "a")
 
 
 def test_vectors_fit_the_texts(tmp_path: Path) -> None:
@@ -149,14 +148,14 @@ def test_vectors_fit_the_texts(tmp_path: Path) -> None:
     ):
         store(tmp_path, FACTS, **tensors)
         with damaged_question(message):
-            load_question(tmp_path)
+            load_query(tmp_path)
     facts = {**FACTS, "negatives": ["b", "c"], "form": "lerf"}
     store(tmp_path, facts, negative_vectors=torch.ones(2, 3))
-    assert load_question(tmp_path) is not None
+    assert load_query(tmp_path) is not None
     for wrong in (torch.ones(1, 3), torch.ones(2, 4), torch.zeros(2, 3)):
         store(tmp_path, facts, negative_vectors=wrong)
         with damaged_question("(negative_vectors of 2 texts|'b' is zero)"):
-            load_question(tmp_path)
+            load_query(tmp_path)
 
 
 def test_a_question_that_could_not_be_loaded_is_not_stored(tmp_path: Path) -> None:
@@ -170,7 +169,7 @@ def test_a_question_that_could_not_be_loaded_is_not_stored(tmp_path: Path) -> No
         {"texts": ("a", "\ud800")},
     ):
         with pytest.raises(InputError, match="cannot be stored"):
-            save_question(tmp_path, replace(WHOLE, **changes))  # type: ignore[arg-type]
+            save_query(tmp_path, replace(WHOLE, **changes))  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -179,8 +178,8 @@ def test_hostile_facts_and_damaged_files_raise_our_errors_only(tmp_path: Path) -
     @given(hostile_json(FACTS))
     def run(text: bytes) -> None:
         store(tmp_path, text.decode())
-        survives(lambda: load_question(tmp_path))
+        survives(lambda: load_query(tmp_path))
 
     run()
-    path = save_question(tmp_path, WHOLE)
-    fuzz(15, damaged(path.read_bytes()), path, lambda: load_question(tmp_path))
+    path = save_query(tmp_path, WHOLE)
+    fuzz(15, damaged(path.read_bytes()), path, lambda: load_query(tmp_path))

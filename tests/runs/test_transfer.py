@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import InputError
-from normlift_ns.runs.transfer import nearest_rows, places, read_cloud, write_cloud
+from normlift_ns.exports import nearest_gaussians, read_cloud, vertex_positions, write_cloud
 from tests.examples import examples
 
 
@@ -19,7 +19,7 @@ def test_nearest_rows_are_those_of_loops(seed, most):
     g = np.random.default_rng(seed)
     points, means = g.normal(size=(20, 3)), g.normal(size=(15, 3))
     points[3] = [np.nan, 0, np.inf]
-    found = nearest_rows(points, means, most)
+    found = nearest_gaussians(points, means, most)
     for i, point in enumerate(points):
         distances = [float(np.sqrt(((point - mean) ** 2).sum())) for mean in means]
         if i == 3:
@@ -31,7 +31,7 @@ def test_nearest_rows_are_those_of_loops(seed, most):
 
 def test_points_however_far_away_have_no_label():
     for far in (1e150, 1e200, 1e300, np.finfo(np.float64).max):
-        found = nearest_rows(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
+        found = nearest_gaussians(np.array([[far, -far, 0], [0, 0, 1]]), np.zeros((3, 3)), 2.0)
         assert found.near.tolist() == [False, True] and set(found.row) <= {0, 1, 2}, far
 
 
@@ -48,7 +48,7 @@ def cloud(path: Path, *, text: bool = False, order: str = "<") -> np.ndarray:
 def test_all_else_of_a_cloud_stays(how, tmp_path):
     table = cloud(tmp_path / "a.ply", **how)
     read = read_cloud(tmp_path / "a.ply")
-    assert places(read)[2].tolist() == [2, 2, 3]
+    assert vertex_positions(read)[2].tolist() == [2, 2, 3]
     columns = {"relevancy_0": np.arange(5, dtype=np.float32), "class_id": np.arange(5).astype(np.uint32)}
     write_cloud(tmp_path / "b.ply", read, columns)
     again = PlyData.read(tmp_path / "b.ply")

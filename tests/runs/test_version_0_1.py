@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 import normlift_ns as nl
-from normlift_ns.scripts import evaluate, export, lift, query
+from normlift_ns.cli import evaluate, export, lift, query
 from tests.golden.summary import differences, without_news
 from tests.scripts.conftest import run_entry
 
@@ -60,9 +60,9 @@ def test_our_commands_answer_as_before(config: Path, tmp_path: Path, monkeypatch
 def test_stock_nerfstudio_loads_them(config: Path) -> None:
     from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
 
-    from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin.views import relocate_config  # noqa: PLC0415
 
-    pipeline = eval_setup(config, update_config_callback=lambda loaded: rerooted(loaded, config))[1]
+    pipeline = eval_setup(config, update_config_callback=lambda loaded: relocate_config(loaded, config))[1]
     run = nl.open_run(config)
     stored = run.ask_stored()
     assert stored is not None

@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 
 import normlift_ns as nl
-from normlift_ns.core.storage import StoredEvidence
-from normlift_ns.demo import DemoRoom
-from normlift_ns.runs.votes import Votes
+from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.demo.room import DemoRoom
 
 LINE = torch.tensor([255, 176, 0], dtype=torch.uint8)
 
@@ -73,7 +73,7 @@ def test_pictures_outline_what_is_red(run: nl.LiftedRun) -> None:
 
 def test_what_the_cache_no_longer_holds_is_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     mask = run.ask("red").mask
-    votes = Votes(run.scene, run.field, tmp_path / "emptied")
+    votes = RecordedVotes(run.scene, run.field, tmp_path / "emptied")
     if isinstance(run.field.store, StoredEvidence):
         assert votes.explain(mask).views == run.why(run.ask("red")).views
         return
@@ -88,12 +88,12 @@ def test_photographs_that_are_gone_replaced_or_unknown_are_named(
     for told, message in ((None, "older version"), ([1], "older version"), ([*names, "x.png"], r"1 of 7 .*x\.png")):
         other = replace(run.field, manifest={**run.field.manifest, "views_lifted": told})
         with pytest.raises(nl.InputError, match=message):
-            _ = Votes(run.scene, other, tmp_path).names
+            _ = RecordedVotes(run.scene, other, tmp_path).names
     if not isinstance(run.field.store, StoredEvidence):
         return  # such a run finds its evidence by the content of the photographs
     fewer = replace(run.field, manifest={**run.field.manifest, "views_lifted": names[:-1]})
     with pytest.raises(nl.InputError, match=r" 5 .* 6"):
-        _ = Votes(run.scene, fewer, tmp_path).names
+        _ = RecordedVotes(run.scene, fewer, tmp_path).names
     moved = tmp_path / "room"
     shutil.copytree(trained.parents[4] / "room", moved)
     opened = nl.open_run(run.config, data=moved)

@@ -12,25 +12,24 @@ import torch
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
-from normlift_ns.scenes.frames import Frame, Intrinsics
-from normlift_ns.scenes.opening import SplatScene
-from normlift_ns.scenes.saved import checkpoint_of, save_splat
-from normlift_ns.scenes.splat import Splat
+from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.open_splat import SplatScene, save_splat, splatfacto_checkpoint
+from normlift_ns.data.splat import SplatParameters
 
 NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 
-def random_splat(n: int = 200, degree: int = 3, seed: int = 0) -> Splat:
+def random_splat(n: int = 200, degree: int = 3, seed: int = 0) -> SplatParameters:
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=g)
 
     rest = normal(n, (degree + 1) ** 2 - 1, 3)
-    return Splat(normal(n, 3), normal(n, 4), normal(n, 3) - 4, normal(n, 1), normal(n, 3), rest)
+    return SplatParameters(normal(n, 3), normal(n, 4), normal(n, 3) - 4, normal(n, 1), normal(n, 3), rest)
 
 
-def ply_columns(splat: Splat) -> dict[str, np.ndarray]:
+def ply_columns(splat: SplatParameters) -> dict[str, np.ndarray]:
     columns = {name: splat.means[:, i] for i, name in enumerate("xyz")}
     columns |= {name: torch.zeros(len(splat)) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{i}": splat.features_dc[:, i] for i in range(3)}
@@ -60,7 +59,7 @@ def write_ply(
     return path
 
 
-def write_gsplat(path: Path, splat: Splat, *, step: int = 29999, **more: object) -> Path:
+def write_gsplat(path: Path, splat: SplatParameters, *, step: int = 29999, **more: object) -> Path:
     """As gsplat's simple_trainer saves it."""
     splats = {"means": splat.means, "quats": splat.quats, "scales": splat.scales, "opacities": splat.opacities[:, 0]}
     splats |= {"sh0": splat.features_dc[:, None], "shN": splat.features_rest}
@@ -70,15 +69,15 @@ def write_gsplat(path: Path, splat: Splat, *, step: int = 29999, **more: object)
 
 def saved_run(folder: Path, scene: SplatScene) -> Path:
     """The files of a scene in the folder of its run."""
-    content = checkpoint_of(scene)
+    content = splatfacto_checkpoint(scene)
     (folder / "nerfstudio_models").mkdir(parents=True)
     torch.save(content, folder / "nerfstudio_models" / f"step-{content['step']:09d}.ckpt")
     save_splat(folder, scene)
     return folder
 
 
-def rows_of(splat: Splat, rows: slice) -> Splat:
-    return Splat(**{name: value[rows] for name, value in splat.parameters.items()})
+def rows_of(splat: SplatParameters, rows: slice) -> SplatParameters:
+    return SplatParameters(**{name: value[rows] for name, value in splat.parameters.items()})
 
 
 def camera_parameters(model: str, c: Intrinsics) -> list[float]:

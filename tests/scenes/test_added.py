@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from normlift_ns import InputError, LiftOptions, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
-from normlift_ns.scenes.added import add_photographs
-from normlift_ns.scenes.nerfstudio.load import NerfstudioScene
-from normlift_ns.scenes.splat import Splat
+from normlift_ns.data.extra_images import add_extra_images
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.data.splat import SplatParameters
 from tests.scenes.made import ply_columns, write_ply
 
 TURNED = np.array([[0.0, -3.0, 0.0, 5.0], [0.0, 0.0, -3.0, 1.0], [3.0, 0.0, 0.0, -2.0], [0.0, 0.0, 0.0, 1.0]])
@@ -57,7 +57,7 @@ def larger(scene: NerfstudioScene, tmp_path: Path) -> Callable[..., Path]:
 
 
 def test_new_cameras_stand_in_the_world_of_the_scene(scene, larger) -> None:
-    found = add_photographs(scene, larger(TURNED))
+    found = add_extra_images(scene, larger(TURNED))
     before = len(scene.train)
     assert found.train.names[:before] == list(scene.train.names) and len(found.train) == before + 2
     assert [Path(name).name for name in found.train.names[before:]] == ["before.png", "later_1.png"]
@@ -73,10 +73,10 @@ def test_new_cameras_stand_in_the_world_of_the_scene(scene, larger) -> None:
 
 
 def test_splats_take_them_too(scene, larger, tmp_path: Path) -> None:
-    write_ply(tmp_path / "splat.ply", ply_columns(Splat(**scene.parameters)))
+    write_ply(tmp_path / "splat.ply", ply_columns(SplatParameters(**scene.parameters)))
     transforms, world = scene.location.folder / "transforms.json", scene.location.run_dir / "dataparser_transforms.json"
     splat = open_splat(tmp_path / "splat.ply", SplatOptions(transforms=transforms, world_transform=world))
-    found = add_photographs(splat, larger(TURNED))
+    found = add_extra_images(splat, larger(TURNED))
     assert len(found.train) == len(splat.train) + 2
     place = [Path(name).name for name in found.train.names].index("before.png")
     expected = scene.train.cameras[4].world_to_camera
@@ -86,19 +86,19 @@ def test_splats_take_them_too(scene, larger, tmp_path: Path) -> None:
 def test_worlds_that_differ_are_refused_by_name(scene, larger) -> None:
     moved = scene.train.names[3]
     with pytest.raises(InputError, match=rf"{Path(moved).name} .*14 old"):
-        add_photographs(scene, larger(move=moved))
+        add_extra_images(scene, larger(move=moved))
     with pytest.raises(InputError, match="already belong to"):
-        add_photographs(scene, larger(frames=slice(0, -2)))
+        add_extra_images(scene, larger(frames=slice(0, -2)))
     with pytest.raises(InputError, match="has 1 of the"):
-        add_photographs(scene, larger(frames=slice(-3, None)))
+        add_extra_images(scene, larger(frames=slice(-3, None)))
     with pytest.raises(InputError, match="has 0 of the"):
-        add_photographs(scene, larger(frames=slice(-2, None)))
+        add_extra_images(scene, larger(frames=slice(-2, None)))
 
 
 def test_a_lifted_run_knows_them(scene, larger, tmp_path: Path) -> None:
     options = {"source": SourceOptions(encoder="colour", regions="grid", region_count=48), "device": "cpu"}
     how = {"lift": LiftOptions(refine=False), "output_dir": tmp_path / "out", "check": False, **options}
-    run = lift_run(add_photographs(scene, larger(TURNED)), **how)
+    run = lift_run(add_extra_images(scene, larger(TURNED)), **how)
     again = open_run(run.config)
     assert again.field.manifest["views_lifted"] == again.scene.train.names
     assert len(again.scene.train) == len(scene.train) + 2

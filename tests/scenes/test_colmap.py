@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from normlift_ns.data.colmap import (
+    colmap_intrinsics,
+    colmap_pose,
+    find_colmap_model,
+    read_colmap_model,
+    read_colmap_points,
+)
+from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.colmap import intrinsics_of, model_folder, pose_of, read_model, read_points
-from normlift_ns.scenes.frames import Frame, Intrinsics
 from tests.hostile import damaged, fuzz
 from tests.scenes.made import write_colmap
 
@@ -22,11 +28,11 @@ KEPT = {
 
 
 def read_cameras(folder: Path) -> dict[int, Intrinsics]:
-    return {number: intrinsics_of(camera, folder) for number, camera in read_model(folder)[0].items()}
+    return {number: colmap_intrinsics(camera, folder) for number, camera in read_colmap_model(folder)[0].items()}
 
 
 def read_images(folder: Path) -> list:
-    return sorted(read_model(folder)[1], key=lambda image: image.name)
+    return sorted(read_colmap_model(folder)[1], key=lambda image: image.name)
 
 
 def frames(count: int = 5) -> list[Frame]:
@@ -43,32 +49,32 @@ def test_projects_are_read(tmp_path: Path) -> None:
     for model, kept in KEPT.items():
         for binary in (False, True):
             project = write_colmap(tmp_path / f"{model}{binary}", frames(), model, binary=binary, points=points)
-            folder = model_folder(project)
+            folder = find_colmap_model(project)
             cameras, images = read_cameras(folder), read_images(folder)
             assert [image.name for image in images] == [f"photo {i}.jpg" for i in range(5)]
             lost = {name: 0.0 for name in ("k1", "k2", "p1", "p2") if name not in kept}
             for image, frame in zip(images, frames()):
-                assert np.allclose(pose_of(image), frame.pose, atol=1e-12)
+                assert np.allclose(colmap_pose(image), frame.pose, atol=1e-12)
                 assert cameras[image.camera] == DISTORTED._replace(**lost), (model, binary)
-            assert np.array_equal(read_points(folder), points)
+            assert np.array_equal(read_colmap_points(folder), points)
 
 
 def test_the_project_is_found_where_it_lies(tmp_path: Path) -> None:
     write_colmap(tmp_path / "a", frames())
     found = tmp_path / "a" / "sparse" / "0"
-    assert model_folder(tmp_path / "a") == found == model_folder(found)
+    assert find_colmap_model(tmp_path / "a") == found == find_colmap_model(found)
     (tmp_path / "b").mkdir()
     for name, message in (("b", "COLMAP"), ("c", "no folder")):
         with pytest.raises(FileNotFoundError, match=message):
-            model_folder(tmp_path / name)
+            find_colmap_model(tmp_path / name)
 
 
 def test_unknown_models_and_missing_files_are_named(tmp_path: Path) -> None:
     for binary in (False, True):
-        folder = model_folder(write_colmap(tmp_path / str(binary), frames(), "OPENCV_FISHEYE", binary=binary))
+        folder = find_colmap_model(write_colmap(tmp_path / str(binary), frames(), "OPENCV_FISHEYE", binary=binary))
         with pytest.raises(InputError, match=r"OPENCV_FISHEYE; .* SIMPLE_PINHOLE, PINHOLE"):
             read_cameras(folder)
-    folder = model_folder(write_colmap(tmp_path, frames()))
+    folder = find_colmap_model(write_colmap(tmp_path, frames()))
     for name, start, count, message in (
         ("cameras", 12, b"\x4d", r"cameras\.bin .* 77"),
         ("cameras", 0, struct.pack("<Q", 10**12), "1,000,000,000,000"),  # more than the file can hold
@@ -87,7 +93,7 @@ def test_unknown_models_and_missing_files_are_named(tmp_path: Path) -> None:
 
 
 def test_lines_that_make_no_sense_are_refused(tmp_path: Path) -> None:
-    folder = model_folder(write_colmap(tmp_path, frames(), binary=False))
+    folder = find_colmap_model(write_colmap(tmp_path, frames(), binary=False))
     for name, line, read in (
         ("cameras", "1 PINHOLE 640 480 500 500 320", read_cameras),
         ("cameras", "1 PINHOLE 640", read_cameras),
@@ -95,8 +101,8 @@ def test_lines_that_make_no_sense_are_refused(tmp_path: Path) -> None:
         ("images", "1 1 0 0 0 0 0 0", read_images),
         ("images", "1 nan 0 0 0 0 0 0 1 a.jpg", read_images),
         ("images", "1 0 0 0 0 0 0 0 1 a.jpg", read_images),
-        ("points3D", "1 2 3", read_points),
-        ("points3D", "1 nan 3 4 0 0 0 1", read_points),
+        ("points3D", "1 2 3", read_colmap_points),
+        ("points3D", "1 nan 3 4 0 0 0 1", read_colmap_points),
     ):
         whole = (folder / f"{name}.txt").read_text()
         (folder / f"{name}.txt").write_text(line + "\n")
@@ -106,7 +112,7 @@ def test_lines_that_make_no_sense_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
-    folder = model_folder(write_colmap(tmp_path, frames(), "PINHOLE", binary=False))
+    folder = find_colmap_model(write_colmap(tmp_path, frames(), "PINHOLE", binary=False))
     cameras, images = (folder / "cameras.txt").read_text(), (folder / "images.txt").read_text()
     for changed, message in (
         (cameras + cameras.splitlines()[-1], "twice"),
@@ -116,18 +122,18 @@ def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
     ):
         (folder / "cameras.txt").write_text(changed)
         with pytest.raises(InputError, match=message):
-            read_model(folder)
+            read_colmap_model(folder)
     (folder / "cameras.txt").write_text(cameras)
     (folder / "images.txt").write_text(images + "\n".join(images.splitlines()[-2:]))
     with pytest.raises(InputError, match="same ID"):
-        read_model(folder)
+        read_colmap_model(folder)
     (folder / "images.txt").write_text("# none")
     with pytest.raises(InputError, match="0 registered images"):
-        read_model(folder)
+        read_colmap_model(folder)
 
 
 def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> None:
-    folder = model_folder(write_colmap(tmp_path, frames(), binary=False))
+    folder = find_colmap_model(write_colmap(tmp_path, frames(), binary=False))
     expected = read_images(folder)
     lines = (folder / "images.txt").read_text().splitlines()
     pairs = [f"\n{first}\n{second}\n" for first, second in zip(lines[2::2], lines[3::2])]
@@ -141,11 +147,15 @@ def test_text_files_with_blank_lines_and_a_byte_order_mark(tmp_path: Path) -> No
 def test_no_damage_gets_through_as_another_error(tmp_path: Path) -> None:
     for suffix in ("bin", "txt"):
         project = write_colmap(tmp_path / suffix, frames(2), binary=suffix == "bin", points=np.eye(3))
-        model = model_folder(project)
+        model = find_colmap_model(project)
 
         def load(folder: Path = model) -> None:
             try:
-                _ = read_points(folder), read_cameras(folder), [pose_of(image) for image in read_images(folder)]
+                _ = (
+                    read_colmap_points(folder),
+                    read_cameras(folder),
+                    [colmap_pose(image) for image in read_images(folder)],
+                )
             except (InputError, FileNotFoundError) as error:
                 assert str(folder) in str(error)
                 raise

@@ -22,17 +22,19 @@ import torch
 from hypothesis import strategies as st
 from PIL import Image
 
+from normlift_ns.data.checkpoint import (
+    GAUSSIAN_PARAMETERS,
+    Checkpoint,
+    allow_numpy_scalars,
+    read_checkpoint,
+    read_gsplat_checkpoint,
+)
+from normlift_ns.data.frames import Frame, Intrinsics, check_frames, rescale_intrinsics
+from normlift_ns.data.images import ImageViews
+from normlift_ns.data.open_splat import SplatScene, open_saved_splat
+from normlift_ns.data.splat import read_ply
+from normlift_ns.data.transforms import read_dataparser_transforms, read_transforms, read_world_transform
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.checkpoint import GAUSSIAN_PARAMETERS, Checkpoint, read_checkpoint
-from normlift_ns.scenes.formats.gsplat_checkpoint import read_gsplat
-from normlift_ns.scenes.formats.ply import read_ply
-from normlift_ns.scenes.frames import Frame, Intrinsics, check_frames, sized
-from normlift_ns.scenes.opening import SplatScene
-from normlift_ns.scenes.photographs import PhotographViews
-from normlift_ns.scenes.saved import open_saved_splat
-from normlift_ns.scenes.similarity import read_dataparser_transforms, read_world_transform
-from normlift_ns.scenes.transforms import read_transforms
-from normlift_ns.scenes.unpickling import numbers_allowed
 from tests.hostile import damaged, fuzz, hostile_json, no_files
 from tests.scenes.made import ply_columns, random_splat, saved_run, write_gsplat, write_ply
 
@@ -102,7 +104,7 @@ def test_steps_that_are_not_numbers_or_not_those_of_the_name_are_refused(tmp_pat
         with pytest.raises(InputError, match="its step is"):
             read_checkpoint(saved(tmp_path, {"step": step, "pipeline": state()}))
         with pytest.raises(InputError, match="its step is"):
-            read_gsplat(write_gsplat(tmp_path / "ckpt_7_rank0.pt", random_splat(N), step=step))
+            read_gsplat_checkpoint(write_gsplat(tmp_path / "ckpt_7_rank0.pt", random_splat(N), step=step))
     with pytest.raises(InputError, match=r"step-000000008\.ckpt"):
         read_checkpoint(saved(tmp_path, {"step": 8, "pipeline": state()}))
 
@@ -184,11 +186,11 @@ def test_images_of_all_modes_become_rgb_or_are_refused(tmp_path: Path) -> None:
     red = Image.new("RGB", (40, 30), (250, 0, 0))
     for mode in ("P", "RGBA", "L", "LA", "1", "CMYK"):
         kind = "TIFF" if mode == "CMYK" else "PNG"
-        view = PhotographViews([image_frame(tmp_path, red.convert(mode), kind)], BLACK)[0]
+        view = ImageViews([image_frame(tmp_path, red.convert(mode), kind)], BLACK)[0]
         assert view.image.shape == (30, 40, 3)
         assert view.image[0, 0].tolist() == list(red.convert(mode).convert("RGB").getpixel((0, 0))), mode
     for mode, kind in (("I;16", "PNG"), ("F", "TIFF")):
-        views = PhotographViews([image_frame(tmp_path, Image.new(mode, (40, 30)), kind)], BLACK)
+        views = ImageViews([image_frame(tmp_path, Image.new(mode, (40, 30)), kind)], BLACK)
         for read in (views.check_files, lambda views=views: views[0]):
             with pytest.raises(InputError, match=rf"a\.png cannot be read: .* {mode}, expected 8 bits"):
                 read()
@@ -200,7 +202,7 @@ def test_transparent_pixels_show_the_background(tmp_path: Path) -> None:
     palette = Image.fromarray((np.arange(40) >= 20).astype(np.uint8)[None].repeat(30, 0), "P")
     palette.putpalette([10, 20, 30, 255, 0, 255])
     for image, more in ((half, {}), (half.convert("LA"), {}), (palette, {"transparency": 1})):
-        pixels = PhotographViews([image_frame(tmp_path, image, **more)], torch.ones(3))[0].image
+        pixels = ImageViews([image_frame(tmp_path, image, **more)], torch.ones(3))[0].image
         assert (pixels[:, 20:] == 255).all(), image.mode
         assert (pixels[:, :20] < 40).all(), image.mode
 
@@ -215,7 +217,7 @@ def test_rotations_and_animations_are_remarked(tmp_path: Path) -> None:
         *((kind, {}, None) for kind in ("JPEG", "PNG", "WEBP", "TIFF")),
     ):
         frame = image_frame(tmp_path, PLAIN, kind, **more)
-        remarks = PhotographViews([frame], BLACK).check_files()
+        remarks = ImageViews([frame], BLACK).check_files()
         assert len(remarks) == (expected is not None), (kind, remarks)
         assert expected is None or re.search(expected, remarks[0]), (kind, remarks)
 
@@ -224,24 +226,24 @@ def test_wrong_cameras_masks_and_heads_name_their_image(tmp_path: Path) -> None:
     frame = image_frame(tmp_path, PLAIN)
     for camera in (CAMERA._replace(fx=1e39), CAMERA._replace(cx=1e39, k1=0.1)):
         with pytest.raises(InputError, match=r"camera of .*a\.png cannot be used"):
-            _ = PhotographViews([replace(frame, intrinsics=camera)], BLACK).cameras
+            _ = ImageViews([replace(frame, intrinsics=camera)], BLACK).cameras
     mask = tmp_path / "mask.png"
     for made in (PLAIN, Image.new("L", (40, 31)), Image.new("LA", (40, 30))):
         made.save(mask)
         with pytest.raises(InputError, match=r"mask\.png .*a\.png"):
-            sized(Frame(frame.file, "a", frame.pose, CAMERA, mask), tmp_path)
+            rescale_intrinsics(Frame(frame.file, "a", frame.pose, CAMERA, mask), tmp_path)
     data = bytearray(frame.file.read_bytes())
     data[16:24] = struct.pack(">II", 10**5, 10**5)
     data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
     frame.file.write_bytes(data)
     with pytest.raises(InputError, match=r"a\.png cannot be read as an image"):
-        sized(frame, tmp_path)
+        rescale_intrinsics(frame, tmp_path)
 
 
 def looked_at(path: Path) -> None:
     frame = Frame(path.with_name("a.png"), "a.png", np.eye(4)[:3], CAMERA, path if path.stem == "mask" else None)
-    sized(frame, path.parent)
-    _ = PhotographViews([frame], BLACK)[0]
+    rescale_intrinsics(frame, path.parent)
+    _ = ImageViews([frame], BLACK)[0]
 
 
 def noise() -> Image.Image:
@@ -249,14 +251,14 @@ def noise() -> Image.Image:
 
 
 def saved_splat(path: Path) -> None:
-    views, none = PhotographViews([image_frame(path.parent, PLAIN)], BLACK), PhotographViews([], BLACK)
+    views, none = ImageViews([image_frame(path.parent, PLAIN)], BLACK), ImageViews([], BLACK)
     there = path.parent
     saved_run(there, SplatScene(random_splat(N), views, none, "x", there, 7, there, there, {}, "classic", "black"))
 
 
 LOADERS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], Any]]] = {
     "checkpoint": (CHECKPOINT, lambda path: saved(path.parent, {"step": 7, "pipeline": state()}), read_checkpoint),
-    "gsplat": ("ckpt_7_rank0.pt", lambda path: write_gsplat(path, random_splat(N), step=7), read_gsplat),
+    "gsplat": ("ckpt_7_rank0.pt", lambda path: write_gsplat(path, random_splat(N), step=7), read_gsplat_checkpoint),
     "ply": ("x.ply", lambda path: write_ply(path, ply_columns(random_splat(N, 1))), read_ply),
     "text ply": ("x.ply", lambda path: write_ply(path, ply_columns(random_splat(N, 1)), text=True), read_ply),
     "PNG": ("a.png", lambda path: noise().convert("RGB").save(path, "PNG"), looked_at),
@@ -331,7 +333,7 @@ class Stranger:
 def test_numbers_of_numpy_are_read_and_objects_are_not(tmp_path: Path) -> None:
     state = {"step": 7, "lr": np.float64(0.1), "many": [np.float32(1), np.int64(3)], "w": torch.arange(3.0)}
     plain = saved(tmp_path, {**state, "more": OrderedDict(a=1)}, "plain.pt")
-    with numbers_allowed():
+    with allow_numpy_scalars():
         found = torch.load(plain, weights_only=True)
         with pytest.raises(pickle.UnpicklingError, match="Stranger"):
             torch.load(saved(tmp_path, {**state, "stranger": Stranger()}, "stranger.pt"), weights_only=True)

@@ -10,7 +10,7 @@ import torch
 
 from normlift_ns import InputError, open_scene
 from normlift_ns.core.scene import View
-from normlift_ns.scenes.match import judge, match_photographs
+from normlift_ns.data.alignment import alignment_warning, measure_alignment
 from tests.captures import SHARED, needs_shared
 from tests.scenes import generator
 
@@ -53,15 +53,15 @@ def scene(trained: Path):
 
 
 def test_what_belongs_together_passes(scene) -> None:
-    match = match_photographs(scene)
+    match = measure_alignment(scene)
     assert match.psnr > 40  # the photographs are pictures of these very Gaussians
     assert match.in_view > 0.5
     assert match.grey_psnr < 20
-    assert judge(match, own_cameras=True) is None
+    assert alignment_warning(match, own_cameras=True) is None
 
 
 def warning_of(scene, change) -> str:
-    warning = judge(match_photographs(Changed(scene, change)), own_cameras=True)
+    warning = alignment_warning(measure_alignment(Changed(scene, change)), own_cameras=True)
     assert warning is not None
     return warning
 
@@ -74,12 +74,14 @@ def test_another_focal_length_or_look_is_warned_of(scene) -> None:
 
 def test_cameras_and_images_of_another_scene_are_refused(scene) -> None:
     with pytest.raises(InputError, match=r"0\.00%"):
-        judge(match_photographs(Changed(scene, shifted)), own_cameras=True)
+        alignment_warning(measure_alignment(Changed(scene, shifted)), own_cameras=True)
     upside_down = Changed(scene, lambda view: view._replace(image=255 - view.image.flip(0)))
-    match = match_photographs(upside_down)
+    match = measure_alignment(upside_down)
     with pytest.raises(InputError, match="does not show"):
-        judge(match, own_cameras=False)
-    assert "stopped early" in str(judge(match, own_cameras=True))  # a run that was hardly trained can be lifted
+        alignment_warning(match, own_cameras=False)
+    assert "stopped early" in str(
+        alignment_warning(match, own_cameras=True)
+    )  # a run that was hardly trained can be lifted
 
 
 def test_one_wrong_photograph_of_three_is_named(scene) -> None:
@@ -91,9 +93,9 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
         def change(view: View, name: str = name, image: torch.Tensor = image) -> View:
             return view._replace(image=image) if view.name == name else view
 
-        match = match_photographs(Changed(scene, change))
+        match = measure_alignment(Changed(scene, change))
         assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
-        warning = judge(match, own_cameras=True)
+        warning = alignment_warning(match, own_cameras=True)
         assert warning is not None and f"dB on {name}, one of the three training images" in warning
 
 
@@ -104,7 +106,7 @@ def test_masked_pixels_do_not_count(scene) -> None:
         mask[: len(image) // 2] = False
         return view._replace(image=image, mask=mask)
 
-    assert match_photographs(Changed(scene, hidden)).psnr > 40
+    assert measure_alignment(Changed(scene, hidden)).psnr > 40
 
 
 @needs_shared
@@ -112,5 +114,5 @@ def test_masked_pixels_do_not_count(scene) -> None:
 def test_real_captures() -> None:
     for name, factor in (("fox", 0.98), ("tabletop", 1.02)):
         scene = open_scene(SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml")
-        assert judge(match_photographs(scene), own_cameras=True) is None
+        assert alignment_warning(measure_alignment(scene), own_cameras=True) is None
         assert "fit the images better" in warning_of(scene, focal(factor))

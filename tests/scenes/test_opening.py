@@ -24,14 +24,13 @@ from normlift_ns import (
     open_scene,
     open_splat,
 )
-from normlift_ns.raster.rasterize import rasterize_evidence
-from normlift_ns.scenes.frames import Frame, Intrinsics
-from normlift_ns.scenes.photographs import PhotographViews
-from normlift_ns.scenes.saved import open_saved_splat
-from normlift_ns.scenes.similarity import gsplat_normalization, similarity
-from normlift_ns.scenes.splat import Splat
-from normlift_ns.scenes.transforms import read_transforms, write_transforms
-from normlift_ns.team.seen import Export
+from normlift_ns.data.frames import Frame, Intrinsics
+from normlift_ns.data.images import ImageViews
+from normlift_ns.data.open_splat import open_saved_splat
+from normlift_ns.data.splat import SplatParameters
+from normlift_ns.data.transforms import decompose_similarity, gsplat_normalization, read_transforms, write_transforms
+from normlift_ns.evidence_collection import FeatureExport
+from normlift_ns.rasterization.rasterize import rasterize_evidence
 from tests.captures import SHARED, needs_shared
 from tests.scenes import generator
 from tests.scenes.made import in_file_world, ply_columns, rows_of, saved_run, write_colmap, write_gsplat, write_ply
@@ -50,8 +49,8 @@ def native(trained: Path):
 
 
 @pytest.fixture(scope="module")
-def splat(native) -> Splat:
-    return Splat(**native.parameters)
+def splat(native) -> SplatParameters:
+    return SplatParameters(**native.parameters)
 
 
 @pytest.fixture(scope="module")
@@ -150,9 +149,9 @@ def _normalization(frames: list[Frame], points: np.ndarray, number: int = 0) -> 
     return np.vstack([world.scale * world.transform, [0, 0, 0, 1]])
 
 
-def _in_world(splat: Splat, matrix: np.ndarray) -> Splat:
+def _in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
     """The Gaussians in another world, computed in float64."""
-    world = similarity(matrix, "test")
+    world = decompose_similarity(matrix, "test")
     turn = torch.from_numpy(world.transform[:, :3])
     quats = Rotation.from_matrix(turn.numpy()) * Rotation.from_quat(splat.quats.double().numpy()[:, [1, 2, 3, 0]])
     return replace(
@@ -264,7 +263,7 @@ def test_undistortion_and_masks_are_nerfstudios(nerfstudio, tmp_path: Path) -> N
     dataset = InputDataset(parser.get_dataparser_outputs("train"))
     background = torch.tensor([0.2, 0.4, 0.6])
     stock = DatasetViews(dataset, tmp_path / "a", dataset.cameras.camera_to_worlds, background)
-    ours = PhotographViews(read_transforms(tmp_path / "a").frames, background)
+    ours = ImageViews(read_transforms(tmp_path / "a").frames, background)
     assert ours.names == stock.names
     for view, other in zip(ours, stock):
         assert torch.equal(view.image, other.image)
@@ -379,7 +378,7 @@ def test_images_in_subfolders(splat, frames, tmp_path: Path) -> None:
         assert again.train.names == scene.train.names
         assert again.train[3].image.shape == (120, 160, 3)
     with pytest.raises(InputError, match=r" 0000_\*\.npy "):
-        lift_run(again, export=Export(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
+        lift_run(again, export=FeatureExport(tmp_path / "e", False), output_dir=tmp_path / "o", **OPTIONS)
     (tmp_path / "moved" / "left" / "0001.png").rename(tmp_path / "moved" / "0001.png")
     (tmp_path / "moved" / "right" / "0001.png").unlink()
     with pytest.raises(InputError, match=r"moved/0001\.png for both"):
@@ -396,7 +395,7 @@ def test_a_real_capture_by_other_ways(tmp_path: Path) -> None:
     """
     config = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     scene = open_scene(config)
-    path = write_ply(tmp_path / "s.ply", ply_columns(Splat(**scene.parameters)))
+    path = write_ply(tmp_path / "s.ply", ply_columns(SplatParameters(**scene.parameters)))
     folder, world = SHARED / "captures" / "fox", config.parent / "dataparser_transforms.json"
     of_json = open_splat(path, SplatOptions(transforms=folder, world_transform=world, holdout=("0.1",)))
     assert of_json.train.names == scene.train.names

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from normlift_ns.data.splat import read_ply
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.formats.ply import read_ply
 from tests.scenes.made import ply_columns, random_splat, write_ply
 
 
@@ -31,7 +31,7 @@ def test_every_kind_of_splat_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
         }
         for kind, how in kinds.items():
             if kind == "several blocks":
-                monkeypatch.setattr("normlift_ns.scenes.formats.ply._PLY_BLOCK_ROWS", 7)
+                monkeypatch.setattr("normlift_ns.data.splat._PLY_BLOCK_ROWS", 7)
             found = read_ply(write_ply(tmp_path / "a.ply", **{"columns": columns, **how}))
             assert (found.rasterize_mode, found.splat.degree) == (None, degree)
             for name, value in splat.parameters.items():
@@ -125,8 +125,8 @@ def test_damaged_and_missing_files_are_refused(tmp_path: Path) -> None:
 _MEASURE = """
 import sys
 from pathlib import Path
-from normlift_ns.scenes.formats.ply import read_ply
-from normlift_ns.stages import peak_gib
+from normlift_ns.data.splat import read_ply
+from normlift_ns.progress import peak_gib
 before = peak_gib()
 splat = read_ply(Path(sys.argv[1])).splat
 splat.activated

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from normlift_ns.data.frames import Frame, Intrinsics, transform_frames
+from normlift_ns.data.transforms import decompose_similarity, gsplat_normalization, read_world_transform
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.frames import Frame, Intrinsics, moved
-from normlift_ns.scenes.similarity import gsplat_normalization, read_world_transform, similarity
 
 ROTATION = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
 MATRIX = np.block([[2.5 * ROTATION, np.array([[1.0], [2.0], [3.0]])], [np.array([[0.0, 0, 0, 1]])]])
@@ -61,7 +61,7 @@ def test_what_is_not_a_similarity_is_refused(tmp_path: Path) -> None:
 
 def test_moved_cameras_see_moved_points_at_the_same_place() -> None:
     frame = Frame(Path("a"), "a", np.column_stack([Rotation.random(random_state=1).as_matrix(), [1, 2, 3]]), _CAMERA)
-    there = moved([frame], similarity(MATRIX, "test"))[0]
+    there = transform_frames([frame], decompose_similarity(MATRIX, "test"))[0]
     point = np.array([0.3, -2.0, 5.0])
     before = frame.pose[:, :3].T @ (point - frame.pose[:, 3])
     after = there.pose[:, :3].T @ (MATRIX[:3, :3] @ point + MATRIX[:3, 3] - there.pose[:, 3])
@@ -98,7 +98,7 @@ def test_gsplats_normalization_undoes_any_similarity(seed: int) -> None:
     spread = there.std(axis=0)
     assert spread[0] > spread[1] > spread[2]
     assert np.mean(there[:, 2]) >= np.median(there[:, 2])  # the tail points up
-    poses = np.array([frame.pose for frame in moved(frames, world)])
+    poses = np.array([frame.pose for frame in transform_frames(frames, world)])
     assert np.allclose(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=1), 1, atol=0.01)
     turns = {tuple(np.round(np.diag(w.transform[:, :3] @ world.transform[:, :3].T)).astype(int)) for w in worlds}
     assert turns == {(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)}

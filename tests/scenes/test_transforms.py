@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from normlift_ns.data.frames import check_frames
+from normlift_ns.data.transforms import read_transforms, write_transforms
 from normlift_ns.errors import InputError
-from normlift_ns.scenes.frames import check_frames
-from normlift_ns.scenes.transforms import read_transforms, write_transforms
 
 INTRINSICS = {"fl_x": 50.0, "fl_y": 51.0, "cx": 20.5, "cy": 14.5, "w": 40, "h": 30}
 

@@ -14,11 +14,11 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from normlift_ns.scripts.shared import run_command
+from normlift_ns.cli.common import run_command
 from tests.conftest import import_nerfstudio
 
 if TYPE_CHECKING:
-    from normlift_ns.demo import DemoRoom
+    from normlift_ns.demo.room import DemoRoom
 
 SMALL = ("--encoder", "colour", "--k", "12")
 """Flags that lift the small demo room in a moment."""
@@ -107,7 +107,7 @@ def little(little_room: DemoRoom, made_once: Any) -> Path:
 
     def make(folder: Path) -> None:
         import_nerfstudio()
-        from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+        from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
 
         write_capture(little_room, folder / "room", views=6, held_out=2, width=96, height=72)
         write_splatfacto_run(little_room, folder / "room", folder / "outputs")
@@ -121,7 +121,7 @@ def little_lifted(little: Path, made_once: Any) -> Path:
 
     def make(folder: Path) -> None:
         import_nerfstudio()
-        from normlift_ns.scripts import lift  # noqa: PLC0415
+        from normlift_ns.cli import lift  # noqa: PLC0415
 
         with pytest.MonkeyPatch.context() as patch:
             flags = ("--load-config", little, *QUICK, "--region-count", "300", "--timestamp", "t")

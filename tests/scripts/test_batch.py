@@ -18,16 +18,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.core.disk.claims import State, claim, read_states
-from normlift_ns.core.disk.lines import read_lines
+from normlift_ns.api import open_run
+from normlift_ns.cli import batch
+from normlift_ns.cli.batch import (
+    WHOLE_LIST,
+    Capture,
+    Outcome,
+    OutcomeState,
+    Shard,
+    is_lifted,
+    largest_exit_code,
+    latest_outcomes,
+    lift_captures,
+    make_shard,
+    read_captures,
+    run_logged,
+)
 from normlift_ns.errors import InputError
-from normlift_ns.front_door import open_run
-from normlift_ns.scripts import batch
-from normlift_ns.scripts.captures.listed import Capture, is_lifted, read_captures
-from normlift_ns.scripts.captures.outcomes import Outcome, OutcomeState, latest, worst
-from normlift_ns.scripts.captures.process import run_program
-from normlift_ns.scripts.captures.shards import ALL, Shard, make_shard
-from normlift_ns.scripts.captures.work import work
+from normlift_ns.io.file_lock import ClaimState, read_claim_states, read_jsonl, try_claim
 from tests.processes import FORK, killed_at
 from tests.scripts import stand_in
 from tests.scripts.conftest import SMALL, run_entry, said, wait_for
@@ -57,7 +65,7 @@ class Batch:
         self.list.write_text("# captures\n\n" + "".join(f"{config}\n" for config in self.configs))
 
     def work(self, *options: str, patience: float = PATIENCE) -> dict[str, Outcome]:
-        return work(read_captures(self.list, options), self.results, patience, program=STAND_IN)
+        return lift_captures(read_captures(self.list, options), self.results, patience, program=STAND_IN)
 
     def start(self) -> FORK.Process:  # type: ignore[name-defined]
         process = FORK.Process(target=self.work)
@@ -74,17 +82,17 @@ class Batch:
 
     def states(self, *options: str) -> list[str]:
         """The last outcomes, in the order of the list."""
-        found = latest(read_lines(self.results, Outcome))
+        found = latest_outcomes(read_jsonl(self.results, Outcome))
         return [found[capture.key].state for capture in read_captures(self.list, options)]
 
     def check_lifted_once(self, *options: str) -> None:
         runs = [sorted(config.parents[2].glob("normlift/batch_*")) for config in self.configs]
         assert [len(found) for found in runs] == [1] * len(runs) and all(is_lifted(found[0]) for found in runs)
-        lines = read_lines(self.results, Outcome)
+        lines = read_jsonl(self.results, Outcome)
         done = Counter(line.key for line in lines if line.state == "done")
         assert set(self.states(*options)) <= {"done", "skipped"} and set(done.values()) <= {1}
         known = {line.key for line in lines}  # a worker may be killed between its line and the end of its claim
-        ends = {(state.outcome, key in known) for key, state in read_states(self.results / "claims").items()}
+        ends = {(state.outcome, key in known) for key, state in read_claim_states(self.results / "claims").items()}
         assert ends <= {("done", True), ("skipped", True), (None, True)}
 
 
@@ -104,7 +112,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> list[Callable[[Callable[[], b
                 return int(stop.code or 0)
         return 0
 
-    monkeypatch.setattr("normlift_ns.scripts.captures.work.run_program", run)
+    monkeypatch.setattr("normlift_ns.cli.batch.run_logged", run)
     return happens
 
 
@@ -146,15 +154,15 @@ def test_a_worker_may_be_killed_at_any_access_to_files(stride, tmp_path):
         made.results.mkdir()
 
         def first(made: Batch = made, captures: Sequence[Capture] = captures) -> None:
-            work(captures, made.results, 0.3, program=STAND_IN)
+            lift_captures(captures, made.results, 0.3, program=STAND_IN)
 
         if not killed_at(step, first, made.results):
             break
-        killed.add(tuple(sorted(read_states(made.results / "claims").values(), key=str)))
-        work(captures, made.results, 0.3, program=STAND_IN)
+        killed.add(tuple(sorted(read_claim_states(made.results / "claims").values(), key=str)))
+        lift_captures(captures, made.results, 0.3, program=STAND_IN)
         made.check_lifted_once()
     assert step > 24
-    one, done = State(1, None), State(1, "done")
+    one, done = ClaimState(1, None), ClaimState(1, "done")
     states = {(), (one,), (done,), (done, one), (done, done)}
     assert killed <= states and (killed == states or stride > 1)
 
@@ -179,7 +187,7 @@ def test_a_process_that_ends_has_time_to_clean_up(tmp_path):
         signal.signal(signal.SIGTERM, end); open(sys.argv[2], "w").close(); time.sleep(60)"""
     ready, cleaned = tmp_path / "ready", tmp_path / "cleaned"
     words = [sys.executable, "-S", "-c", program, str(cleaned), str(ready)]
-    assert run_program(words, tmp_path / "log", lambda: not ready.exists(), every=0.01) is None
+    assert run_logged(words, tmp_path / "log", lambda: not ready.exists(), every=0.01) is None
     assert cleaned.exists()
 
 
@@ -191,7 +199,11 @@ def test_damaged_captures_fail_alone_and_are_tried_again(tmp_path):
     assert [outcome.code for outcome in found] == [0, 1, 128 + signal.SIGSEGV, 70]
     assert [outcome.message for outcome in found[1:4:2]] == ["the photographs are [/gone]", "This is a bug"]
     assert "SIGSEGV" in found[2].message and "logs" in found[2].message
-    assert worst(found) == 128 + signal.SIGSEGV and worst(found[:2]) == 1 and worst(found[:1]) == 0
+    assert (
+        largest_exit_code(found) == 128 + signal.SIGSEGV
+        and largest_exit_code(found[:2]) == 1
+        and largest_exit_code(found[:1]) == 0
+    )
     made.set(1, "0")
     made.work()
     assert made.states() == ["done", "done", "failed", "failed"]
@@ -219,7 +231,7 @@ def test_a_rerun_does_only_what_is_missing(tmp_path, in_process):
     shutil.rmtree(made.results)  # the runs themselves say that they are there
     made.work("--encoder", "colour")
     assert sum(made.begun().values()) == 10
-    assert {outcome.state for outcome in read_lines(made.results, Outcome)} == {"skipped"}
+    assert {outcome.state for outcome in read_jsonl(made.results, Outcome)} == {"skipped"}
 
 
 def test_an_interrupted_capture_is_free_at_once(tmp_path, in_process):
@@ -230,7 +242,7 @@ def test_an_interrupted_capture_is_free_at_once(tmp_path, in_process):
     in_process.append(interrupted)
     with pytest.raises(KeyboardInterrupt):
         made.work()
-    assert list(read_states(made.results / "claims").values()) == [State(1, "left")]
+    assert list(read_claim_states(made.results / "claims").values()) == [ClaimState(1, "left")]
     made.work(patience=86400.0)
     assert made.states() == ["done"]
 
@@ -241,13 +253,13 @@ def test_who_was_taken_for_dead_writes_nothing_and_takes_over_where_the_other_di
 
     def taken_over(beat: Callable[[], bool]) -> int | None:
         assert beat()
-        assert claim(made.results / "claims", capture.key, after=1) is not None  # another one, which dies at once
+        assert try_claim(made.results / "claims", capture.key, after=1) is not None  # another one, which dies at once
         return 0 if beat() else None
 
     in_process.append(taken_over)
     made.work(patience=0.3)
-    assert read_states(made.results / "claims") == {capture.key: State(3, "done")}
-    assert [(line.attempt, line.state) for line in read_lines(made.results, Outcome)] == [(3, "done")]
+    assert read_claim_states(made.results / "claims") == {capture.key: ClaimState(3, "done")}
+    assert [(line.attempt, line.state) for line in read_jsonl(made.results, Outcome)] == [(3, "done")]
     assert made.begun() == {"c00": 1}
 
 
@@ -264,9 +276,9 @@ def test_a_program_that_is_not_wanted_any_more_is_ended(interrupted, tmp_path):
     words = [sys.executable, "-S", "-c", f"{program}; p.Path({str(end)!r}).touch()"]
     if interrupted:
         with pytest.raises(KeyboardInterrupt):
-            run_program(words, tmp_path / "log", beat, 0.05)
+            run_logged(words, tmp_path / "log", beat, 0.05)
     else:
-        assert run_program(words, tmp_path / "log", beat, 0.05) is None
+        assert run_logged(words, tmp_path / "log", beat, 0.05) is None
     assert not end.exists() and not alive(int(pid.read_text() or "0"))
 
 
@@ -349,14 +361,14 @@ def test_mistakes_are_one_message_and_leave_nothing(tmp_path, monkeypatch, capsy
 
 
 def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("normlift_ns.scripts.captures.work.run_program", lambda *_: 0)
+    monkeypatch.setattr("normlift_ns.cli.batch.run_logged", lambda *_: 0)
     made = Batch(tmp_path, ["0"] * 5)
     for task in range(3):
         for name, value in {"ID": task + 4, "COUNT": 3, "MIN": 4, "MAX": 6, "STEP": 1}.items():
             monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
         assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
         assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
-    lines = read_lines(made.results, Outcome)
+    lines = read_jsonl(made.results, Outcome)
     assert len(lines) == len({line.key for line in lines}) == 5
     assert len(list(made.results.glob("*.jsonl"))) == 3
 
@@ -389,10 +401,10 @@ def test_the_last_attempt_counts_whatever_the_clocks_say():
     failed, done, found = outcome(1, "failed", 9e9), outcome(2, "done", 5.0), outcome(3, "skipped", 1.0)
     broken = outcome(4, "failed", 0.0)
     for order in permutations([failed, done, found]):
-        assert latest(order) == {"a": done}
+        assert latest_outcomes(order) == {"a": done}
     for order in permutations([failed, found]):
-        assert latest(order) == {"a": found}
-    assert latest([broken, done, found]) == {"a": broken}
+        assert latest_outcomes(order) == {"a": found}
+    assert latest_outcomes([broken, done, found]) == {"a": broken}
 
 
 def array(task: int, count: int, least: int = 0, step: int = 1) -> dict[str, str]:
@@ -426,7 +438,7 @@ def test_tasks_of_an_array_and_ranks_within_them_hold_everything_exactly_once(co
 
 
 def test_what_the_environment_says_and_cannot_say():
-    assert make_shard("auto", {}) == make_shard("none", array(1, 3)) == ALL
+    assert make_shard("auto", {}) == make_shard("none", array(1, 3)) == WHOLE_LIST
     assert make_shard("auto", array(5, 4, least=4)) == Shard(1, 4)
     assert make_shard("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}) == Shard(2, 3)
     assert make_shard("3/3", array(1, 5)) == Shard(2, 3)
@@ -451,8 +463,8 @@ def test_what_the_environment_says_and_cannot_say():
 
 
 RAY = f"""#!{sys.executable}
-from normlift_ns.scripts.captures import work
-from normlift_ns.scripts.start import batch
+from normlift_ns.cli.captures import work
+from normlift_ns.cli.start import batch
 work.work.__kwdefaults__["program"] = {STAND_IN!r}
 batch()
 """

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from normlift_ns.encoders.regions import Superpixels
-from normlift_ns.planning import findings
-from normlift_ns.scripts import check, lift
+from normlift_ns import planning
+from normlift_ns.cli import check, lift
+from normlift_ns.segmentation.regions import Superpixels
 from tests.scripts.conftest import SMALL, run_entry, said
 
 
@@ -64,7 +64,7 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_p
     assert "No config at" in found["findings"][0]["found"]
     code, found = checked("--device", "cuda:7")
     assert code == 1 and states(found)["device"] == "error"
-    monkeypatch.setattr(findings, "in_view", lambda means, camera: means[:, 0] > 1e9)
+    monkeypatch.setattr(planning, "in_frustum", lambda means, camera: means[:, 0] > 1e9)
     code, found = checked("--check", "False")
     assert code == 1 and states(found)["in view"] == "error" and found["plan"] is None
     assert "Correct the errors above" in said(capsys)
@@ -75,7 +75,7 @@ def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_p
 
 
 def test_weights_that_would_be_downloaded_are_a_warning(checked, monkeypatch, trained, tmp_path, capsys) -> None:
-    monkeypatch.setattr("normlift_ns.encoders.weights.probe", lambda address: None)
+    monkeypatch.setattr("normlift_ns.encoders.registry.check_server", lambda address: None)
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     code, found = checked("--encoder", "open_clip", "--regions", "patches")
     assert code == 0 and states(found)["weights"] == "warning" and found["plan"] is None
@@ -100,6 +100,6 @@ def test_texts_of_sam3_are_those_of_the_lift(checked, monkeypatch, trained, tmp_
 
 def test_memory_and_disk_are_compared_with_what_is_free() -> None:
     for needed, state in ((70, "ok"), (90, "warning"), (101, "error")):
-        row = findings._check_capacity("disk", needed, 100, "free some")
+        row = planning._check_capacity("disk", needed, 100, "free some")
         assert row.state == state and (row.advice == "") == (state == "ok")
-    assert findings._free_memory() is None or findings._free_memory() > 2**20
+    assert planning._free_memory() is None or planning._free_memory() > 2**20

@@ -16,21 +16,21 @@ import torch
 import yaml
 from PIL import Image
 
-from normlift_ns import open_run, open_scene
-from normlift_ns.encoders import RegionFeatures, write_langsplat
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.encoders.regions import Grid
-from normlift_ns.encoders.sam.masks import MaskRules, SamMasks
-from normlift_ns.runs.question import load_question
-from normlift_ns.scenes.splat import Splat
-from normlift_ns.scripts import evaluate, export, lift, query
-from normlift_ns.scripts.demo import iou_per_class
-from normlift_ns.team import seen
+from normlift_ns import evidence_collection, open_run, open_scene
+from normlift_ns.cli import evaluate, export, lift, query
+from normlift_ns.cli.demo import iou_per_class
+from normlift_ns.data.splat import SplatParameters
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.encoders.langsplat import write_langsplat
+from normlift_ns.query.question import load_query
+from normlift_ns.segmentation.regions import Grid
+from normlift_ns.segmentation.sam import MaskRules, SamMasks
 from tests.scenes.made import ply_columns, random_splat, write_gsplat, write_ply
 from tests.scripts.conftest import QUICK, SMALL, run_entry, said
 
 if TYPE_CHECKING:
-    from normlift_ns.demo import DemoRoom
+    from normlift_ns.demo.room import DemoRoom
 
 TWO = ("--max-views", "2", "--refine", "False")
 
@@ -48,7 +48,7 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
     assert after > 0.7 and after > before
     assert field.manifest["encoder"]["encoder"] == "colour"
     assert field.manifest["statistics"]["views"] == 12
-    question = load_question(lifted.parent / "normlift")
+    question = load_query(lifted.parent / "normlift")
     assert question is not None and question.texts == ("red", "yellow")
     assert sorted(p.name for p in lifted.parent.iterdir()) == [
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", "normlift",
@@ -94,7 +94,7 @@ def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys)
         existing.write_text("mine")
         flags = ("--load-config", lifted, "--text", "red", "sky blue", output, folder if pictures else existing)
         with monkeypatch.context() as patch:
-            patch.setattr("normlift_ns.quick.open_quick", None)  # refused before anything is opened
+            patch.setattr("normlift_ns.query.arrays.open_quick", None)  # refused before anything is opened
             for views in ((), ("--render-views", "0002", "images/0003.png") if pictures else ()):
                 assert run_entry(patch, query.entrypoint, *flags, *views) == 1
                 shown = said(capsys)
@@ -132,7 +132,7 @@ def test_a_damaged_run_is_refused_with_a_message(lifted, tmp_path, monkeypatch, 
 
 def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
     clock = SimpleNamespace(now=lambda: datetime(2024, 5, 1, 12))
-    monkeypatch.setattr("normlift_ns.runs.files.datetime", clock)
+    monkeypatch.setattr("normlift_ns.io.run_dir.datetime", clock)
     flags = ("--load-config", little, *QUICK, *TWO, "--output-dir", tmp_path)
     names = ["2024-05-01_120000", "2024-05-01_120000_2"]
     for overwrite in ("False", "True"):
@@ -142,8 +142,8 @@ def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, m
 
 
 def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
-    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
-    monkeypatch.setattr("normlift_ns.encoders.colour.ColourEncoder.encode", None)
+    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
+    monkeypatch.setattr("normlift_ns.encoders.color.ColorEncoder.encode", None)
     given = (*QUICK, "--region-count", "300", "--refine", "False")
     flags = ("--load-config", own, *given, "--timestamp", "two", "--beta", "2.0")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
@@ -154,8 +154,8 @@ def test_a_second_lift_rasterizes_and_encodes_nothing(own, monkeypatch):
 
 
 def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("normlift_ns.observing._MAX_CHUNK", 2)
-    rasterize, calls = seen.block_evidence, []
+    monkeypatch.setattr("normlift_ns.evidence_collection._MAX_CHUNK", 2)
+    rasterize, calls = evidence_collection.batch_evidence, []
 
     def interrupted(*args, **kwargs):
         calls.append(1)
@@ -164,15 +164,17 @@ def test_an_interrupted_lift_leaves_nothing_half_written_and_resumes(little, mon
         return rasterize(*args, **kwargs)
 
     flags = ("--load-config", little, *QUICK, "--refine", "False", "--output-dir", tmp_path / "out", "--timestamp", "t")
-    monkeypatch.setattr(seen, "block_evidence", interrupted)
+    monkeypatch.setattr(evidence_collection, "batch_evidence", interrupted)
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 130
     assert "rerun the command to resume" in capsys.readouterr().err
     written = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
     assert {p.suffix for p in written} == {".safetensors"} and all(".cache" in p.parts for p in written)
     fresh: list[Any] = []
-    monkeypatch.setattr(seen, "block_evidence", rasterize)
-    save = seen.Evidence.save
-    monkeypatch.setattr(seen.Evidence, "save", lambda self, *a, **how: (fresh.append(a), save(self, *a, **how))[1])
+    monkeypatch.setattr(evidence_collection, "batch_evidence", rasterize)
+    save = evidence_collection.Evidence.save
+    monkeypatch.setattr(
+        evidence_collection.Evidence, "save", lambda self, *a, **how: (fresh.append(a), save(self, *a, **how))[1]
+    )
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
     assert len(fresh) == 1  # of three blocks, two were kept
 
@@ -197,7 +199,7 @@ def test_another_level_of_label_files_rasterizes_nothing(little, tmp_path, monke
     flags = ("--load-config", little, *QUICK, *given)
     for level in ("0", "1"):
         assert run_entry(monkeypatch, lift.entrypoint, *flags, "--level", level, "--timestamp", level) == 0
-        monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
+        monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
     fields = [field_of(tmp_path / "out", level) for level in ("0", "1")]
     weights = [field.scalars.weight for field in fields]
     assert torch.allclose(*weights, rtol=1e-5)  # the same pixels are labelled
@@ -229,7 +231,7 @@ def test_clip_by_patches_and_questions_without_a_network(little, clip, tmp_path,
     ask = ("--load-config", config, "--text", "table", "--json")
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "1.json") == 0
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "2.json", "--text-template", "ensemble") == 0
-    monkeypatch.setattr("normlift_ns.encoders.clip.encoder.load_clip", None)
+    monkeypatch.setattr("normlift_ns.encoders.open_clip_network.load_open_clip", None)
     assert run_entry(monkeypatch, query.entrypoint, *ask, tmp_path / "3.json") == 0
     plain, ensemble, again = (json.loads((tmp_path / f"{i}.json").read_text())["queries"][0] for i in (1, 2, 3))
     assert again == plain and ensemble["peak"] != plain["peak"]
@@ -251,8 +253,8 @@ def test_levels_of_sam(little, clip, tmp_path, monkeypatch, capsys):
         assert field.manifest["features"]["regions"]["kind"] == "sam"
         assert field.manifest["features"]["levels"] == [{"l": 3, "s": 1}[level]]
         shares.append(field.manifest["statistics"]["zero_evidence_share"])
-        monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
-        monkeypatch.setattr("normlift_ns.encoders.sam.library.SamNetwork", None)
+        monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
+        monkeypatch.setattr("normlift_ns.segmentation.sam.SamNetwork", None)
     assert shares[0] != shares[1] and max(shares) < 1
 
 
@@ -293,9 +295,9 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
     assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
     assert len(list((tmp_path / "features").iterdir())) == 2 * 6
     texts = ("red", "sky blue")
-    np.savez(tmp_path / "texts.npz", **dict(zip(texts, ColourEncoder().text(texts).numpy())))
+    np.savez(tmp_path / "texts.npz", **dict(zip(texts, ColorEncoder().text(texts).numpy())))
 
-    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)
+    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)
     importing = ("--features", "langsplat", "--features-dir", tmp_path / "features")
     vectors = ("--text-vectors", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
@@ -326,11 +328,11 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
 
 
 def test_images_without_features_are_listed_and_left_out(little, tmp_path, monkeypatch, capsys):
-    source = RegionFeatures(Grid(9), ColourEncoder())
+    source = RegionFeatures(Grid(9), ColorEncoder())
     for view in open_scene(little).train:
         write_langsplat(source, view.image, view.name, tmp_path / "features", overwrite=False)
     (tmp_path / "features" / "0003_f.npy").unlink()
-    np.savez(tmp_path / "texts.npz", red=ColourEncoder().text(["red"])[0].numpy())
+    np.savez(tmp_path / "texts.npz", red=ColorEncoder().text(["red"])[0].numpy())
     flags = ("--load-config", little, "--features", "langsplat", "--features-dir", tmp_path / "features")
     flags += ("--text-vectors", tmp_path / "texts.npz", "--output-dir", tmp_path / "out", "--timestamp", "t")
     flags += ("--check", "False", "--refine", "False")
@@ -362,7 +364,7 @@ def test_double_precision_differs_from_the_default_by_rounding(little, tmp_path,
 @pytest.fixture
 def ply(little: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    return write_ply(tmp_path / "scene.ply", ply_columns(Splat(**open_scene(little).parameters)))
+    return write_ply(tmp_path / "scene.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
 
 
 def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, tmp_path, monkeypatch, capsys) -> None:
@@ -394,7 +396,7 @@ def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, t
 
 def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
     """What shows before the splat is read is in test_early.py."""
-    columns, splat = ply_columns(random_splat(5)), ply_columns(Splat(**open_scene(little).parameters))
+    columns, splat = ply_columns(random_splat(5)), ply_columns(SplatParameters(**open_scene(little).parameters))
     write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})
     write_gsplat(ply.parent / "other.pt", random_splat(50))
     write_ply(ply.parent / "far.ply", {**splat, "z": splat["z"] + 1000})

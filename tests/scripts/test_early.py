@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from normlift_ns.encoders import weights
+from normlift_ns.cli import evaluate, export, lift, query, view
+from normlift_ns.cli.preflight import check_unused_options, read_config_paths
+from normlift_ns.encoders import registry
 from normlift_ns.errors import InputError
 from normlift_ns.options import LiftOptions, RefineConfig
-from normlift_ns.scripts import evaluate, export, lift, query, view
-from normlift_ns.scripts.answers.glance import glance
-from normlift_ns.scripts.early import check_effect
 from tests.scripts.conftest import run_entry, said
 
 CONFIG = """!!python/object:nerfstudio.engine.trainer.TrainerConfig
@@ -48,7 +47,7 @@ def config(tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("lift_run", "open_run"):
-        monkeypatch.setattr(f"normlift_ns.front_door.{name}", None)
+        monkeypatch.setattr(f"normlift_ns.api.{name}", None)
 
 
 COLOUR = ("--encoder", "colour")
@@ -204,7 +203,7 @@ def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsy
     def unreachable(address: str) -> None:
         raise ConnectionError(f"{address} cannot be reached")
 
-    monkeypatch.setattr(weights, "probe", unreachable)
+    monkeypatch.setattr(registry, "check_server", unreachable)
     monkeypatch.setenv("HF_ENDPOINT", "https://hub")
     for there in (False, True, None):
         asked: list[tuple[str, ...]] = []
@@ -213,7 +212,7 @@ def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsy
             asked.append(name)
             return there
 
-        monkeypatch.setattr(weights, "clip_weights_at_hand", at_hand, raising=False)
+        monkeypatch.setattr(registry, "has_local_clip_weights", at_hand, raising=False)
         code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, "--timestamp", "old")
         assert (code, asked) == (1, [("ViT-B-16", "laion2b_s34b_b88k")])
         text = said(capsys)
@@ -229,19 +228,21 @@ def test_what_is_no_config_is_one_message(tmp_path, monkeypatch, capsys):
 
 
 def test_places_of_a_config_and_others_are_looked_at_without_harm(config, tmp_path):
-    seen = glance(config)
+    seen = read_config_paths(config)
     assert (seen.experiment, seen.output_dir, seen.data[0]) == ("room", tmp_path / "outputs", tmp_path / "room")
     for key in ("experiment_name", "timestamp", "output_dir", "pipeline"):
         lines = [line for line in CONFIG.splitlines() if not line.startswith((f"{key}:", " ", "-"))]
         for value in ("null", "[1, 2]", "{a: b}", "7", "!!python/object/apply:os.system [x]"):
             (tmp_path / "config.yml").write_text("\n".join([*lines, f"{key}: {value}"]))
-            glance(tmp_path / "config.yml")
+            read_config_paths(tmp_path / "config.yml")
 
 
 def test_options_of_what_is_off_are_refused():
     for name, value in {"consensus_power": 2.0, "consensus_sample": 9, "consensus_least": 0.0}.items():
         with pytest.raises(InputError, match=f"--{name.replace('_', '-')} is for --consensus True"):
-            check_effect(LiftOptions(consensus=False, **{name: value}))
+            check_unused_options(LiftOptions(consensus=False, **{name: value}))
     with pytest.raises(InputError, match="--prior is for --vote posterior"):
-        check_effect(LiftOptions(vote=RefineConfig(vote="paper", prior=2.0)))
-    check_effect(LiftOptions(consensus=True, consensus_power=2.0, vote=RefineConfig(vote="posterior", prior=2.0)))
+        check_unused_options(LiftOptions(vote=RefineConfig(vote="paper", prior=2.0)))
+    check_unused_options(
+        LiftOptions(consensus=True, consensus_power=2.0, vote=RefineConfig(vote="posterior", prior=2.0))
+    )

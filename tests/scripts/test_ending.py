@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.panel import Panel
 
 import normlift_ns
-from normlift_ns.core.files import new_file
+from normlift_ns.cli import common
+from normlift_ns.cli.common import info, plain_text
 from normlift_ns.errors import InputError
-from normlift_ns.scripts import shared
-from normlift_ns.scripts.shared import plain, say
+from normlift_ns.io.atomic import atomic_file
 
 NO_SPACE = OSError(28, "No space left on device", "a.ply")
 
@@ -29,7 +29,7 @@ NO_SPACE = OSError(28, "No space left on device", "a.ply")
 def console(monkeypatch: pytest.MonkeyPatch) -> None:
     """What could not be written stays in a console, and would be printed by the next test."""
     fresh = Console(width=120, markup=False, emoji=False, highlight=False)
-    monkeypatch.setattr(shared, "CONSOLE", fresh)
+    monkeypatch.setattr(common, "CONSOLE", fresh)
 
 
 def fail(error: BaseException) -> NoReturn:
@@ -61,8 +61,8 @@ def test_an_error_is_one_message_on_standard_error(ended, tmp_path):
 
 def test_what_cannot_be_encoded_is_replaced(ended, monkeypatch):
     def body(_: str) -> None:
-        say("a 🎉 中 \u202e " + chr(0xDC80))
-        shared.CONSOLE.print(Panel(plain("🎉")))
+        info("a 🎉 中 \u202e " + chr(0xDC80))
+        common.CONSOLE.print(Panel(plain_text("🎉")))
         raise InputError("no 中")
 
     for encoding in ("cp1252", "ascii", "latin-1"):
@@ -86,13 +86,13 @@ def caught(_: str) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_device_is_a_message(ended, monkeypatch):
     for body, *flags in (
-        (say,),
+        (info,),
         (print,),
-        (lambda _: say("a" * 10**6),),
+        (lambda _: info("a" * 10**6),),
         (lambda _: sys.stdout.write("x"),),
         (caught,),
-        (say, "--help"),
-        (say, "--version"),
+        (info, "--help"),
+        (info, "--version"),
     ):
         with open("/dev/full", "w") as full, monkeypatch.context() as patch:
             patch.setattr(sys, "stdout", full)
@@ -104,7 +104,7 @@ def test_a_full_device_is_a_message(ended, monkeypatch):
 def test_a_closed_pipe_ends_quietly(ended, monkeypatch):
     def body(_: str) -> None:
         for i in range(10**5):
-            say(f"line {i}")
+            info(f"line {i}")
         raise AssertionError("nobody reads")
 
     reading, writing = os.pipe()
@@ -116,12 +116,12 @@ def test_a_closed_pipe_ends_quietly(ended, monkeypatch):
 
 def test_sigterm_cleans_up_and_says_so(ended, tmp_path):
     def body(word: str) -> None:
-        with new_file(tmp_path / word) as draft:
+        with atomic_file(tmp_path / word) as draft:
             draft.write_text("half")
             try:
                 os.kill(os.getpid(), signal.SIGTERM)
             except Exception:
-                say("swallowed")
+                info("swallowed")
             raise AssertionError("went on")
 
     before = signal.getsignal(signal.SIGTERM)
@@ -145,7 +145,7 @@ PROGRAM = """
 import atexit, os, sys
 from dataclasses import dataclass
 from normlift_ns.errors import InputError
-from normlift_ns.scripts.shared import run_process
+from normlift_ns.cli.common import run_process
 
 class Slow:
     def __del__(self):
@@ -189,7 +189,7 @@ def test_a_server_ends_where_another_thread_gets_the_signal(tmp_path):
     """It wakes no wait of the main thread: a viewer that had been told to end went on."""
     body = """
         import signal, threading, time
-        from normlift_ns.scripts.view import until_stopped
+        from normlift_ns.cli.view import until_stopped
         def tell():
             time.sleep(0.5)
             signal.pthread_kill(threading.get_ident(), signal.SIGTERM)

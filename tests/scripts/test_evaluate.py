@@ -14,14 +14,14 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import normlift_ns as nl
-from normlift_ns.core.ablations import Variant
-from normlift_ns.encoders.colour import ColourEncoder
-from normlift_ns.evaluation import votes
+from normlift_ns.cli import evaluate
+from normlift_ns.encoders.color import ColorEncoder
+from normlift_ns.evaluation import studies
 from normlift_ns.evaluation.baselines import BASELINES
-from normlift_ns.evaluation.instance_masks import read_names
+from normlift_ns.evaluation.protocols import read_names
 from normlift_ns.evaluation.scannet import NYU40
+from normlift_ns.evaluation.studies import Variant
 from normlift_ns.options import BACKGROUND_WORDS, CANONICAL_NEGATIVES, RefineConfig
-from normlift_ns.scripts import evaluate
 from tests.scripts.conftest import run_entry, said
 
 
@@ -45,7 +45,7 @@ def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_nothing_is_replaced_unasked(little_lifted, capture, tmp_path, monkeypatch, capsys):
     masks = ("--protocol", "masks", "--labels", capture / "instance", "--study", "sweeps", "signals")
     coverage = ("--protocol", "none", "--study", "coverage")
-    monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
+    monkeypatch.setattr("normlift_ns.api.open_run", None)  # refused before anything is opened
     monkeypatch.chdir(tmp_path)
     plots = ("scores.json", "scores_sweeps.svg", "scores_signals.svg", "output.json")
     coverages = ("scores_coverage_camera_path.json", "scores_coverage_pose_5.png")
@@ -77,13 +77,13 @@ def test_coverage_needs_no_truth(little_lifted, tmp_path, monkeypatch, capsys):
 
 def stand_ins(path: Path, words: dict[str, str]) -> Path:
     """Vectors of words, each that of a colour."""
-    vectors = ColourEncoder().text(list(words.values())).numpy()
+    vectors = ColorEncoder().text(list(words.values())).numpy()
     np.savez(path, **dict(zip(words, vectors)))
     return path
 
 
 def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(votes, "SWEEPS", {"beta": (0.5,), "k": (6, 12), "delta": (0.0, 0.1)})
+    monkeypatch.setattr(studies, "SWEEPS", {"beta": (0.5,), "k": (6, 12), "delta": (0.0, 0.1)})
     flags = ("--study", "ablation", "sweeps", "signals", "timing", "baselines")
     document = scored("masks", capture / "instance", *flags)
     results, studies = document["results"], document["studies"]
@@ -98,7 +98,7 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
 
     assert list(studies) == ["ablation", "sweeps", "signals", "timing", "baselines"]
     by_variant = {row["variant"]: row["miou_3d"] for row in studies["ablation"]}
-    assert list(by_variant) == [*get_args(Variant), *votes.AGREED]
+    assert list(by_variant) == [*get_args(Variant), *studies.CONSENSUS_VARIANTS]
     ours = by_variant["consensus_posterior"]  # the defaults, here from stored u
     assert ours == pytest.approx(results["miou_3d"], abs=5e-3)
     assert by_variant["consensus"] == plain["miou_3d"] and len(set(by_variant.values())) > 3

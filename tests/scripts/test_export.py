@@ -14,10 +14,10 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from normlift_ns import open_run
-from normlift_ns.objects import connected_components
-from normlift_ns.runs.splats import instances_of
-from normlift_ns.scripts import export
-from normlift_ns.viewer.pictures import view_mask
+from normlift_ns.analysis.objects import connected_components
+from normlift_ns.cli import export
+from normlift_ns.exports import answer_instances
+from normlift_ns.rendering.figures import view_mask
 from tests.scripts.conftest import run_entry, said
 
 if TYPE_CHECKING:
@@ -36,12 +36,12 @@ def scene_ply(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
-    from normlift_ns.nerfstudio_plugin.config import rerooted  # noqa: PLC0415
+    from normlift_ns.nerfstudio_plugin.views import relocate_config  # noqa: PLC0415
 
     setup = ns_export.eval_setup
 
     def spoiled(config: Path, **options):
-        config, pipeline, *rest = setup(config, update_config_callback=lambda c: rerooted(c, lifted), **options)
+        config, pipeline, *rest = setup(config, update_config_callback=lambda c: relocate_config(c, lifted), **options)
         return config, pipeline, *rest
 
     monkeypatch.setattr(ns_export, "eval_setup", spoiled)
@@ -69,7 +69,7 @@ def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> Non
     assert np.array_equal(vertices["class_id"], class_id.numpy()[rows])
     names = json.loads(scene_ply.with_name("splat_names.json").read_text())
     assert (names["none"], names["class_id"]) == (0, {"1": "red", "2": "yellow"})
-    instance_id = instances_of(answer).instance_id.numpy()
+    instance_id = answer_instances(answer).instance_id.numpy()
     assert np.array_equal(vertices["instance_id"], instance_id[rows])
     assert [str(i) for i in np.unique(instance_id)] == ["0", *names["instance_id"]]
     for number, about in names["instance_id"].items():  # an object is of one class, and hangs together
@@ -152,7 +152,7 @@ def test_an_overwritten_export_is_that_of_the_last_one_alone(lifted: Path, tmp_p
 
 
 def test_no_part_of_an_export_is_replaced_unasked(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("normlift_ns.front_door.open_run", None)  # refused before anything is opened
+    monkeypatch.setattr("normlift_ns.api.open_run", None)  # refused before anything is opened
     for existing in ("splat.ply", "splat_rows.npy", "splat_names.json", "splat_objects.json"):
         (tmp_path / existing).write_text("mine")
         assert run_entry(monkeypatch, export.entrypoint, "--load-config", lifted, "--output-dir", tmp_path) == 1

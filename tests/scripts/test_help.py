@@ -18,7 +18,7 @@ import tyro
 
 import normlift_ns
 from benchmarks.reference import COMMANDS
-from normlift_ns.scripts import shared, start
+from normlift_ns.cli import common, start
 from tests.scripts.conftest import run_entry
 
 if sys.version_info >= (3, 11):
@@ -63,7 +63,7 @@ def options(command: Any) -> dict[str, tuple[set[str], str]]:
 def check_options(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     made: dict[str, Any] = {}
     monkeypatch.setattr(tyro, "cli", lambda flags, **how: made.update(flags=flags, **how))
-    shared.read_flags(COMMANDS[name], ["--help"], name)
+    common.parse_flags(COMMANDS[name], ["--help"], name)
     assert made["prog"] == name and "--quiet" in made["description"] and "--log-file" in made["description"]
     summary = " ".join((COMMANDS[name].__doc__ or "").split("\n\n")[0].split())
     assert made["description"].startswith(summary) and "Raises" not in made["description"]
@@ -99,10 +99,10 @@ def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhi
     monkeypatch.setattr(os, "_exit", sys.exit)
     for name, place in SCRIPTS.items():
         module, function = place.split(":")
-        assert module == "normlift_ns.scripts.start"
+        assert module == "normlift_ns.cli.start"
         begun: list[Any] = []
         with monkeypatch.context() as patch:
-            command = import_module(f"normlift_ns.scripts.{function}")
+            command = import_module(f"normlift_ns.cli.{function}")
             patch.setattr(command, "run_process", begun.append)
             getattr(start, function)()
             assert begun == [COMMANDS[name]], name
@@ -120,13 +120,13 @@ def test_every_command_starts_its_module_and_ends_when_it_is_interrupted_meanwhi
             patch.setattr(start, "import_module", interrupted)
             with pytest.raises(SystemExit) as stop:
                 getattr(start, function)()
-        assert (stop.value.code, begun[2:]) == (130, [f"normlift_ns.scripts.{function}"])
+        assert (stop.value.code, begun[2:]) == (130, [f"normlift_ns.cli.{function}"])
         assert capsys.readouterr() == ("", "Interrupted.\n")
 
 
 def test_a_process_prints_help_of_80_columns_and_its_version():
     environment = os.environ | {"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"}
-    program = "import sys; sys.argv[0] = 'ns-normlift-query'; from normlift_ns.scripts.start import query; query()"
+    program = "import sys; sys.argv[0] = 'ns-normlift-query'; from normlift_ns.cli.start import query; query()"
     printed = []
     for flag in ("--help", "--version"):
         words = [sys.executable, "-c", program, flag]

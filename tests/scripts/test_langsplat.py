@@ -15,10 +15,10 @@ from scipy import ndimage
 
 from benchmarks.captures import SHARED
 from normlift_ns import Scene, open_run, render
-from normlift_ns.asking import pixel_relevancy
-from normlift_ns.encoders.texts.files import TextVectors
-from normlift_ns.scripts import lift, query
-from normlift_ns.scripts.demo import iou_per_class
+from normlift_ns.cli import lift, query
+from normlift_ns.cli.demo import iou_per_class
+from normlift_ns.encoders.text_files import TextEmbeddingFile
+from normlift_ns.query.engine import pixel_relevancy
 from tests.captures import clip_vectors, needs_shared
 from tests.scripts.conftest import run_entry
 
@@ -92,7 +92,7 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
 def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_path, monkeypatch):
     """mIoU over the Gaussians of 13 classes, mean of some draws of the damage."""
     from benchmarks.plain_room import plain_room  # noqa: PLC0415
-    from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+    from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
 
     room = plain_room()
     names = json.loads((SHARED / "clip_vectors" / "lvis_v1_names.json").read_text())
@@ -100,7 +100,7 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
     write_capture(room, tmp_path / "room", held_out=1, width=320, height=240)
     trained = write_splatfacto_run(room, tmp_path / "room", tmp_path / "outputs")
     np.savez(tmp_path / "texts.npz", **dict(zip(THINGS.values(), vectors)))
-    texts = TextVectors(tmp_path / "texts.npz").text([THINGS[name] for name in room.names])
+    texts = TextEmbeddingFile(tmp_path / "texts.npz").text([THINGS[name] for name in room.names])
 
     def lifted(seed: int, level: str) -> tuple[Path, list[float]]:
         """The run, and mIoU before and after refinement."""
@@ -120,7 +120,7 @@ def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_pa
         return config, scores
 
     scores = {seed: lifted(seed, "l")[1] for seed in range(draws)}
-    monkeypatch.setattr("normlift_ns.observing.rasterize_evidence", None)  # another level has its evidence
+    monkeypatch.setattr("normlift_ns.evidence_collection.rasterize_evidence", None)  # another level has its evidence
     config, summed = lifted(0, "sum")
     asking = ("--text", "sofa", "--negatives", "box", "table", "--json", tmp_path / "a.json")
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", config, *asking) == 0

@@ -16,17 +16,16 @@ from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import Camera, InputError, open_run
-from normlift_ns.objects.catalogue import view_shares
-from normlift_ns.objects.tables import columns
-from normlift_ns.raster.rasterize import render
-from normlift_ns.runs.splats import instances_of
-from normlift_ns.scripts import export, query
-from normlift_ns.scripts.answers.catalogue import show_catalogue
-from normlift_ns.scripts.shared import CONSOLE
+from normlift_ns.analysis.catalogue import csv_columns, view_shares
+from normlift_ns.cli import export, query
+from normlift_ns.cli.answers import print_catalog
+from normlift_ns.cli.common import CONSOLE
+from normlift_ns.exports import answer_instances
+from normlift_ns.rasterization.rasterize import render
 from tests.scripts.conftest import run_entry, said
 
 if TYPE_CHECKING:
-    from normlift_ns.demo import DemoRoom
+    from normlift_ns.demo.room import DemoRoom
 
 
 @pytest.fixture(scope="module")
@@ -59,14 +58,14 @@ def test_of_many_objects_the_table_has_the_largest_and_breaks_no_number(lifted: 
     run = open_run(lifted)
     few = run.catalogue(run.ask("red"))
     many = tuple(replace(few.objects[0], id=i, gaussians=1000 + i) for i in range(1, 43))
-    show_catalogue(replace(few, objects=many))
+    print_catalog(replace(few, objects=many))
     shown = said(capsys)
     assert "1,042" in shown and "1,003" in shown and "1,002" not in shown
     assert "2 smaller objects" in shown and "--objects-dir" in shown
     place = few.objects[0].capture
     for width in (60, 80, 120):
         monkeypatch.setattr(CONSOLE, "width", width)
-        show_catalogue(few)
+        print_catalog(few)
         lines = capsys.readouterr().out.splitlines()
         assert max(map(len, lines)) <= width
         words = " ".join(lines).replace("│", " ").split()
@@ -111,7 +110,7 @@ def share_inside(means: torch.Tensor, camera: Camera) -> float:
 def test_views_are_those_that_show_it(lifted: Path) -> None:
     run = open_run(lifted)
     answer = run.ask("red", "yellow")
-    found, instances = run.catalogue(answer), instances_of(answer)
+    found, instances = run.catalogue(answer), answer_instances(answer)
     how = {"rasterize_mode": run.scene.rasterize_mode}
     shares = view_shares(run.scene.gaussians, run.scene.train.cameras, instances, **how)
     for number, thing in enumerate(found.objects, 1):
@@ -137,11 +136,11 @@ def test_views_are_those_that_show_it(lifted: Path) -> None:
 def test_the_page_explains_every_column() -> None:
     page = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
     explained = set(re.findall(r"`([a-z0-9_]+)`", page))
-    assert set(columns()) <= explained | {f"scene_{name}" for name in explained}
+    assert set(csv_columns()) <= explained | {f"scene_{name}" for name in explained}
 
 
 def test_a_catalogue_is_not_overwritten_unasked(written: Path, lifted: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("normlift_ns.quick.open_quick", None)
+    monkeypatch.setattr("normlift_ns.query.arrays.open_quick", None)
     flags = ("--load-config", lifted, "--text", "red", "--objects", "--objects-dir", written)
     assert run_entry(monkeypatch, query.entrypoint, *flags) == 1
     shown = said(capsys)

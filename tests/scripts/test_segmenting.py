@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from normlift_ns import LiftOptions, SourceOptions, lift_run
-from normlift_ns.encoders.sam.text_masks import Sam3Network, TextMasks
-from normlift_ns.scripts import query
+from normlift_ns.cli import query
+from normlift_ns.segmentation.sam3 import Sam3Network, TextMasks
 from tests.scripts.conftest import run_entry, said
 
 

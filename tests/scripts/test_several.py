@@ -20,7 +20,7 @@ from tests.scripts.conftest import wait_for
 
 pytestmark = pytest.mark.slow
 
-LIFT = (sys.executable, "-m", "normlift_ns.scripts.lift")
+LIFT = (sys.executable, "-m", "normlift_ns.cli.lift")
 THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")}
 """What rounding may depend on is the same for all."""
 TABLETOP = SHARED / "captures" / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
@@ -30,7 +30,7 @@ TABLETOP = SHARED / "captures" / "outputs" / "tabletop" / "splatfacto" / "run" /
 def trained(nerfstudio: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A room of three grains of Gaussians."""
     from benchmarks.plain_room import plain_room  # noqa: PLC0415
-    from normlift_ns.demo import write_capture, write_splatfacto_run  # noqa: PLC0415
+    from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("several")
     room = plain_room(20_000)

@@ -23,10 +23,10 @@ from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import open_run, open_scene, render
+from normlift_ns.cli import query
+from normlift_ns.data.splat import SplatParameters
 from normlift_ns.options import SourceOptions, SplatOptions
-from normlift_ns.runs.question import load_question
-from normlift_ns.scenes.splat import Splat
-from normlift_ns.scripts import query
+from normlift_ns.query.question import load_query
 from tests.scenes.made import ply_columns, write_ply
 from tests.scripts.conftest import run_entry
 
@@ -42,11 +42,11 @@ NAMES = ["overlay", "segmentation", "reliability", *SCALARS]
 @pytest.fixture(scope="module")
 def stranger(little: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """config.yml of a lifted run of a PLY file, where no run of nerfstudio ever existed."""
-    from normlift_ns.scripts.lift import NormLift  # noqa: PLC0415
+    from normlift_ns.cli.lift import NormLift  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("stock")
     shutil.copytree(little.parents[4] / "room", folder / "room")
-    ply = write_ply(folder / "splat.ply", ply_columns(Splat(**open_scene(little).parameters)))
+    ply = write_ply(folder / "splat.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
     world = little.parent / "dataparser_transforms.json"
     cameras = SplatOptions(transforms=folder / "room", world_transform=world, rasterize_mode="classic")
     source = SourceOptions(encoder="colour", region_count=64)
@@ -135,7 +135,7 @@ def without_encoders(nerfstudio: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("an encoder was made")
 
     monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
-    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.asker.encoder_of", never)
+    monkeypatch.setattr("normlift_ns.nerfstudio_plugin.panel.text_encoder_for", never)
 
 
 def test_ns_render_dataset(lifted: Path, tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_queries_are_stored_and_replaced(lifted: Path, tmp_path: Path, monkeypat
     flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save", "True")
     rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
-    stored = load_question(copy.parent / "normlift")
+    stored = load_query(copy.parent / "normlift")
     assert stored is not None and stored.texts == ("teal", "pink", "orange")
     assert (stored.threshold, stored.min_reliability, stored.refined) == (0.7, 0.25, False)
     before = (copy.parent / "normlift" / "queries.safetensors").read_bytes()

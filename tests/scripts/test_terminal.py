@@ -12,18 +12,23 @@ from types import SimpleNamespace
 
 import pytest
 
+from normlift_ns.cli import evaluate, export, lift, query, view
+from normlift_ns.cli.common import (
+    OutputSettings,
+    info,
+    info_opening,
+    info_progress,
+    one_line_errors,
+    split_output_flags,
+)
 from normlift_ns.errors import InputError
-from normlift_ns.scripts import evaluate, export, lift, query, view
-from normlift_ns.scripts.mistyped import plain_errors
-from normlift_ns.scripts.shared import say, say_opening, say_progress
-from normlift_ns.scripts.terminal import Terminal, terminal_flags
 from tests.scripts.conftest import SMALL, run_entry
 
 
 def talk(word: str) -> None:
-    say_opening(Path("run"))
-    say_progress("lift")
-    say(f"answer {word}")
+    info_opening(Path("run"))
+    info_progress("lift")
+    info(f"answer {word}")
     for text, category in (("old", FutureWarning), ("wrong", UserWarning)):
         warnings.warn_explicit(text, category, "/site-packages/torch/jit.py", 7)
     sys.stdout.write("\x1b[31mred\x1b[0m\n")
@@ -64,16 +69,16 @@ def test_mistakes_are_messages(ended) -> None:
         (("--log-file",), "--log-file"),
         (("--quiet", "yes"), "--quiet must be True or False, got 'yes'"),
     ):
-        code, out, err = ended(say, *flags)
+        code, out, err = ended(info, *flags)
         assert (code, out) == (1, "") and "Traceback" not in err
         assert [fact for fact in facts if fact not in err] == [], flags
 
 
 def test_words_for_another_command_stay() -> None:
     words = ["list.txt", "--quiet", "False", "--", "--quiet", "--log-file", "x"]
-    assert terminal_flags(words) == (["list.txt", *words[3:]], Terminal())
+    assert split_output_flags(words) == (["list.txt", *words[3:]], OutputSettings())
     with pytest.raises(InputError):
-        terminal_flags(["--log-file", "--k"])
+        split_output_flags(["--log-file", "--k"])
 
 
 def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
@@ -94,7 +99,7 @@ def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_
 
     environment = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "NO_COLOR")}
     environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
-    program = "from normlift_ns.scripts.start import lift; lift()"
+    program = "from normlift_ns.cli.start import lift; lift()"
     config = tmp_path / ("long-" * 30) / "no.yml"
     for flags, fact in ((("--load-config", str(config)), str(config)), (("--k", "many"), "--k cannot be 'many'.")):
         master, slave = pty.openpty()
@@ -154,7 +159,7 @@ def test_a_mistyped_flag_is_one_line_with_what_to_type(monkeypatch, capsys):
 def test_a_warning_meanwhile_is_not_lost_nor_is_help(monkeypatch, capsys) -> None:
     assert run_entry(monkeypatch, lift.entrypoint, "--help") == 0
     assert "usage: " in capsys.readouterr().out
-    with plain_errors("command"):
+    with one_line_errors("command"):
         print("k is lowered", file=sys.stderr)
     assert capsys.readouterr().err == "k is lowered\n"
 
@@ -169,8 +174,8 @@ def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
         doors.append((host, port))
         return SimpleNamespace(server=SimpleNamespace(port=7010))
 
-    monkeypatch.setattr("normlift_ns.viewer.serving.door.Door", door)
-    monkeypatch.setattr(view, "check_lifted", lambda *_: None)
+    monkeypatch.setattr("normlift_ns.viewer.adapter.Door", door)
+    monkeypatch.setattr(view, "check_lifted_run", lambda *_: None)
     monkeypatch.setattr(view.NormLiftView, "open", interrupted)
     for host, port in (("127.0.0.1", 7008), ("0.0.0.0", 7010)):
         view.NormLiftView(Path("config.yml"), host=host, port=port).main()

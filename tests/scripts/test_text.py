@@ -9,10 +9,9 @@ from typing import Any
 
 from rich.console import Console
 
-from normlift_ns.errors import visible
-from normlift_ns.insight.why import ViewVote, Why
-from normlift_ns.scripts import evaluate, export, lift, query, shared
-from normlift_ns.scripts.answers import prompting, reasons
+from normlift_ns.analysis.explain import ViewVote, Why
+from normlift_ns.cli import answers, common, evaluate, export, lift, query, repl
+from normlift_ns.errors import escape_unprintable
 from tests.scripts.conftest import run_entry
 
 HOSTILE = [
@@ -35,18 +34,18 @@ def summary(text: str) -> Any:
     forms = {"float16": {"bytes": 1, "bound": 0.1}}
     manifest = {"statistics": told, "forms": forms, "form": "float16", "features": {"kind": "given"}, "cost": {}}
     run = SimpleNamespace(field=SimpleNamespace(manifest=manifest), seconds={}, folder=text)
-    return lift.summary(run, {}, 1.0)  # type: ignore[arg-type]
+    return lift.lift_summary(run, {}, 1.0)  # type: ignore[arg-type]
 
 
 TABLES: dict[str, Callable[[str], Any]] = {
-    "query": lambda text: prompting.table([{"text": text, **NUMBERS}], "lerf > 0.5", 0.5),
+    "query": lambda text: repl.answer_table([{"text": text, **NUMBERS}], "lerf > 0.5", 0.5),
     "export": lambda text: export._objects_table([{"text": text, "objects": [OBJECT], "in_smaller_parts": 1}]),
     "export nothing": lambda text: export._objects_table([{"text": text, "objects": [], "in_smaller_parts": 1}]),
     "eval rows": lambda text: evaluate.rows_table([{"class": text, "iou": 0.5}], "ablation"),
     "eval columns": lambda text: evaluate.rows_table([{text: 0.5}]),
     "eval signals": lambda text: evaluate.signals_table([{"scene": text, "zero.share": 0.5}]),
     "lift": summary,
-    "text": shared.plain,
+    "text": common.plain_text,
 }
 
 
@@ -62,26 +61,26 @@ def test_hostile_texts_are_shown_as_they_are():
     for name, table in TABLES.items():
         for text in (":smile: [/red]", "\x1b[31m[bold]red"):
             shown = printed(table(text))
-            assert visible(text) in shown and "\x1b[31m" not in shown, name
+            assert escape_unprintable(text) in shown and "\x1b[31m" not in shown, name
     for text in HOSTILE:
         for options in ({}, {"markup": False, "emoji": False, "highlight": False}):
-            shown = printed(shared.plain(text), **options)
-            assert visible(text) in shown, text
+            shown = printed(common.plain_text(text), **options)
+            assert escape_unprintable(text) in shown, text
             assert not [x for x in ("\x1b]", "\x1b[31m", "\x07", "\r", "\u202e", "\x9b") if x in shown], text
             shown.encode("utf8")
 
 
 def test_lines_are_texts_too(capsys):
     for text in HOSTILE:
-        shared.say(f"Written: {text}/{'long/' * 60}end")
-        shared.say_error(f"{text} does not exist")
+        common.info(f"Written: {text}/{'long/' * 60}end")
+        common.print_error(f"{text} does not exist")
         shown = capsys.readouterr()
-        assert shown.out == f"Written: {visible(text)}/{'long/' * 60}end\n"
-        assert shown.err == f"{visible(text)} does not exist\n"
+        assert shown.out == f"Written: {escape_unprintable(text)}/{'long/' * 60}end\n"
+        assert shown.err == f"{escape_unprintable(text)} does not exist\n"
     for text in HOSTILE[:5]:  # nor does the console interpret anything
-        shared.CONSOLE.rule(text)
-        shared.CONSOLE.print(text)
-        shared.ERRORS.print(text)
+        common.CONSOLE.rule(text)
+        common.CONSOLE.print(text)
+        common.ERROR_CONSOLE.print(text)
         shown = capsys.readouterr()
         assert shown.out.count(text) == 2 and shown.err == f"{text}\n"
 
@@ -94,14 +93,14 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", *texts) == 0
     shown = capsys.readouterr().out
     for text in texts:
-        assert visible(text) in shown
+        assert escape_unprintable(text) in shown
     assert f"{folder}/a.json" in shown
     assert len(list(folder.glob("*.png"))) == len(texts)
     texts = (*texts, "blue $\\frac{$")
     exported = ("--load-config", lifted, "--output-dir", folder / "ply", "--text", *texts)
     assert run_entry(monkeypatch, export.entrypoint, *exported) == 0
     shown = capsys.readouterr().out
-    assert all(visible(text) in shown for text in texts)
+    assert all(escape_unprintable(text) in shown for text in texts)
 
 
 def test_answers_and_reasons_fit_into_the_terminal_with_all_their_numbers():
@@ -110,8 +109,8 @@ def test_answers_and_reasons_fit_into_the_terminal_with_all_their_numbers():
     why, names = Why(606, 60, 1.0, 1.0, 1.0, 16.6, 0.9, votes), ["images/0012.png", "images/0017.png"]
     for width in (60, 80, 120):
         for table, numbers in (
-            (prompting.table([row], "cosine > 0.5", 0.5, narrow=width < 100), "-0.18 0.25 -0.45 0.26 0.27 0.10"),
-            (reasons.table(names, ["tomato red"], [why], narrow=width < 120), "8.8% 0.994 -0.006 21%"),
+            (repl.answer_table([row], "cosine > 0.5", 0.5, narrow=width < 100), "-0.18 0.25 -0.45 0.26 0.27 0.10"),
+            (answers.explanation_table(names, ["tomato red"], [why], narrow=width < 120), "8.8% 0.994 -0.006 21%"),
         ):
             Console(file=(file := io.StringIO()), width=width).print(table)
             shown = file.getvalue()

@@ -8,17 +8,15 @@ from hypothesis import strategies as st
 
 from normlift_ns.errors import InputError
 from normlift_ns.session import actions
-from normlift_ns.session.found import found_objects
-from normlift_ns.session.history import MOST_STATES, History
-from normlift_ns.session.prompts import Prompt, click_name, pose, read_prompts
-from normlift_ns.session.space import Box
-from normlift_ns.session.state import State
-from normlift_ns.session.turns import Turns
+from normlift_ns.session.objects import list_objects
+from normlift_ns.session.prompts import Prompt, build_query, click_name, encode_prompts
+from normlift_ns.session.selection import SelectionBox
+from normlift_ns.session.state import MAX_STATES, History, RequestTokens, State
 from tests.session.worlds import BLOCK, ray, read, rows, world
 
 
 def asked(line: str, state: State | None = None) -> State:
-    prompts, question = pose(world().field, read_prompts(line, read), read, negatives=())
+    prompts, question = build_query(world().field, encode_prompts(line, read), read, negatives=())
     return actions.ask(State(world()) if state is None else state, prompts, question)
 
 
@@ -29,18 +27,18 @@ def chosen(state: State, *cubes: int) -> bool:
 def test_prompts_select_and_hides_add_up_over_questions():
     state = asked("red, zebra, blue")
     assert chosen(state, 0, 1, 2)
-    assert chosen(actions.show(state, 1), 1)
+    assert chosen(actions.show_prompt(state, 1), 1)
     for nothing in (2, -1):
-        assert actions.show(state, nothing) is state
-    assert chosen(actions.show(actions.show(state, 1), None), 0, 1, 2)
-    state = actions.hide(actions.show(state, 1))
+        assert actions.show_prompt(state, nothing) is state
+    assert chosen(actions.show_prompt(actions.show_prompt(state, 1), None), 0, 1, 2)
+    state = actions.hide(actions.show_prompt(state, 1))
     state = actions.hide(actions.click(asked("red", state), ray(0)))
     assert torch.equal(state.drawn, rows(2, 3))
     assert torch.equal(actions.show_all(state).drawn, rows(0, 1, 2, 3))
-    assert torch.equal(actions.only(asked("red", state)).drawn, rows(0, 2))
+    assert torch.equal(actions.show_only(asked("red", state)).drawn, rows(0, 2))
     assert torch.equal(actions.clear(state).drawn, state.drawn) and chosen(actions.clear(state))
     for wrong, hint in (
-        (lambda: actions.only(asked("green")), "selected"),
+        (lambda: actions.show_only(asked("green")), "selected"),
         (lambda: actions.hide(State(world())), "hide"),
     ):
         with pytest.raises(InputError, match=hint):
@@ -56,25 +54,28 @@ def test_a_click_selects_the_connected_object_adds_and_takes_away():
     assert chosen(alone, 2)
     both = actions.click(actions.click(alone, ray(BLOCK), "add"), ray(2 * BLOCK), "take away")
     assert chosen(both, 1)
-    assert chosen(actions.add(actions.take_away(state, rows(0)), rows(0)), 0, 2)
+    assert chosen(actions.add(actions.remove(state, rows(0)), rows(0)), 0, 2)
     for blind, gaussian in ((state, 3 * BLOCK), (actions.hide(actions.click(state, ray(0))), 0)):
         with pytest.raises(InputError, match="clicked"):  # without a direction, or hidden
             actions.click(blind, ray(gaussian))
-    prompts, question = pose(world().field, [Prompt(click_name(1), actions.click_vector(state, ray(BLOCK + 1)))], read)
+    prompts, question = build_query(
+        world().field, [Prompt(click_name(1), actions.picked_direction(state, ray(BLOCK + 1)))], read
+    )
     assert chosen(actions.ask(State(world()), prompts, question), 1)
 
 
 def test_the_thresholds_go_on_after_a_click_that_adds_and_stay_within_their_sliders():
     state = actions.click(asked("red"), ray(BLOCK), "add")
-    assert chosen(actions.threshold(state, 1.5), 1)
-    assert actions.threshold(state, state.question.threshold) is state
+    assert chosen(actions.set_threshold(state, 1.5), 1)
+    assert actions.set_threshold(state, state.question.threshold) is state
     assert torch.equal(
-        actions.min_reliability(asked("red"), 0.9).selection, rows(0, 2) & (world().field.scalars.reliability >= 0.9)
+        actions.set_min_reliability(asked("red"), 0.9).selection,
+        rows(0, 2) & (world().field.scalars.reliability >= 0.9),
     )
     for typed, threshold, reliability in ((99.0, 1.0, 1.0), (-5.0, -0.2, 0.0), (0.3, 0.3, 0.3)):
-        assert actions.threshold(state, typed).question.threshold == threshold
-        assert actions.min_reliability(state, typed).question.min_reliability == reliability
-    for act in (actions.threshold, actions.min_reliability):  # nothing is asked
+        assert actions.set_threshold(state, typed).question.threshold == threshold
+        assert actions.set_min_reliability(state, typed).question.min_reliability == reliability
+    for act in (actions.set_threshold, actions.set_min_reliability):  # nothing is asked
         assert act(empty := State(world()), 0.3) is empty
 
 
@@ -93,7 +94,7 @@ def test_growing_goes_from_part_to_whole_and_shrinking_to_the_core():
     assert chosen(actions.resize(State(world()), 3))
     shrunk = actions.resize(whole, -5)  # what is added or taken away then is so from what is left
     assert torch.equal(actions.add(shrunk, rows(1)).selection, shrunk.selection | rows(1))
-    assert chosen(actions.take_away(shrunk, shrunk.selection))
+    assert chosen(actions.remove(shrunk, shrunk.selection))
 
 
 @given(st.sets(st.integers(0, 4 * BLOCK - 1), min_size=1, max_size=20), st.integers(-10, 9))
@@ -107,17 +108,17 @@ def test_every_step_of_growth_holds_the_one_before(some, steps):
 
 def test_a_box_cuts_inside_outside_and_turned():
     state = asked("red")
-    box = Box((1.5, 1.5, 1.5), (10, 10, 10))
-    assert chosen(actions.cut(state, box), 0)
-    assert chosen(actions.cut(state, Box(box.centre, box.size, keeps_inside=False)), 2)
-    assert chosen(actions.add(actions.cut(state, box), rows(1)), 0, 1)
-    assert chosen(actions.cut(actions.cut(state, box), None), 0, 2)
+    box = SelectionBox((1.5, 1.5, 1.5), (10, 10, 10))
+    assert chosen(actions.set_box(state, box), 0)
+    assert chosen(actions.set_box(state, SelectionBox(box.centre, box.size, keeps_inside=False)), 2)
+    assert chosen(actions.add(actions.set_box(state, box), rows(1)), 0, 1)
+    assert chosen(actions.set_box(actions.set_box(state, box), None), 0, 2)
     half = 0.5**0.5
-    turned = Box((1, 2, 3), (2, 4, 6), (0.5, 0.1, -0.7, 0.2))
+    turned = SelectionBox((1, 2, 3), (2, 4, 6), (0.5, 0.1, -0.7, 0.2))
     inside = torch.from_numpy(np.array(turned.centre) + 0.999 * (turned.corners - turned.centre))
     outside = torch.from_numpy(np.array(turned.centre) + 1.001 * (turned.corners - turned.centre))
     assert bool(turned.kept(inside).all()) and not bool(turned.kept(outside).any())
-    turned = Box((101.5, 1.5, 1.5), (10, 300, 10), (half, 0, 0, half))  # y of the box is x of the world
+    turned = SelectionBox((101.5, 1.5, 1.5), (10, 300, 10), (half, 0, 0, half))  # y of the box is x of the world
     assert torch.equal(turned.kept(world().means), rows(0, 1, 2))
 
 
@@ -126,10 +127,10 @@ def test_every_deed_is_undone_and_done_again():
         asked_red := lambda s: asked("red", s),
         lambda s: actions.click(s, ray(0), "add"),
         lambda s: actions.click(s, ray(BLOCK), "add"),
-        lambda s: actions.cut(s, Box((0, 0, 0), (50, 50, 50))),
+        lambda s: actions.set_box(s, SelectionBox((0, 0, 0), (50, 50, 50))),
         actions.hide,
         asked_red,
-        lambda s: actions.threshold(s, 0.95),
+        lambda s: actions.set_threshold(s, 0.95),
         lambda s: actions.resize(s, 1),
         actions.clear,
         actions.show_all,
@@ -166,9 +167,9 @@ def test_steps_of_a_slider_are_one_and_old_states_go_and_hold_no_masks():
     assert history.states == (0, 4000)
     assert history.do(1, key="another").states == (0, 4000, 1)
     assert history.undo().redo().do(5000, key="threshold").states == (0, 4000, 5000)
-    for value in range(2 * MOST_STATES):
+    for value in range(2 * MAX_STATES):
         history = history.do(value)
-    assert (len(history.states), history.now) == (MOST_STATES, 2 * MOST_STATES - 1)
+    assert (len(history.states), history.now) == (MAX_STATES, 2 * MAX_STATES - 1)
     history = History.of(asked("red"), lean=State.lean)
     _ = history.now.selection
     history = history.do(actions.clear(history.now))
@@ -177,7 +178,7 @@ def test_steps_of_a_slider_are_one_and_old_states_go_and_hold_no_masks():
 
 
 def test_objects_are_listed_with_what_their_buttons_need():
-    found = found_objects(asked("red, blue, green"))
+    found = list_objects(asked("red, blue, green"))
     assert [(row.name, row.size) for row in found.objects] == [("red 1", 64), ("red 2", 64), ("blue 1", 64)]
     assert (found.left_out, found.in_smaller_parts) == (0, 0)
     first, blue = found.objects[0], found.objects[2]
@@ -188,12 +189,12 @@ def test_objects_are_listed_with_what_their_buttons_need():
     for row in (first, blue):
         grade = "strong" if row.reliability >= 0.8 else "fair" if row.reliability >= 0.6 else "weak"
         assert row.evidence.startswith(grade) and f"{row.reliability:.2f}" in row.evidence
-    assert [row.size for row in found_objects(actions.hide(asked("red"), first.mask)).objects] == [64]
-    few = found_objects(asked("red, blue"), most=2)
+    assert [row.size for row in list_objects(actions.hide(asked("red"), first.mask)).objects] == [64]
+    few = list_objects(asked("red, blue"), most=2)
     assert ([row.name for row in few.objects], few.left_out) == (["red 1", "blue 1"], 1)
-    assert found_objects(asked("red"), min_size=65).in_smaller_parts == 128
-    assert [row.name for row in found_objects(actions.show(asked("red, blue"), 1)).objects] == ["blue 1"]
-    by_hand = found_objects(actions.click(asked("red"), ray(0)))
+    assert list_objects(asked("red"), min_size=65).in_smaller_parts == 128
+    assert [row.name for row in list_objects(actions.show_prompt(asked("red, blue"), 1)).objects] == ["blue 1"]
+    by_hand = list_objects(actions.click(asked("red"), ray(0)))
     assert [row.name for row in by_hand.objects] == ["selected by hand 1"]
 
 
@@ -203,7 +204,7 @@ def test_poor_evidence_is_told_and_left_out():
     share = float((poor & rows(0, 1, 2)).sum() / (3 * BLOCK))
     assert state.poor == pytest.approx(share) and share > 0.25
     assert state.remark.startswith(f"{share:.0%} ")
-    sure = actions.leave_out_poor(state)
+    sure = actions.remove_weak(state)
     assert (sure.poor, sure.remark) == (0.0, "")
     assert torch.equal(sure.selection, rows(0, 1, 2) & ~poor)
     few = poor & rows(0, 1, 2)  # 20 % of what is selected
@@ -212,7 +213,7 @@ def test_poor_evidence_is_told_and_left_out():
 
 
 def test_late_answers_do_not_count():
-    turns = Turns()
+    turns = RequestTokens()
     first = turns.start("one")
     second = turns.start("two")
     assert (turns.wanted(first), turns.wanted(second)) == (False, True)
@@ -229,7 +230,7 @@ def test_a_file_is_called_after_what_selects_and_what_is_selected_by_hand_says_s
     floating = actions.select_floaters(state, rows(3))
     assert chosen(floating, 3)
     for one, name, by_hand in (
-        (state, "red, blue", ""), (actions.show(state, 1), "blue", ""), (floating, "selection", ", by hand"),
+        (state, "red, blue", ""), (actions.show_prompt(state, 1), "blue", ""), (floating, "selection", ", by hand"),
         (State(world()), "selection", ""),
     ):  # fmt: skip
         assert (one.name, one.by_hand) == (name, by_hand)

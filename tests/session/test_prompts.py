@@ -6,16 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.errors import InputError
-from normlift_ns.session.colours import prompt_colours
+from normlift_ns.rendering.colors import prompt_rgb_tuples
 from normlift_ns.session.prompts import (
-    MOST_PROMPTS,
+    MAX_PROMPTS,
     Prompt,
+    build_query,
     click_name,
+    encode_prompts,
     join_prompts,
-    merged,
-    pose,
-    prompts_of,
-    read_prompts,
+    merge_queries,
+    prompts_of_query,
     split_prompts,
 )
 from tests.session.worlds import read, world
@@ -40,48 +40,48 @@ def test_an_unknown_word_marks_its_row_and_the_rest_is_answered():
         calls.append(tuple(texts))
         return read(texts)
 
-    found = read_prompts("red, zebra; blue", counted)
+    found = encode_prompts("red, zebra; blue", counted)
     assert [(one.text, "'zebra'" in one.problem) for one in found] == [("red", False), ("zebra", True), ("blue", False)]
     assert (found[0].problem, calls[0]) == ("", ("red", "zebra", "blue"))
-    prompts, question = pose(world().field, found, read, negatives=())
+    prompts, question = build_query(world().field, found, read, negatives=())
     assert prompts == found
     assert question.texts == ("red", "blue")
     np.testing.assert_array_equal(question.vectors, np.eye(3)[:2])
     with pytest.raises(InputError, match="zebra"):
-        pose(world().field, read_prompts("zebra", read), read)
+        build_query(world().field, encode_prompts("zebra", read), read)
     with pytest.raises(InputError, match="Ask"):
-        pose(world().field, [], read)
+        build_query(world().field, [], read)
 
 
 def test_what_is_wrong_with_the_line_or_the_encoder_is_an_error():
-    assert len(read_prompts(",".join(map(str, range(MOST_PROMPTS))), lambda texts: np.ones((len(texts), 3)))) == 64
-    for line, hint in ((" ;, \n", "Ask"), (",".join(map(str, range(MOST_PROMPTS + 1))), "65 .* 64")):
+    assert len(encode_prompts(",".join(map(str, range(MAX_PROMPTS))), lambda texts: np.ones((len(texts), 3)))) == 64
+    for line, hint in ((" ;, \n", "Ask"), (",".join(map(str, range(MAX_PROMPTS + 1))), "65 .* 64")):
         with pytest.raises(InputError, match=hint):
-            read_prompts(line, read)
+            encode_prompts(line, read)
 
     def without_weights(_):
         raise FileNotFoundError("weights are gone")
 
     with pytest.raises(FileNotFoundError, match="weights are gone"):
-        read_prompts("red", without_weights)
+        encode_prompts("red", without_weights)
 
 
 def test_a_click_is_asked_by_its_direction_and_beside_texts_by_the_rule_cosine_alone():
     field, click = world().field, np.array([0.6, 0.8, 0], np.float32)
     known = {click_name(1): click}
-    (prompt,) = read_prompts("like click 1", read, known)
+    (prompt,) = encode_prompts("like click 1", read, known)
     assert prompt.clicked
-    _, question = pose(field, [prompt], read)
+    _, question = build_query(field, [prompt], read)
     assert (question.rule, question.threshold, question.negatives) == ("cosine", 0.9, ())
-    again = {row.text: row.vector for row in prompts_of(question)}
-    (prompt,) = read_prompts(join_prompts(question.texts), read, again)
+    again = {row.text: row.vector for row in prompts_of_query(question)}
+    (prompt,) = encode_prompts(join_prompts(question.texts), read, again)
     np.testing.assert_array_equal(prompt.vector, click)
-    (lost,) = read_prompts("like click 2", read, known)
+    (lost,) = encode_prompts("like click 2", read, known)
     assert lost.vector is None and "'like click 2'" in lost.problem
 
     prompts = [Prompt("red", read(["red"])[0]), prompt]
-    assert pose(field, prompts, read, negatives=())[1].texts == ("red", "like click 1")
-    marked, question = pose(field, prompts, read, negatives=["green"])
+    assert build_query(field, prompts, read, negatives=())[1].texts == ("red", "like click 1")
+    marked, question = build_query(field, prompts, read, negatives=["green"])
     assert question.texts == ("red",)
     assert marked[0].problem == "" and "cosine" in marked[1].problem
 
@@ -90,19 +90,19 @@ def test_saving_keeps_what_is_saved():
     field = world().field
 
     def posed(line, **how):
-        return pose(field, read_prompts(line, read), read, **how)[1]
+        return build_query(field, encode_prompts(line, read), read, **how)[1]
 
     one, two = posed("red, blue", negatives=()), posed("blue, green", negatives=(), threshold=0.7)
-    both = merged(one, two)
+    both = merge_queries(one, two)
     assert (both.texts, both.threshold) == (("red", "blue", "green"), 0.7)
     np.testing.assert_array_equal(both.vectors, np.eye(3))
-    assert merged(None, two) is two and prompts_of(None) == ()
+    assert merge_queries(None, two) is two and prompts_of_query(None) == ()
     for other in (posed("red", negatives=["green"]), posed("red", negatives=(), refined=False)):
         with pytest.raises(InputError, match=f"2 prompts .*cosine.*{other.rule}"):
-            merged(one, other)
+            merge_queries(one, other)
 
 
 def test_a_prompt_has_the_colour_that_it_names():
-    assert prompt_colours(["a dark green leaf"])[0] == pytest.approx((3 / 255, 53 / 255, 0), abs=1 / 255)
-    colours = prompt_colours(["fox", "bear", "wolf", "yellow"])
+    assert prompt_rgb_tuples(["a dark green leaf"])[0] == pytest.approx((3 / 255, 53 / 255, 0), abs=1 / 255)
+    colours = prompt_rgb_tuples(["fox", "bear", "wolf", "yellow"])
     assert min(np.abs(np.subtract(a, b)).max() for i, a in enumerate(colours) for b in colours[:i]) > 0.2

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from normlift_ns import GaussianScene
-from normlift_ns.session.viewpoint import Spot, clear_viewpoint, viewpoint
+from normlift_ns.session.objects import LookAtTarget, unoccluded_viewpoint, viewpoint
 
-SPOT = Spot((0.0, 0.0, 0.0), 1.0)
+SPOT = LookAtTarget((0.0, 0.0, 0.0), 1.0)
 FROM, UP = (0.0, -10.0, 0.0), (0.0, 0.0, 1.0)
 AWAY = 1 / np.tan(0.45)
 
@@ -34,13 +34,13 @@ def test_a_spot_fills_half_the_picture_from_the_side_where_the_camera_is_unless_
     seen = (0, -AWAY, 0)
     assert viewpoint(SPOT, FROM) == pytest.approx(seen)
     assert viewpoint(SPOT, SPOT.centre) == pytest.approx(seen)
-    assert viewpoint(Spot((1.0, 0.0, 0.0), 2.0), (1.0, 0.0, 9.0), np.pi / 2) == pytest.approx((1, 0, 2))
+    assert viewpoint(LookAtTarget((1.0, 0.0, 0.0), 2.0), (1.0, 0.0, 9.0), np.pi / 2) == pytest.approx((1, 0, 2))
     for sides in ((), ((0, 1, 0),), ((1, 0, 0), (-1, 0, 0), (0, 0, 1))):  # nothing in the way
-        assert clear_viewpoint(SPOT, walls(*sides), None, FROM, UP) == pytest.approx(seen), sides
+        assert unoccluded_viewpoint(SPOT, walls(*sides), None, FROM, UP) == pytest.approx(seen), sides
     scene = walls((0, -1, 0))
     hidden = torch.arange(len(scene)) == 0
-    assert clear_viewpoint(SPOT, scene, hidden, FROM, UP) == pytest.approx(seen)
-    around = np.array(clear_viewpoint(SPOT, scene, None, FROM, UP))
+    assert unoccluded_viewpoint(SPOT, scene, hidden, FROM, UP) == pytest.approx(seen)
+    around = np.array(unoccluded_viewpoint(SPOT, scene, None, FROM, UP))
     assert np.linalg.norm(around) == pytest.approx(AWAY)
     assert around[1] < 0 and np.abs(around) == pytest.approx([AWAY * 0.5**0.5, AWAY * 0.5**0.5, 0])
 
@@ -48,14 +48,14 @@ def test_a_spot_fills_half_the_picture_from_the_side_where_the_camera_is_unless_
 def test_a_large_gaussian_whose_center_is_farther_away_stands_in_the_way_too():
     beside = torch.tensor([[0.0, 0.0, 0.0], [3.0, -1.0, 0.0]])
     scene = GaussianScene(beside, torch.eye(4)[:1].expand(2, 4), torch.tensor([[0.05] * 3, [2.0] * 3]), torch.ones(2))
-    assert clear_viewpoint(SPOT, scene, None, FROM, UP) == pytest.approx((AWAY * 0.5**0.5, -AWAY * 0.5**0.5, 0))
+    assert unoccluded_viewpoint(SPOT, scene, None, FROM, UP) == pytest.approx((AWAY * 0.5**0.5, -AWAY * 0.5**0.5, 0))
 
 
 def test_in_a_corner_it_takes_the_open_side():
     around = [(np.sin(a), -np.cos(a), 0.0) for a in np.radians([0, 45, -45, 90, -90, 135, -135])]
-    place = np.array(clear_viewpoint(SPOT, walls(*around), None, FROM, UP))
+    place = np.array(unoccluded_viewpoint(SPOT, walls(*around), None, FROM, UP))
     assert place == pytest.approx([0, AWAY, 0], abs=1e-9)
-    above = np.array(clear_viewpoint(SPOT, walls(*around, (0.0, 1.0, 0.0)), None, FROM, UP))
+    above = np.array(unoccluded_viewpoint(SPOT, walls(*around, (0.0, 1.0, 0.0)), None, FROM, UP))
     assert above[2] > 0.4 * AWAY
     assert np.linalg.norm(above) == pytest.approx(AWAY)
 
@@ -63,8 +63,8 @@ def test_in_a_corner_it_takes_the_open_side():
 def test_without_any_clear_side_it_stays_on_one():
     scene = GaussianScene(torch.zeros(1, 3), torch.eye(4)[:1], torch.full((1, 3), 30.0), torch.ones(1))
     for spot, some, place, up in (
-        (Spot((0.0, 0.0, 0.0), 1e-3), scene, FROM, UP),
+        (LookAtTarget((0.0, 0.0, 0.0), 1e-3), scene, FROM, UP),
         (SPOT, walls((0, -1, 0)), (0, 0, 5.0), UP),
         (SPOT, walls((0, -1, 0)), FROM, (0, 0, 0)),
     ):
-        assert np.isfinite(clear_viewpoint(spot, some, None, place, up)).all()
+        assert np.isfinite(unoccluded_viewpoint(spot, some, None, place, up)).all()

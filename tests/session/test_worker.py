@@ -8,12 +8,12 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.session.worker import Worker
+from normlift_ns.session.state import JobQueue
 
 
 @given(st.lists(st.sampled_from(["", "a", "b"]), max_size=30))
 def test_work_is_done_in_order_and_of_a_key_the_last_in_a_row(keys):
-    worker, gate, done, ended = Worker(), threading.Event(), [], threading.Event()
+    worker, gate, done, ended = JobQueue(), threading.Event(), [], threading.Event()
     worker.put(lambda: done.extend([] if gate.wait(30) else ["late"]))
     for i, key in enumerate(keys):
         worker.put(lambda i=i: done.append(i), key)
@@ -25,7 +25,7 @@ def test_work_is_done_in_order_and_of_a_key_the_last_in_a_row(keys):
 
 def test_what_waits_is_forgotten_and_nothing_is_taken_in_the_end():
     for forget, expected in (("drop", [True, 3]), ("end", [True])):
-        worker, begun, gate, done = Worker(), threading.Event(), threading.Event(), []
+        worker, begun, gate, done = JobQueue(), threading.Event(), threading.Event(), []
 
         def first(begun: threading.Event = begun, gate: threading.Event = gate, done: list[int] = done) -> None:
             begun.set()

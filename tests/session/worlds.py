@@ -10,7 +10,7 @@ import torch
 from normlift_ns import Evidence, SemanticField, lift
 from normlift_ns.core.evidence import Entries
 from normlift_ns.errors import InputError
-from normlift_ns.session.space import Space
+from normlift_ns.session.selection import SelectionContext
 
 SIDE = 4
 BLOCK = SIDE**3
@@ -18,7 +18,7 @@ BLOCK = SIDE**3
 WORDS = {"red": (1.0, 0.0, 0.0), "blue": (0.0, 1.0, 0.0), "green": (0.0, 0.0, 1.0)}
 
 
-def cubes(side: int = SIDE) -> Space:
+def cubes(side: int = SIDE) -> SelectionContext:
     """Four cubes of Gaussians in a row, 100 apart: red, blue, red, and one without a direction."""
     axis, block = torch.arange(side).float(), side**3
     cube = torch.cartesian_prod(axis, axis, axis)
@@ -28,11 +28,11 @@ def cubes(side: int = SIDE) -> Space:
     again = Entries(torch.arange(block), torch.ones(block, dtype=torch.long), torch.ones(block), (3,))
     features = torch.cat([torch.eye(3), torch.eye(3)])
     evidence = Evidence.from_entries([seen, again], 4 * block)
-    return Space(SemanticField.build(lift(evidence, features), means), means)
+    return SelectionContext(SemanticField.build(lift(evidence, features), means), means)
 
 
 @cache
-def world() -> Space:
+def world() -> SelectionContext:
     """The same for all tests that do nothing but ask."""
     return cubes()
 

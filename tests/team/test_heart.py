@@ -11,10 +11,15 @@ from typing import Any
 
 import pytest
 
+from normlift_ns.distributed import launch as module
+from normlift_ns.distributed.launch import (
+    HEARTBEAT_TIMEOUT,
+    Heartbeat,
+    PeerFailure,
+    describe_failure,
+    rank_and_world_size,
+)
 from normlift_ns.errors import InputError
-from normlift_ns.team import heart as module
-from normlift_ns.team.heart import PATIENCE, Heart, Lost
-from normlift_ns.team.launch import rank_of, told
 
 
 class Store:
@@ -57,11 +62,11 @@ class World:
         self.store, self.hearts, self.now = Store(), [], 0.0
         self.signals: list[int] = []
         self.exits: list[int] = []
-        self.words: list[Lost] = []
+        self.words: list[PeerFailure] = []
         self.threads: list[threading.Thread] = []
 
-    def team(self, size: int) -> list[Heart]:
-        self.hearts = [Heart(self.store, rank, size, self.words.append) for rank in range(size)]
+    def team(self, size: int) -> list[Heartbeat]:
+        self.hearts = [Heartbeat(self.store, rank, size, self.words.append) for rank in range(size)]
         for one in self.hearts:
             before = set(threading.enumerate())
             one.start()
@@ -87,9 +92,9 @@ class World:
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     """All hearts are stopped in the end: one that is not ends the process."""
-    assert (module.BEAT, PATIENCE, module._GRACE) == (2, 30, 10)
+    assert (module.HEARTBEAT_INTERVAL, HEARTBEAT_TIMEOUT, module._GRACE) == (2, 30, 10)
     found = World()
-    monkeypatch.setattr(module, "BEAT", 0.002)
+    monkeypatch.setattr(module, "HEARTBEAT_INTERVAL", 0.002)
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: found.now))
     monkeypatch.setattr(os, "kill", lambda pid, number: found.signals.append(number))
     monkeypatch.setattr(os, "_exit", found.exits.append)
@@ -101,7 +106,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
 def test_a_slow_process_is_waited_for(world: World) -> None:
     hearts = world.team(3)
     for _ in range(4):
-        world.pass_by(0.95 * PATIENCE)
+        world.pass_by(0.95 * HEARTBEAT_TIMEOUT)
     assert [one.lost for one in hearts] == [None] * 3
     for one in reversed(hearts):
         one.stop(well=True)
@@ -112,10 +117,10 @@ def test_a_heartbeat_that_stands_still_is_noticed_by_all_others(world: World) ->
     hearts = world.team(3)
     world.kill(1)
     hearts[0]._waiting = hearts[2]._waiting = True
-    world.pass_by(0.4 * PATIENCE)
-    world.pass_by(0.5 * PATIENCE)
+    world.pass_by(0.4 * HEARTBEAT_TIMEOUT)
+    world.pass_by(0.5 * HEARTBEAT_TIMEOUT)
     assert hearts[0].lost is hearts[2].lost is None
-    world.now += 0.2 * PATIENCE
+    world.now += 0.2 * HEARTBEAT_TIMEOUT
     found = [hearts[r].wait_for_a_loss() for r in (0, 2)]
     assert [lost is not None and (lost.rank, lost.failed) for lost in found] == [(1, False)] * 2
     assert str(os.getpid()) in found[0].place and world.signals == []  # type: ignore[union-attr]
@@ -125,7 +130,7 @@ def test_one_that_ends_well_is_not_missed(world: World) -> None:
     hearts = world.team(2)
     hearts[1].stop(well=True)
     for _ in range(3):
-        world.pass_by(0.9 * PATIENCE)
+        world.pass_by(0.9 * HEARTBEAT_TIMEOUT)
     assert hearts[0].lost is None and world.signals == []
     hearts[0].stop(well=True)
 
@@ -172,13 +177,13 @@ def test_where_the_store_is_gone_process_0_has_reported_its_error(world: World) 
 
 def test_an_environment_that_cannot_be() -> None:
     good = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
-    assert rank_of(good) == (1, 2)
-    assert rank_of(good | {"RANK": "0", "WORLD_SIZE": "1"}) is None
+    assert rank_and_world_size(good) == (1, 2)
+    assert rank_and_world_size(good | {"RANK": "0", "WORLD_SIZE": "1"}) is None
     for change in ({"RANK": "x"}, {"RANK": "2"}, {"RANK": "-1"}, {"WORLD_SIZE": "-1"}):
         with pytest.raises(InputError, match="torchrun"):
-            rank_of(good | change)
+            rank_and_world_size(good | change)
 
 
 def test_what_people_are_told() -> None:
-    text = told(Lost(1, False, "there, process 7"))
+    text = describe_failure(PeerFailure(1, False, "there, process 7"))
     assert "Process 1 (there, process 7)" in text

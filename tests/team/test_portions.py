@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, RefineConfig, consensus, lift, nearest_neighbors
-from normlift_ns.core import portions
+from normlift_ns.core import partition
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import Scalars
-from normlift_ns.core.portions import ALONE, Portion, Team
-from normlift_ns.core.storage import StoredEvidence
-from normlift_ns.lifting import vote_together
+from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
+from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
 from normlift_ns.options import Storage
-from normlift_ns.stages import Stages
-from normlift_ns.team.exchange import Piece, share_evidence
+from normlift_ns.pipeline import vote_distributed
+from normlift_ns.progress import StageTimer
 from tests.scenes import generator, random_evidence, unit_rows
 from tests.team.threads import together
 
@@ -27,7 +27,7 @@ N, VIEWS, REGIONS, D = 150, (3, 0, 2, 4, 1), 10, 24
 
 @pytest.fixture(autouse=True)
 def small_grains(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(portions, "GRAIN", 16)
+    monkeypatch.setattr(partition, "PARTITION_BLOCK", 16)
     monkeypatch.setattr("normlift_ns.core.refine._BLOCK", (32, 32))
 
 
@@ -42,8 +42,8 @@ def world(seed: int) -> tuple[torch.Tensor, Evidence, torch.Tensor]:
 def test_everybody_is_of_one_portion(n: int, size: int, seed: int) -> None:
     means = torch.randn(n, 3, generator=generator(seed))
 
-    def work(team: Team) -> tuple[torch.Tensor, torch.Tensor]:
-        portion = Portion.of(team, means)
+    def work(team: Communicator) -> tuple[torch.Tensor, torch.Tensor]:
+        portion = Partition.of(team, means)
         assert torch.equal(portion.gaussians, portion.gaussians.sort().values)
         assert torch.equal(torch.cat([*portion.blocks(), portion.along[:0]]).sort().values, torch.arange(len(portion)))
         return portion.gaussians, portion.join(means[portion.gaussians])
@@ -58,10 +58,10 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
     means, evidence, _ = world(seed)
     chunks = [[0], [1, 2], [3], [4]]
 
-    def work(team: Team) -> tuple[Evidence, torch.Tensor]:
-        portion = Portion.of(team, means)
-        pieces = {c: Piece.of(evidence.select_views(chunks[c]), portion) for c in team.chunks(len(chunks))}
-        return share_evidence(pieces, portion, len(chunks)), portion.gaussians
+    def work(team: Communicator) -> tuple[Evidence, torch.Tensor]:
+        portion = Partition.of(team, means)
+        pieces = {c: EvidenceShard.of(evidence.select_views(chunks[c]), portion) for c in team.chunks(len(chunks))}
+        return redistribute_evidence(pieces, portion, len(chunks)), portion.gaussians
 
     for found, gaussians in together(size, work):
         expected = evidence.select_gaussians(gaussians)
@@ -71,15 +71,15 @@ def test_evidence_changes_hands(seed: int, size: int) -> None:
             assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("offsets", "column", "weight"))
 
 
-def lifted_by(team: Team, seed: int, vote: str, storage: Storage) -> SemanticField | None:
+def lifted_by(team: Communicator, seed: int, vote: str, storage: Storage) -> SemanticField | None:
     """All that follows from evidence, by the process of a team."""
     means, evidence, features = world(seed)
-    portion = Portion.of(team, means)
+    portion = Partition.of(team, means)
     mine = evidence.select_gaussians(portion.gaussians)
     table = consensus(mine, features, portion=portion, sample=5).features
     lifted = lift(mine, table)
-    config, stages = RefineConfig(vote=vote, k=9), Stages(lambda stage, done, total: None)  # type: ignore[arg-type]
-    copied, shares = vote_together(means, lifted, lifted.scalars.own_evidence, config, portion, stages)
+    config, stages = RefineConfig(vote=vote, k=9), StageTimer(lambda stage, done, total: None)  # type: ignore[arg-type]
+    copied, shares = vote_distributed(means, lifted, lifted.scalars.own_evidence, config, portion, stages)
     how = {"tolerance": 0.3, "storage": storage, "provenance": shares}
     return SemanticField.build_together(lifted, means, copied, portion, **how)
 
@@ -95,7 +95,7 @@ def stored(field: SemanticField) -> list[torch.Tensor]:
     [("posterior", "low_rank", 0), ("paper", "float16", 1), ("posterior", "evidence", 2), ("posterior", "auto", 3)],
 )
 def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
-    expected = lifted_by(ALONE, seed, vote, storage)
+    expected = lifted_by(SINGLE_PROCESS, seed, vote, storage)
     assert expected is not None
     assert float((expected.source != torch.arange(N)).float().mean()) > 0.1
     for size in (2, 13):  # of which some have nothing

@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from normlift_ns.core.portions import Team
+from normlift_ns.core.partition import Communicator
 
 T = TypeVar("T")
 
 
-class Threads(Team):
+class Threads(Communicator):
     """One of some threads."""
 
     def __init__(self, rank: int, size: int, board: list[Any], barrier: threading.Barrier) -> None:
@@ -59,7 +59,7 @@ class Threads(Team):
         return iter(range(count)[::-1][self.rank :: self.size])  # in an order that nobody expects
 
 
-def together(size: int, work: Callable[[Team], T]) -> list[T]:
+def together(size: int, work: Callable[[Communicator], T]) -> list[T]:
     """What every thread of a team makes of the same work."""
     board, barrier, found = [None] * size, threading.Barrier(size), [None] * size
     errors: list[BaseException] = []

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import torch
 
+from normlift_ns.api import lift_run, open_run
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.encoders.cache import _read, _write
 from normlift_ns.errors import InputError
-from normlift_ns.front_door import lift_run, open_run
 from normlift_ns.lifted_run import LiftedRun
 from tests.core.test_digests import flipped
 

@@ -12,10 +12,9 @@ from typing import Any
 import torch
 
 from normlift_ns import Camera, GaussianScene
-from normlift_ns.runs.files import FIELD_FOLDER
-from normlift_ns.session.space import Space
-from normlift_ns.viewer.records import make_records
-from normlift_ns.viewer.shared import Run
+from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.session.selection import SelectionContext
+from normlift_ns.viewer.shared import Run, make_records
 from tests.session.worlds import read
 
 
@@ -43,7 +42,7 @@ def scene_of(gaussians: GaussianScene, rgb: torch.Tensor | None = None, cameras:
     )  # fmt: skip
 
 
-def run_of(folder: Path, space: Space, scene: Any = None) -> Run:
+def run_of(folder: Path, space: SelectionContext, scene: Any = None) -> Run:
     """A run whose encoder knows three words."""
     scene = scene_of(spheres(space.means, 0.3), cameras=(camera(),)) if scene is None else scene
     (folder / FIELD_FOLDER).mkdir(exist_ok=True)

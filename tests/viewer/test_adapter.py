@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection
 
-from normlift_ns.viewer.adapter import Page, Server, pass_over_the_gone
+from normlift_ns.viewer.adapter import BrowserPage, ViserServer, ignore_closed_clients
 from tests.viewer.scenes import free_port, until
 from tests.viewer.wire import ONE, messages, opened
 
@@ -25,19 +25,19 @@ NAME, NOTICE = ("uuid", "GuiMarkdownMessage") if ONE else ("id", "GuiAddMarkdown
 
 
 @pytest.fixture(scope="module")
-def pages() -> list[Page]:
+def pages() -> list[BrowserPage]:
     return []
 
 
 @pytest.fixture(scope="module")
-def server(pages: list[Page]) -> Iterator[Server]:
-    server = Server("127.0.0.1", free_port(), "label", pages.append, lambda _: None)
+def server(pages: list[BrowserPage]) -> Iterator[ViserServer]:
+    server = ViserServer("127.0.0.1", free_port(), "label", pages.append, lambda _: None)
     yield server
     server.stop()
 
 
 @contextmanager
-def browsing(server: Server, pages: list[Page]) -> Iterator[tuple[ClientConnection, Page]]:
+def browsing(server: ViserServer, pages: list[BrowserPage]) -> Iterator[tuple[ClientConnection, BrowserPage]]:
     """A browser, and its page."""
     before = len(pages)
     with opened(server.port) as browser:
@@ -171,7 +171,7 @@ def test_what_a_closed_page_asked_is_passed_over_and_all_else_is_told():
     heard, come = [], []
     lines = [SimpleNamespace(_handle_incoming_message=read) for _ in range(2)]
     told = {"get_clients": lambda: {3: "here"}, "on_client_connect": come.append}
-    pass_over_the_gone(SimpleNamespace(_websock_server=lines[0], **told))
+    ignore_closed_clients(SimpleNamespace(_websock_server=lines[0], **told))
     come[0](SimpleNamespace(_websock_connection=lines[1]))
     for line in lines:
         line._handle_incoming_message(4, KeyError(4))

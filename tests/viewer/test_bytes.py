@@ -7,9 +7,9 @@ from importlib.util import find_spec
 import pytest
 from websockets.sync.client import connect
 
-from normlift_ns.viewer.people import People
-from normlift_ns.viewer.records import BYTES
-from normlift_ns.viewer.serving.door import Door
+from normlift_ns.viewer.adapter import Door
+from normlift_ns.viewer.person import People
+from normlift_ns.viewer.shared import BYTES
 from tests.session.worlds import cubes
 from tests.viewer.scenes import free_port, run_of
 from tests.viewer.wire import CAMERA

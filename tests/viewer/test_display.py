@@ -8,13 +8,19 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns.asking import Answer
-from normlift_ns.colors import colors_of, prompt_colors
-from normlift_ns.errors import visible
-from normlift_ns.question import Question
-from normlift_ns.viewer.display import color_scale, draw, make_display, overlay, reliability_picture, segmentation
-from normlift_ns.viewer.legend import clipped
-from normlift_ns.viewer.status import as_text
+from normlift_ns.errors import escape_unprintable
+from normlift_ns.query.engine import Answer
+from normlift_ns.query.question import Query
+from normlift_ns.rendering.colors import clip_text, colormap_rgb, prompt_colors
+from normlift_ns.rendering.figures import (
+    color_scale,
+    make_display,
+    overlay,
+    reliability_map,
+    render_outputs,
+    segmentation,
+)
+from normlift_ns.viewer.widgets import escape_mdx
 
 
 def pictured() -> tuple[torch.Tensor, torch.Tensor]:
@@ -25,7 +31,7 @@ def pictured() -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
     rgb, grey = pictured()
-    colors = colors_of("viridis")
+    colors = colormap_rgb("viridis")
     relevancy, share = torch.zeros(4, 5), torch.zeros(4, 5, 1)
     relevancy[0] = torch.tensor([-1.0, 0.5, 0.75, 1.0, 7.0])
     share[0] = 1
@@ -50,18 +56,18 @@ def test_segmentation_and_reliability_have_colours_of_their_own() -> None:
     found = segmentation(rgb, labels, torch.ones(4, 5, 1), colors)
     torch.testing.assert_close(found, 0.2 * grey + 0.8 * colors[labels])
     torch.testing.assert_close(segmentation(rgb, labels, torch.zeros(4, 5, 1), colors), grey)
-    colors, alpha = colors_of("cividis"), torch.full((4, 5), 0.5)
+    colors, alpha = colormap_rgb("cividis"), torch.full((4, 5), 0.5)
     reliability = torch.full((4, 5, 1), 0.25)  # composited: R is 0.5
-    found = reliability_picture(rgb, reliability, alpha)
+    found = reliability_map(rgb, reliability, alpha)
     torch.testing.assert_close(found, 0.55 * grey + 0.45 * colors[128].expand(4, 5, 3))
-    assert torch.equal(reliability_picture(rgb, 0 * reliability, 0 * alpha), grey)
+    assert torch.equal(reliability_map(rgb, 0 * reliability, 0 * alpha), grey)
 
 
 def shown(texts: tuple[str, ...], relevancy: torch.Tensor) -> Answer:
     field: Any = SimpleNamespace(
         scalars=SimpleNamespace(reliability=torch.tensor([0.9, 0.5, 0.2]), n_eff=torch.ones(3), weight=torch.ones(3))
     )
-    question = Question(texts, torch.eye(len(texts), 2))
+    question = Query(texts, torch.eye(len(texts), 2))
     return Answer(question, field, torch.zeros(3, 3), relevancy, torch.ones(3).bool(), relevancy > 0.5)
 
 
@@ -71,7 +77,7 @@ def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> No
     )
     image, alpha = torch.rand(200, 300, 7, generator=torch.Generator().manual_seed(1)), torch.ones(200, 300)
     rgb = torch.full((200, 300, 3), 0.5)
-    told, seen = draw(display, rgb, image, alpha), draw(display, rgb, image, alpha, by_text=True)
+    told, seen = render_outputs(display, rgb, image, alpha), render_outputs(display, rgb, image, alpha, by_text=True)
     assert list(told)[:2] == ["relevancy_0", "relevancy_1"]
     assert list(seen)[:2] == ["relevancy_sky_blue", "relevancy_sky_blue_2"]
     others = ["reliability", "reliability_value", "n_eff", "selection", "segmentation", "overlay"]
@@ -83,7 +89,7 @@ def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> No
         white = (seen[name] > 0.8).all(dim=2)  # letters
         assert int(white[100:, 150:].sum()) >= 20
         assert int(white[:100].sum()) == 0
-    small = draw(display, rgb[:100], image[:100], alpha[:100])
+    small = render_outputs(display, rgb[:100], image[:100], alpha[:100])
     assert not bool((small["overlay"] > 0.8).all(dim=2).any())  # no room for a legend
 
 
@@ -99,14 +105,14 @@ def test_the_scale_is_that_of_all_prompts_and_views() -> None:
 
 
 def test_markup_is_text_and_choices_of_a_dropdown_can_be_sent_and_shown() -> None:
-    assert as_text("1 < 2 {}\n") == "1 &#60; 2 &#123;&#125;&#10;"
-    assert clipped("a\n  b", 9) == "a b"
+    assert escape_mdx("1 < 2 {}\n") == "1 &#60; 2 &#123;&#125;&#10;"
+    assert clip_text("a\n  b", 9) == "a b"
     for text in (
         "<script>x</script>", "{1+1}", "| a | b |", "**b**", "a\n# b", "`x`", "\x1b[31m", "\u202ex", "\udc80", "\0",
         "&lt;",
     ):  # fmt: skip
-        shown = as_text(text)
+        shown = escape_mdx(text)
         assert re.fullmatch(r"(?:\w| |&#\d+;)*", shown), text
-        assert html.unescape(shown) == visible(text, keep="\n")
-        assert clipped(text, 40).isprintable(), text
-        clipped(text, 40).encode("utf8")
+        assert html.unescape(shown) == escape_unprintable(text, keep="\n")
+        assert clip_text(text, 40).isprintable(), text
+        clip_text(text, 40).encode("utf8")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from normlift_ns.viewer.serving import door as door_module
-from normlift_ns.viewer.serving.door import OPENING, Door
+from normlift_ns.viewer import adapter as door_module
+from normlift_ns.viewer.adapter import OPENING, Door
 
 
 def test_pages_wait_until_the_door_opens(monkeypatch):
-    monkeypatch.setattr(door_module, "Server", lambda *_: SimpleNamespace(label=lambda text: None))
+    monkeypatch.setattr(door_module, "ViserServer", lambda *_: SimpleNamespace(label=lambda text: None))
     told, came, went, door = [[], [], [], []], [], [], Door("", 0)
     pages = [SimpleNamespace(number=i, notice=notices.append) for i, notices in enumerate(told)]
     for page in pages[:3]:

@@ -10,11 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
-from normlift_ns.insight.histogram import histogram
+from normlift_ns.query.histogram import relevancy_histogram
 from normlift_ns.session import actions
-from normlift_ns.session.prompts import Prompt, pose
+from normlift_ns.session.prompts import Prompt, build_query
 from normlift_ns.session.state import State
-from normlift_ns.viewer.drawing import histogram_svg, photograph_mdx, verdicts_mdx
+from normlift_ns.viewer.widgets import diagnostics_mdx, histogram_svg, image_mdx
 from tests.session.worlds import read, world
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -22,7 +22,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def drawn(threshold: float = 0.5) -> tuple[ElementTree.Element, np.ndarray]:
     values = np.concatenate([np.full(900, 0.1), np.full(90, 0.3), np.full(10, 0.9)])
-    found = histogram(values, np.ones(1000, bool), threshold=threshold, limit=None)
+    found = relevancy_histogram(values, np.ones(1000, bool), threshold=threshold, limit=None)
     assert found is not None
     return ElementTree.fromstring(histogram_svg(found, (1.0, 0.5, 0.0))), found.counts
 
@@ -47,7 +47,7 @@ def test_the_line_is_at_the_threshold():
         assert x == pytest.approx(min(max((threshold - low) / (high - low) * 280, 1), 279), abs=0.06)
         texts = [text.text for text in picture.findall(f"{SVG}text")]
         assert texts == [f"> {threshold:.2f}", f"{low:.2f}", f"{high:.2f}"]
-    found = histogram(np.full(5, 0.25), np.ones(5, bool), threshold=0.25, limit=0.9)
+    found = relevancy_histogram(np.full(5, 0.25), np.ones(5, bool), threshold=0.25, limit=0.9)
     assert found is not None
     assert len(ElementTree.fromstring(histogram_svg(found, (0, 0, 1))).findall(f"{SVG}rect")) == 2
 
@@ -55,11 +55,11 @@ def test_the_line_is_at_the_threshold():
 def test_a_photograph_is_made_small_enough_for_a_panel():
     image = torch.zeros(900, 1200, 3, dtype=torch.uint8)
     image[:, 600:] = torch.tensor([255, 176, 0], dtype=torch.uint8)
-    data = re.findall(r"data:image/jpeg;base64,([^\"]+)", photograph_mdx(image))
+    data = re.findall(r"data:image/jpeg;base64,([^\"]+)", image_mdx(image))
     found = Image.open(io.BytesIO(base64.b64decode(data[0])))
     assert found.size == (480, 360)
     assert np.abs(np.asarray(found)[180, 400].astype(int) - (255, 176, 0)).max() < 12
-    small = photograph_mdx(torch.zeros(30, 40, 3, dtype=torch.uint8))
+    small = image_mdx(torch.zeros(30, 40, 3, dtype=torch.uint8))
     assert Image.open(io.BytesIO(base64.b64decode(re.findall('base64,([^"]+)', small)[0]))).size == (40, 30)
 
 
@@ -67,13 +67,13 @@ def test_names_of_prompts_stay_text():
     space = world()
     hostile = "<img src=x onerror=alert(1)> {alert(1)} ![](http://a)"
     prompts = [Prompt(hostile, read(["red"])[0]), *(Prompt(str(i), read(["blue"])[0]) for i in range(4))]
-    state = actions.ask(State(space), *pose(space.field, prompts, read, negatives=(), threshold=0.5))
-    text = verdicts_mdx(state)
+    state = actions.ask(State(space), *build_query(space.field, prompts, read, negatives=(), threshold=0.5))
+    text = diagnostics_mdx(state)
     rest = re.sub(
         r'<img src="data:image/svg\+xml;base64,[\w+/=]+" style=\{\{[^}]*\}\} />|<span [^>]*>■</span>', "", text
     )
     assert not set(re.sub(r"&#\d+;", "", rest)) & set("{}<>`![]()")
     assert text.count("<img") == 3
     assert "2 more" in rest
-    assert verdicts_mdx(actions.show(state, 4)).count("<img") == 1
-    assert verdicts_mdx(State(space)) == ""
+    assert diagnostics_mdx(actions.show_prompt(state, 4)).count("<img") == 1
+    assert diagnostics_mdx(State(space)) == ""

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.errors import InputError
-from normlift_ns.viewer.links import Link, View, read_hello, read_link, write_link
+from normlift_ns.viewer.shared import Link, View, read_hello, read_link, write_link
 
 PLACE = st.tuples(*[st.floats(-1e9, 1e9)] * 3)
 

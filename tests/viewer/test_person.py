@@ -15,13 +15,12 @@ import pytest
 import torch
 from msgspec import structs
 
-from normlift_ns.insight.floaters import find_floaters
-from normlift_ns.runs.files import FIELD_FOLDER
-from normlift_ns.runs.question import load_question
-from normlift_ns.viewer import painter, person
-from normlift_ns.viewer.links import View, read_link, write_link
-from normlift_ns.viewer.people import People
-from normlift_ns.viewer.shared import Run
+from normlift_ns.analysis.objects import find_floaters
+from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.query.question import load_query
+from normlift_ns.viewer import person
+from normlift_ns.viewer.person import People
+from normlift_ns.viewer.shared import Run, View, read_link, write_link
 from tests.session.worlds import BLOCK, cubes, read, rows
 from tests.viewer.scenes import run_of, until
 from tests.viewer.test_reasons import FakeVotes
@@ -161,7 +160,7 @@ def run(tmp_path) -> Run:
 
 @pytest.fixture
 def crowd(run, monkeypatch) -> Iterator[People]:
-    monkeypatch.setattr(painter, "_FRAME", 0.01)
+    monkeypatch.setattr(person, "_FRAME", 0.01)
     people = People(run)
     yield people
     for number in list(people._here):
@@ -342,7 +341,7 @@ def test_clicks_are_armed_cancelled_and_asked_again(crowd, run):
     again.asks("red", 2 * BLOCK)
     again.press("Save prompts in run")
     again.says("2 prompts")
-    stored = load_question(run.folder / FIELD_FOLDER)
+    stored = load_query(run.folder / FIELD_FOLDER)
     assert stored is not None and stored.texts == ("like click 1", "red")
 
 
@@ -400,7 +399,7 @@ def test_every_page_has_its_own_question_and_gets_it_back(crowd, monkeypatch):
     gone.gone = True
     crowd.come(gone)  # type: ignore[arg-type]
     assert sorted(crowd._here) == [1, 2, 3]
-    monkeypatch.setattr("normlift_ns.viewer.people.MOST_KEPT", 1)
+    monkeypatch.setattr("normlift_ns.viewer.person.MOST_KEPT", 1)
     for number in (3, 1):
         crowd.go(number)
     opened(crowd, 5, "another")
@@ -488,7 +487,7 @@ def test_a_readonly_page_writes_nothing(crowd, run, monkeypatch):
     page.asks("red", 2 * BLOCK)
     crowd._here[0]._act("Save prompts in run", None)
     page.says("may only look")
-    assert load_question(run.folder / FIELD_FOLDER) is None
+    assert load_query(run.folder / FIELD_FOLDER) is None
     page.press("Download selection")
     page.until(lambda: "red.ply" in page.files)
     assert list((run.folder / FIELD_FOLDER).iterdir()) == []

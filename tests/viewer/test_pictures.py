@@ -12,11 +12,17 @@ import pytest
 import torch
 
 from normlift_ns.errors import InputError
-from normlift_ns.viewer.pictures import save_overlays, training_cameras
-from normlift_ns.viewer.sheets import Found, Sheet, contact_sheet, picture_of
+from normlift_ns.rendering.figures import (
+    FigureHeader,
+    FigureStyle,
+    contact_sheet,
+    save_overlays,
+    training_cameras,
+    view_figure,
+)
 from tests.test_lifting import HEIGHT, WIDTH, scene
 
-SHEET = Sheet("viridis", (0.0, 1.0), 0.5)
+SHEET = FigureStyle("viridis", (0.0, 1.0), 0.5)
 
 
 def test_pictures_that_would_replace_each_other_are_refused(tmp_path: Path) -> None:
@@ -35,8 +41,8 @@ def test_a_text_is_drawn_as_it_is() -> None:
     for i, text in enumerate((r"$\frac{$", "$", "a\nb", "[/red]", "\ud800", "x\0y", "", "x" * 3000, "מים")):
         size = sizes[i % 3]
         image, selected = torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(size, dtype=torch.bool)
-        found = Found(text, "x" * 300)
-        assert picture_of(SHEET, found, text, image, image, selected).size[0] > 500, text
+        found = FigureHeader(text, "x" * 300)
+        assert view_figure(SHEET, found, text, image, image, selected).size[0] > 500, text
         assert contact_sheet(SHEET, found, [(text, image, selected)] * 5).size[0] > 500, text
 
 
@@ -45,7 +51,7 @@ def test_the_outline_goes_around_what_is_selected_and_the_photograph_stands_besi
     photograph, overlay = red.expand(60, 80, 3).contiguous(), blue.expand(60, 80, 3).contiguous()
     selected = torch.zeros(60, 80, dtype=torch.bool)
     selected[20:40, 20:60] = True
-    page = np.asarray(picture_of(SHEET, Found("x", "y"), "0001", photograph, overlay, selected))
+    page = np.asarray(view_figure(SHEET, FigureHeader("x", "y"), "0001", photograph, overlay, selected))
     left, right = page[:, :656], page[:, 656:]
     assert (left == red.numpy()).all(axis=2).sum() == 640 * 480
     inside = (right == blue.numpy()).all(axis=2)
@@ -57,7 +63,7 @@ def test_the_outline_goes_around_what_is_selected_and_the_photograph_stands_besi
     assert abs(rows.min() - 160) <= 4 and abs(rows.max() - 319) <= 4
     assert abs(columns.min() - 160) <= 4 and abs(columns.max() - 479) <= 4
     assert found[240, 320] and 3 * 900 < line.sum() < 7 * 1100  # a closed line of 3 to 7 pixels
-    none = np.asarray(picture_of(SHEET, Found("x", "y"), "0001", None, overlay, ~selected & selected))
+    none = np.asarray(view_figure(SHEET, FigureHeader("x", "y"), "0001", None, overlay, ~selected & selected))
     assert (none == blue.numpy()).all(axis=2).sum() == 640 * 480
 
 
@@ -69,18 +75,18 @@ def test_the_title_says_how_much_and_on_what_evidence() -> None:
         peak=0.9, stands_out=True,
     )  # fmt: skip
     for facts in ("50.0 %", "R 0.50", "3.0 views", "100 %", "R < 0.6"):
-        assert facts in Found.of(finding).summary
+        assert facts in FigureHeader.of(finding).summary
     finding.mask = torch.zeros(4, dtype=torch.bool)
-    assert re.fullmatch(r"[^\d]* 0\.5; [^\d]* 0\.90", Found.of(finding).summary)  # threshold and peak
+    assert re.fullmatch(r"[^\d]* 0\.5; [^\d]* 0\.90", FigureHeader.of(finding).summary)  # threshold and peak
     for stands_out, alone in ((True, True), (False, False), (None, True)):  # None: nobody can tell
         finding.stands_out = stands_out
-        assert (Found.of(finding).title == "x") is alone
+        assert (FigureHeader.of(finding).title == "x") is alone
 
 
 def test_three_views_stand_in_one_row_and_more_in_a_square() -> None:
     image, none = torch.full((60, 40, 3), 90, dtype=torch.uint8), torch.zeros(60, 40, dtype=torch.bool)
     one, three, five = (
-        contact_sheet(SHEET, Found("x", "y"), [("view", image, none)] * count).size for count in (1, 3, 5)
+        contact_sheet(SHEET, FigureHeader("x", "y"), [("view", image, none)] * count).size for count in (1, 3, 5)
     )
     assert one[1] == three[1]
     assert three[0] - one[0] > 500

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from normlift_ns import Evidence
+from normlift_ns.analysis.explain import explain_selection
+from normlift_ns.analysis.vote_records import VoteImage
 from normlift_ns.core.evidence import Entries
 from normlift_ns.errors import InputError
-from normlift_ns.insight.why import explain_selection
-from normlift_ns.runs.votes import Picture
 from normlift_ns.session import actions
 from normlift_ns.session.state import State
-from normlift_ns.viewer.reasons import Reasons, reasons_mdx
+from normlift_ns.viewer.widgets import Explanation, explanation_mdx
 from tests.session.worlds import BLOCK, rows, world
 
 NAMES = ("a/[x](y).png", "b.png", "c.png", "d.png", "e.png")
@@ -43,11 +43,11 @@ class FakeVotes:
         for vote in votes:
             if self.problem is not None:
                 raise self.problem
-            yield Picture(NAMES[vote.view], vote, torch.full((12, 16, 3), 40 * vote.view, dtype=torch.uint8))
+            yield VoteImage(NAMES[vote.view], vote, torch.full((12, 16, 3), 40 * vote.view, dtype=torch.uint8))
 
 
 def told(votes: Any, *cubes_: int) -> str:
-    return reasons_mdx(votes, rows(*cubes_))
+    return explanation_mdx(votes, rows(*cubes_))
 
 
 def test_three_that_weigh_most_and_those_that_disagree():
@@ -69,7 +69,7 @@ def test_three_that_weigh_most_and_those_that_disagree():
 
 
 def test_reasons_belong_to_their_selection():
-    reasons = Reasons(FakeVotes)  # type: ignore[arg-type]
+    reasons = Explanation(FakeVotes)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="nothing is selected"):
         reasons.find(reasons.start(State(world())), State(world()))
     assert (reasons.content, reasons.busy) == ("", "")
@@ -94,7 +94,7 @@ def test_a_late_answer_is_dropped_and_so_is_its_error(fails):
                 raise InputError("too late to be told")
             return super().explain(selected, refined=refined)
 
-    reasons = Reasons(Slow)  # type: ignore[arg-type]
+    reasons = Explanation(Slow)  # type: ignore[arg-type]
     state, raised = actions.select(State(world()), rows(0)), []
 
     def find() -> None:

@@ -5,13 +5,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from normlift_ns import GaussianScene
+from normlift_ns.rendering.colors import prompt_rgb_tuples
 from normlift_ns.session import actions
-from normlift_ns.session.colours import prompt_colours
-from normlift_ns.session.prompts import pose, read_prompts
+from normlift_ns.session.prompts import build_query, encode_prompts
 from normlift_ns.session.state import State
 from normlift_ns.viewer.adapter import _unpack_splats
-from normlift_ns.viewer.paint import legend, opacities, painted
-from normlift_ns.viewer.records import BYTES, Units, cholesky, make_records
+from normlift_ns.viewer.shared import BYTES, Units, cholesky, legend, make_records, opacities, painted
 from tests.session.worlds import BLOCK, read, rows, world
 from tests.viewer.scenes import camera, scene_of, spheres
 
@@ -87,25 +86,25 @@ def test_what_cannot_be_drawn_and_the_faintest_and_smallest_of_too_many_are_left
 def test_colours_show_what_is_selected_and_hidden():
     space = world()
     records = make_records(scene_of(spheres(space.means)))
-    prompts, question = pose(space.field, read_prompts("red, blue", read), read, negatives=())
-    state = actions.look(actions.ask(State(space), prompts, question), "prompts")
+    prompts, question = build_query(space.field, encode_prompts("red, blue", read), read, negatives=())
+    state = actions.set_color_mode(actions.ask(State(space), prompts, question), "prompts")
     colours, drawn = painted(records, state)
     assert drawn.all()
     grey = int(records.colours[0, 0] * 0.8)
-    for number, colour in ((0, prompt_colours(["red"])[0]), (BLOCK, prompt_colours(["blue"])[0])):
+    for number, colour in ((0, prompt_rgb_tuples(["red"])[0]), (BLOCK, prompt_rgb_tuples(["blue"])[0])):
         np.testing.assert_allclose(colours[number], 0.15 * grey + 0.85 * 255 * np.array(colour), atol=1)
     assert colours[3 * BLOCK].tolist() == 3 * [grey]
-    state = actions.look(actions.hide(actions.show(state, 0)), "overlay")
+    state = actions.set_color_mode(actions.hide(actions.show_prompt(state, 0)), "overlay")
     colours, drawn = painted(records, state)
     assert drawn.reshape(4, -1).all(axis=1).tolist() == [False, True, False, True]
     assert colours[BLOCK].tolist() == 3 * [grey]
     assert colours[0].tolist() == [253, 231, 37]  # the best match: all of the last colour of the map
     assert painted(records, actions.add(State(space, look="overlay"), rows(1)))[0][BLOCK].tolist() == [255, 191, 26]
     assert "0.80 relevancy 1.00" in legend(state)
-    colours, _ = painted(records, actions.look(state, "reliability"))
+    colours, _ = painted(records, actions.set_color_mode(state, "reliability"))
     assert len(np.unique(colours, axis=0)) >= 2
-    assert "0.00 reliability R 1.00" in legend(actions.look(state, "reliability"))
-    np.testing.assert_array_equal(painted(records, actions.look(state, "colours"))[0], records.colours)
+    assert "0.00 reliability R 1.00" in legend(actions.set_color_mode(state, "reliability"))
+    np.testing.assert_array_equal(painted(records, actions.set_color_mode(state, "colours"))[0], records.colours)
 
 
 def test_a_faint_selection_can_be_seen():
@@ -113,13 +112,17 @@ def test_a_faint_selection_can_be_seen():
     faint = torch.arange(len(space)) < BLOCK
     records = make_records(scene_of(spheres(space.means, 0.1, torch.where(faint, 0.02, 0.9))))
     plain = State(space)
-    chosen = actions.look(actions.select(plain, faint), "overlay")
+    chosen = actions.set_color_mode(actions.select(plain, faint), "overlay")
     shown = opacities(records, chosen)
     assert set(shown[:BLOCK].tolist()) == {160}
     np.testing.assert_array_equal(shown[BLOCK:], records.alpha[BLOCK:])
     buffer = records.buffer(*painted(records, chosen), shown)
     np.testing.assert_array_equal(buffer[:, 7] >> 24, shown)
-    for by_hand in (chosen, actions.look(actions.add(plain, faint), "overlay")):
+    for by_hand in (chosen, actions.set_color_mode(actions.add(plain, faint), "overlay")):
         assert legend(by_hand) == ""
-    for state in (plain, actions.look(chosen, "colours"), actions.look(actions.select(plain, ~faint), "overlay")):
+    for state in (
+        plain,
+        actions.set_color_mode(chosen, "colours"),
+        actions.set_color_mode(actions.select(plain, ~faint), "overlay"),
+    ):
         np.testing.assert_array_equal(opacities(records, state), records.alpha)

@@ -14,9 +14,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.session.state import State
-from normlift_ns.viewer.blind.page import SCRIPT, picture_script, with_script
-from normlift_ns.viewer.blind.stills import Stills, still
-from normlift_ns.viewer.eye import Eye
+from normlift_ns.viewer.adapter import SCRIPT, picture_script, with_script
+from normlift_ns.viewer.person import Eye, Stills, still
 from normlift_ns.viewer.shared import Run
 from tests.session.worlds import world
 from tests.viewer.scenes import camera, run_of, scene_of, spheres, until

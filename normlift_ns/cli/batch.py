@@ -1,0 +1,585 @@
+"""Capture lists of ns-normlift-batch: the ns-normlift call and the run directory of each line.
+
+Runs of a batch are named after a digest of the scene and the options. The name therefore shows whether a capture was
+lifted with the same options, and no two processes can both write it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.table import Table
+
+from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command, run_command_process
+from normlift_ns.cli.lift import NormLift
+from normlift_ns.cli.preflight import check_readable_file, check_writable_folder, new_run_location
+from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, exit_with_parent
+from normlift_ns.errors import InputError, escape_unprintable
+from normlift_ns.io.atomic import safe_file_name, text_digest
+from normlift_ns.io.file_lock import (
+    ABANDONED,
+    BEATS_PER_TIMEOUT,
+    JSONL_SUFFIX,
+    Claim,
+    append_jsonl,
+    finish_claim,
+    iter_claims,
+    read_claim_states,
+    read_jsonl,
+    write_pulse,
+)
+from normlift_ns.io.manifest import read_manifest
+from normlift_ns.io.run_dir import FIELD_FOLDER, run_directory
+from normlift_ns.options import check_options, short_repr
+
+_PREFIX = "batch_"
+_SOURCES = {".ply": "load_ply", ".pt": "load_gsplat"}
+"""Options of ns-normlift by the suffix of the path that they take; all other paths are configs."""
+_NOT_IN_KEY = ("device", "timestamp", "output_dir")
+"""Options that do not change what is lifted, only where it is computed or stored."""
+_KEY_LENGTH = 16
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One line of a capture list."""
+
+    name: str
+    """The line itself."""
+    words: tuple[str, ...]
+    """Arguments of ns-normlift, including the name of the new run."""
+    key: str
+    """Digest of scene and options, 16 hexadecimal digits."""
+    run: Path | None
+    """Directory of the lifted run; None if it is not known before the capture is opened."""
+
+
+def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
+    """Read a capture list, in its order.
+
+    Args:
+        path: Text file. A line has the path of a config.yml, a PLY file or a gsplat checkpoint. Options of ns-normlift,
+            quoted as in a shell, may follow the path or replace it. Empty lines and lines that start with # are
+            ignored.
+        options: Options of ns-normlift for all captures; those of a line override them.
+    Raises:
+        InputError: The file is not UTF-8 text or lists no captures, or a line is invalid or a duplicate.
+    """
+    try:
+        common = _parse(options)
+    except InputError as error:
+        raise InputError(f"After --: {error}") from None
+    if (name := next((name for name in _source_names() if getattr(common, name) is not None), None)) is not None:
+        raise InputError(
+            f"--{name.replace('_', '-')} comes after --, where it applies to every capture. Write it into {path}, one "
+            "line per capture."
+        )
+    try:
+        text = path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not UTF-8 text. Expected a list of captures, one path per line.") from None
+    captures: dict[str, tuple[int, Capture]] = {}
+    for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
+        if line == "" or line.startswith("#"):
+            continue
+        capture = _make_capture(line, options, common, f"{path}, line {number}")
+        if capture.key in captures:
+            raise InputError(
+                f"{path}, line {number}, is the same capture with the same options as line {captures[capture.key][0]}: "
+                f"{escape_unprintable(line)}. Remove one of the two."
+            )
+        captures[capture.key] = number, capture
+    if len(captures) == 0:
+        raise InputError(f"{path} lists no captures. Expected one path per line, such as outputs/…/config.yml.")
+    return tuple(capture for _, capture in captures.values())
+
+
+def is_lifted(run: Path) -> bool:
+    """Return whether a lifted run exists and has a valid manifest.
+
+    Raises:
+        InputError: The path is something else, or a damaged run.
+    """
+    if not os.path.lexists(run):
+        return False
+    try:
+        read_manifest(run / FIELD_FOLDER)
+    except (InputError, OSError) as error:
+        raise InputError(f"{error}. To have the capture lifted again, delete {run} and rerun the command.") from error
+    return True
+
+
+def _capture_key(command: NormLift) -> str:
+    """Return a digest of the scene and the options of a lift, 16 hexadecimal digits.
+
+    The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
+    features, label maps and weights, it includes their paths only.
+    """
+    options = {name: value for name, value in asdict(command).items() if name not in _NOT_IN_KEY}
+    sizes = [(file.name, file.stat().st_size) for file in _scene_files(command) if file.is_file()]
+    text = json.dumps([options, sizes], sort_keys=True, default=os.path.abspath)  # only paths need the default
+    return text_digest(text).rpartition(":")[2][:_KEY_LENGTH]
+
+
+def _source_names() -> tuple[str, ...]:
+    return "load_config", *_SOURCES.values()
+
+
+def _scene_files(command: NormLift) -> list[Path]:
+    if command.load_config is None:
+        return [path for path in (command.load_ply, command.load_gsplat) if path is not None]
+    step = "*" if command.load_step is None else f"{command.load_step:09d}"
+    return sorted((command.load_config.absolute().parent / "nerfstudio_models").glob(f"step-{step}.ckpt"))[-1:]
+
+
+def _make_capture(line: str, options: Sequence[str], common: NormLift, location: str) -> Capture:
+    try:
+        first, *rest = shlex.split(line)
+    except ValueError as error:
+        raise InputError(
+            f"{location}: {escape_unprintable(line)} is not quoted as in a shell ({error}). Close the quotes."
+        ) from None
+    source = None if first.startswith("--") else _SOURCES.get(Path(first).suffix.lower(), "load_config")
+    own = [first, *rest] if source is None else [f"--{source.replace('_', '-')}", first, *rest]
+    try:
+        if source is None or len(rest) > 0:
+            command = _parse([*options, *own])
+        else:  # a shortcut for lines without options, because tyro is slow
+            command = replace(common, **{source: Path(first)})
+    except InputError as error:
+        raise InputError(f"{location}: {error}") from None
+    key = _capture_key(command)
+    timestamp = f"{_PREFIX}{key}"
+    return Capture(line, (*options, *own, "--timestamp", timestamp), key, _run_dir(command, timestamp))
+
+
+def _parse(words: Sequence[str]) -> NormLift:
+    """Parse the arguments of ns-normlift.
+
+    Raises:
+        InputError: ns-normlift does not know an argument, or a batch does not support it.
+    """
+    try:
+        command = parse_flags(NormLift, words, name="ns-normlift")
+    except InputError as error:
+        raise InputError(f"invalid options of ns-normlift: {escape_unprintable(shlex.join(words))}. {error}") from None
+    if command.timestamp is not None or command.overwrite:
+        flag = "--overwrite" if command.overwrite else "--timestamp"
+        raise InputError(
+            f"{flag} is not supported in a batch, which names runs by their options and lifts only missing ones. Leave "
+            "it out; to lift a capture again, delete its run."
+        )
+    return command
+
+
+def _run_dir(command: NormLift, timestamp: str) -> Path | None:
+    try:
+        name, outputs = new_run_location(command.load_config, command.splat, command.output_dir)
+        return None if name is None or outputs is None else run_directory(outputs, name, timestamp)
+    except (InputError, OSError):  # the process of this capture reports the error
+        return None
+
+
+# Shards of a capture list: the part of a numbered worker.
+
+
+_MAX_SHARDS = 10**6
+_TASK_ID, _TASK_COUNT, _TASK_MIN, _TASK_STEP = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "COUNT", "MIN", "STEP"))
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of `count` parts of a list."""
+
+    index: int
+    """Number of the part, from 0."""
+    count: int
+
+    def holds(self, position: int) -> bool:
+        """Return whether a position in the list, from 0, belongs to this part; each belongs to exactly one part.
+
+        >>> [position for position in range(7) if Shard(1, 3).holds(position)]
+        [1, 4]
+        """
+        return position % self.count == self.index
+
+
+WHOLE_LIST = Shard(0, 1)
+
+
+def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
+    """Return the part that --shard or the environment selects.
+
+    In a Slurm array whose tasks have several ranks (RANK, WORLD_SIZE), each rank of each task has its own part.
+
+    Args:
+        word: auto for the part in the environment, none for the whole list, or i/n for the i-th of n parts, i from 1.
+        environment: Environment variables.
+    Raises:
+        InputError: The word is invalid, variables contradict each other, or a Slurm array has gaps.
+
+    >>> make_shard("2/3", {}), make_shard("auto", {"RANK": "0", "WORLD_SIZE": "4"}), make_shard("auto", {})
+    (Shard(index=1, count=3), Shard(index=0, count=4), Shard(index=0, count=1))
+    """
+    if word == "none":
+        return WHOLE_LIST
+    if word == "auto":
+        task, rank = _slurm_shard(environment), _rank_shard(environment)
+        return Shard(task.index * rank.count + rank.index, task.count * rank.count)
+    match = re.fullmatch(r"(\d{1,7})/(\d{1,7})", word, re.ASCII)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]) <= _MAX_SHARDS:
+        raise InputError(
+            f"--shard must be auto, none, or i/n for the i-th of n parts, from 1/n to n/n; got {short_repr(word)}. For the "
+            "second of four workers, give --shard 2/4."
+        )
+    return Shard(int(match[1]) - 1, int(match[2]))
+
+
+def _slurm_shard(environment: Mapping[str, str]) -> Shard:
+    if _TASK_ID not in environment:
+        return WHOLE_LIST
+    if _TASK_COUNT not in environment:
+        raise InputError(f"{_TASK_ID} is set, but {_TASK_COUNT} is not. Set both, or give the part with --shard i/n.")
+    task, count = _integer(environment, _TASK_ID, 0), _integer(environment, _TASK_COUNT, 1)
+    first, step = _integer(environment, _TASK_MIN, 0, "0"), _integer(environment, _TASK_STEP, 1, "1")
+    index, remainder = divmod(task - first, step)
+    if remainder != 0 or not 0 <= index < count:
+        raise InputError(
+            f"{_TASK_ID} is {task}, but expected {count} tasks from {first} on, without gaps. Submit an array without "
+            "gaps, such as sbatch -a 0-7; or give --shard none, with which workers claim captures in a shared folder."
+        )
+    return Shard(index, count)
+
+
+def _rank_shard(environment: Mapping[str, str]) -> Shard:
+    present = [name for name in ("RANK", "WORLD_SIZE") if name in environment]
+    if len(present) == 0:
+        return WHOLE_LIST
+    if len(present) == 1:
+        missing = "RANK" if present == ["WORLD_SIZE"] else "WORLD_SIZE"
+        raise InputError(f"{present[0]} is set, but {missing} is not. Set both, or give the part with --shard i/n.")
+    rank, count = _integer(environment, "RANK", 0), _integer(environment, "WORLD_SIZE", 1)
+    if rank >= count:
+        raise InputError(f"RANK is {rank}, but must be less than WORLD_SIZE, {count}. Set both, or give --shard i/n.")
+    return Shard(rank, count)
+
+
+def _integer(environment: Mapping[str, str], name: str, least: int, default: str = "") -> int:
+    text = environment.get(name, default)
+    if not re.fullmatch(r"\d{1,7}", text, re.ASCII) or int(text) < least:
+        raise InputError(
+            f"{name} must be a whole number, at least {least}, got {short_repr(text)}. Set it, or give the part with "
+            "--shard i/n."
+        )
+    return int(text)
+
+
+# Results of captures: one line of JSON each, and a table.
+
+
+OutcomeState = Literal["done", "failed", "skipped"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one attempt at a capture."""
+
+    capture: str
+    """Line of the capture in the list."""
+    key: str
+    """Digest of scene and options."""
+    attempt: int
+    """Number of the attempt from 1, counted over all workers."""
+    state: OutcomeState
+    """done, failed, or skipped if the capture was already lifted."""
+    seconds: float
+    """Duration of the attempt."""
+    message: str
+    """Reason for a failure; otherwise empty."""
+    code: int
+    """Exit code of the process, or 128 plus the number of the signal that killed it."""
+    run: str | None
+    """Directory of the lifted run; None if the attempt failed or the directory is not known."""
+    worker: str
+    """Name of the worker."""
+    time: float
+    """End of the attempt in seconds since 1970, by the clock of the worker."""
+
+
+def latest_outcomes(outcomes: Iterable[Outcome]) -> dict[str, Outcome]:
+    """Return the last outcome of each capture by key; a later skip does not replace a completed lift.
+
+    >>> done = Outcome("fox", "a", 1, "done", 41.0, "", code=0, run=None, worker="one", time=1.0)
+    >>> skipped = Outcome("fox", "a", 2, "skipped", 0.0, "", code=0, run=None, worker="two", time=2.0)
+    >>> latest_outcomes([skipped, done])["a"].state
+    'done'
+    """
+    by_key: dict[str, Outcome] = {}
+    for outcome in sorted(outcomes, key=lambda outcome: (outcome.attempt, outcome.time)):
+        previous = by_key.get(outcome.key)
+        if previous is None or outcome.state != "skipped" or previous.state != "done":
+            by_key[outcome.key] = outcome
+    return by_key
+
+
+def largest_exit_code(outcomes: Iterable[Outcome]) -> int:
+    """Return the largest exit code of failed captures; 0 if none failed."""
+    return max((outcome.code for outcome in outcomes if outcome.state == "failed"), default=0)
+
+
+def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome]) -> Table:
+    """Return a table with one row per capture, in the order of the list."""
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for title in ("capture", "state", "seconds", "run, or error"):
+        table.add_column(title, justify="right" if title == "seconds" else "left", overflow="fold")
+    for capture in captures:
+        outcome = outcomes.get(capture.key)
+        if outcome is None:
+            table.add_row(plain_text(capture.name), "unknown", "", "its results were deleted")
+        else:
+            text = outcome.message if outcome.state == "failed" else outcome.run or ""
+            table.add_row(plain_text(capture.name), outcome.state, f"{outcome.seconds:.1f}", plain_text(text))
+    return table
+
+
+def count_outcomes(captures: Sequence[Capture], outcomes: Mapping[str, Outcome]) -> str:
+    """Return the number of lifted, skipped and failed captures as one line."""
+    states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]
+    words = {"done": "lifted", "skipped": "already lifted", "failed": "failed"}
+    return ", ".join(f"{count} {words[state]}" for state in words if (count := states.count(state)) > 0)
+
+
+# Child processes that lift one capture each.
+
+
+LIFT_COMMAND = (sys.executable, "-m", "normlift_ns.cli.lift")
+"""Command of ns-normlift in this installation."""
+_GRACE = 30.0
+"""Seconds between terminating a process and killing it."""
+_TAIL = 2**14
+"""Number of bytes at the end of a log file that may contain its last line."""
+
+
+def run_logged(words: Sequence[str], log: Path, beat: Callable[[], bool], every: float) -> int | None:
+    """Run a program with its output in a log file; return its exit code, or minus the signal that killed it.
+
+    On Linux, the program ends whenever this process ends; elsewhere, only after Ctrl-C and SIGTERM.
+
+    Args:
+        words: Command line of the program.
+        log: New file for its output.
+        beat: Callback; if it returns False, the program is terminated and the result is None.
+        every: Seconds between two calls of `beat`.
+    Raises:
+        OSError: The program cannot be started, or the log cannot be written.
+    """
+    inherited = {name: value for name, value in os.environ.items() if name not in TORCHRUN_VARIABLES}
+    environment = inherited | {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}  # keeps the last line complete
+    with (
+        log.open("wb") as output,
+        subprocess.Popen(
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            preexec_fn=exit_with_parent(),  # noqa: PLW1509 (workers have no threads)
+        ) as process,
+    ):
+        try:
+            while True:
+                try:
+                    return process.wait(every)
+                except subprocess.TimeoutExpired:
+                    if not beat():
+                        _terminate(process)
+                        return None
+        except BaseException:  # Ctrl-C or SIGTERM
+            _terminate(process)
+            raise
+
+
+def failure_reason(code: int, log: Path) -> str:
+    """Return why a process failed: the signal that killed it, or the last line that it printed."""
+    if code < 0:
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+        hint = ", perhaps because the system ran out of memory" if -code == signal.SIGKILL else ""
+        return f"its process was killed by {name}{hint}; see its output in {log}"
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - _TAIL))
+        lines = file.read().decode("utf8", "replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip() != ""), "")
+    return last or f"its process ended with exit code {code} and without output"
+
+
+def _terminate(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_GRACE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+# Worker that lifts captures of a list, possibly alongside other workers.
+
+
+_CLAIMS, _LOGS = "claims", "logs"
+"""Subfolders of the results folder."""
+
+
+def lift_captures(
+    captures: Sequence[Capture],
+    folder: Path,
+    patience: float,
+    *,
+    say: Callable[[str], None] = lambda text: None,
+    program: Sequence[str] = LIFT_COMMAND,
+) -> dict[str, Outcome]:
+    """Lift the captures that are neither lifted nor claimed by another worker; return the outcomes by key.
+
+    Args:
+        captures: The captures of this worker.
+        folder: Folder of claims and results, which all workers share; created if missing.
+        patience: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+        say: Callback for messages about each capture.
+        program: Command of ns-normlift.
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    worker = f"{safe_file_name(socket.gethostname())}_{os.getpid()}_{secrets.token_hex(4)}"
+    for name in (_CLAIMS, _LOGS):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    at_start, previous = read_claim_states(folder / _CLAIMS), latest_outcomes(read_jsonl(folder, Outcome))
+    missing = {capture.key: capture for capture in captures if not _is_complete(capture, previous)}
+    for claim in iter_claims(folder / _CLAIMS, list(missing), at_start, patience):
+        capture = missing[claim.key]
+        try:
+            say(f"{capture.name} …")
+            outcome = _lift_capture(capture, claim, folder, patience, worker, program)
+        except BaseException:
+            finish_claim(claim, ABANDONED)
+            raise
+        if outcome is None:
+            say(f"{capture.name}: taken over by another worker, which missed the heartbeats of this one")
+            continue
+        append_jsonl(folder / f"{worker}{JSONL_SUFFIX}", outcome)
+        finish_claim(claim, outcome.state)
+        results = {"done": "lifted", "skipped": "already lifted", "failed": f"failed: {outcome.message}"}
+        say(f"{capture.name}: {results[outcome.state]} ({outcome.seconds:.1f} s)")
+    return latest_outcomes(read_jsonl(folder, Outcome))
+
+
+def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
+    """Return whether a capture is lifted and has a result that says so."""
+    outcome = outcomes.get(capture.key)
+    if outcome is None or outcome.state == "failed":
+        return False
+    try:
+        return capture.run is None or is_lifted(capture.run)
+    except InputError:  # reported when the capture is processed
+        return False
+
+
+def _lift_capture(
+    capture: Capture, claim: Claim, folder: Path, patience: float, worker: str, program: Sequence[str]
+) -> Outcome | None:
+    """Lift a capture unless it is already lifted; return None if another worker has taken over."""
+    start_time, log = time.monotonic(), folder / _LOGS / f"{claim.path.name}.log"
+
+    def outcome(state: OutcomeState, message: str = "", code: int = 0) -> Outcome:
+        run = None if capture.run is None or state == "failed" else str(capture.run)
+        seconds, now = time.monotonic() - start_time, time.time()
+        return Outcome(capture.name, capture.key, claim.number, state, seconds, message, code, run, worker, now)
+
+    try:
+        if capture.run is not None and is_lifted(capture.run):
+            return outcome("skipped")
+        beats = count(1)
+        code = run_logged(
+            [*program, *capture.words], log, lambda: write_pulse(claim, next(beats)), patience / BEATS_PER_TIMEOUT
+        )
+        if code is None:
+            return None
+        if code == 0:
+            return outcome("done")
+        if capture.run is not None and is_lifted(capture.run):  # by a worker that was considered dead
+            return outcome("skipped")
+    except InputError as error:
+        return outcome("failed", str(error), 1)
+    return outcome("failed", failure_reason(code, log), code if code > 0 else 128 - code)
+
+
+# ns-normlift-batch: run ns-normlift for many captures, with one or several workers.
+
+
+@dataclass
+class NormLiftBatch:
+    """Lift many captures, each in its own process; several workers may share the list. A rerun skips captures that
+    were lifted with the same options."""
+
+    captures: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURES")]
+    """Text file with one capture per line: the config.yml of a run, a PLY file or a gsplat checkpoint. Options of
+    ns-normlift for this capture may follow."""
+    options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS]")] = ()
+    """Options of ns-normlift for all captures, after --."""
+    results: Path | None = None
+    """Folder of results, logs and claims, which all workers share. Default: <name of the list>_batch next to the
+    list."""
+    shard: str = "auto"
+    """Part of the list for this worker. i/n: the i-th of n parts. auto: from SLURM_ARRAY_TASK_ID or from RANK and
+    WORLD_SIZE if they are set, else none. none: every capture that no other worker has claimed."""
+    patience: float = 120.0
+    """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400; use the same value
+    for all workers. Larger values tolerate longer pauses but delay the takeover."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def main(self) -> None:
+        """Lift the captures and print the results.
+
+        Raises:
+            SystemExit: A capture failed; the exit code is the largest of all captures.
+        """
+        check_readable_file(self.captures, "ns-normlift-batch")
+        shard = make_shard(self.shard, os.environ)
+        all_captures = read_captures(self.captures, self.options)
+        captures = [capture for index, capture in enumerate(all_captures) if shard.holds(index)]
+        folder = self.results or self.captures.with_name(f"{self.captures.stem}_batch")
+        check_writable_folder(folder, "--results")
+        count = f"{len(all_captures)} capture{'' if len(all_captures) == 1 else 's'}"
+        part = "" if shard.count == 1 else f", {len(captures)} of them in part {shard.index + 1} of {shard.count}"
+        info(f"{count} in {self.captures}{part}; results, logs and claims in {folder}")
+        outcomes = lift_captures(captures, folder, self.patience, say=info)
+        if len(captures) > 0:
+            CONSOLE.print(outcomes_table(captures, outcomes))
+            info(count_outcomes(captures, outcomes))
+        code = largest_exit_code(outcomes[capture.key] for capture in captures if capture.key in outcomes)
+        if code != 0:
+            raise SystemExit(code)
+
+
+def entrypoint() -> None:
+    """Run ns-normlift-batch in a process that continues afterwards."""
+    run_command(NormLiftBatch)
+
+
+def main() -> None:
+    """Run ns-normlift-batch as a process."""
+    run_command_process(NormLiftBatch)

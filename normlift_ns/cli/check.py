@@ -1,0 +1,159 @@
+"""ns-normlift-check: check a capture and estimate the cost of a lift before running it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import tyro
+from rich.table import Table
+from rich.text import Text
+
+import normlift_ns
+from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command, run_command_process
+from normlift_ns.cli.lift import NormLift
+from normlift_ns.cli.preflight import check_writable_file
+from normlift_ns.errors import EXIT_INTERNAL_ERROR, describe_error
+from normlift_ns.io.atomic import refuse_existing, write_text_file
+
+if TYPE_CHECKING:
+    from normlift_ns.planning import Diagnostic, Plan
+
+
+_Result = TypeVar("_Result")
+
+
+@dataclass
+class NormLiftCheck(NormLift):
+    """Check a capture and this machine before a lift, with the options of ns-normlift, without lifting. Encodes a few
+    images to estimate the seconds of every stage, memory and disk. The exit code is 1 if there is an error."""
+
+    json: Path | None = None
+    """JSON file for the findings and the plan, in addition to the printed table."""
+    dry_run: tyro.conf.Suppress[bool] = True
+
+    def main(self) -> None:
+        """Check the capture and print the findings.
+
+        Raises:
+            SystemExit: There is an error; the exit code is 1.
+        """
+        start_time = time.perf_counter()
+        if self.json is not None:
+            check_writable_file(self.json, "--json")
+            refuse_existing(self.json, overwrite=self.overwrite, instead="--json")
+        rows, plan = self._rows(start_time)
+        _show(rows, plan)
+        if self.json is not None:
+            write_text_file(self.json, _to_json(rows, plan), overwrite=self.overwrite)
+        if any(row.state == "error" for row in rows):
+            raise SystemExit(1)
+
+    def _rows(self, start_time: float) -> tuple[list[Diagnostic], Plan | None]:
+        """Return all findings up to the first error that prevents further checks, and the plan if nothing failed."""
+        rows: list[Diagnostic] = []
+        if _try(rows, "options", lambda: (self.check_early(),)) is None:
+            return rows, None
+        from normlift_ns import planning  # noqa: PLC0415
+        from normlift_ns.cli.dry_run import compare_cameras, open_capture, plan_lift  # noqa: PLC0415
+        from normlift_ns.core.device import choose_device, init_cuda  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.encoders.build import make_source  # noqa: PLC0415
+        from normlift_ns.planning import Diagnostic  # noqa: PLC0415
+
+        rows.append(planning.diagnose_versions())
+        device = _try(rows, "device", lambda: choose_device(self.device))
+        if device is None:
+            return rows, None
+        init_cuda(device)
+        rows.append(planning.diagnose_device(device))
+        options = self.source.looking_for(self.queries)
+        source = _try(rows, "2D features", lambda: make_source(options, device))
+        missing = [] if source is None else planning.missing_weights(options, device)
+        rows += [] if source is None else [planning.diagnose_weights(missing)]
+        opened = _try(rows, "capture", lambda: open_capture(self, start_time))
+        if opened is None:
+            return rows, None
+        scene = opened.scene
+        count = f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, {len(scene.held_out)} held out"
+        rows.append(Diagnostic("capture", "ok", count))
+        rows += [Diagnostic("photographs", "warning", remark) for remark in scene.remarks]
+        rows.append(planning.diagnose_views(scene))
+        if self.check:
+            warning = _try(rows, "cameras", lambda: (compare_cameras(self, opened, device),))
+            if warning == (None,):
+                rows.append(Diagnostic("cameras", "ok", "three images match renders from their cameras"))
+            elif warning is not None:
+                rows.append(Diagnostic("cameras", "warning", str(warning[0])))
+        if source is None or len(missing) > 0 or any(row.state == "error" for row in rows):
+            return rows, None
+        plan = _try(rows, "plan", lambda: plan_lift(self, opened, source, device))
+        if plan is not None:
+            rows += [*planning.diagnose_memory(plan, device), planning.diagnose_disk(plan, opened.run_dir)]
+        return rows, plan
+
+
+def _try(rows: list[Diagnostic], name: str, function: Callable[[], _Result]) -> _Result | None:
+    """Call a function; if it raises a user error, add an error row and return None.
+
+    Args:
+        rows: Findings so far.
+        name: Name of the row.
+        function: The check.
+    Raises:
+        Exception: Internal errors of the function.
+    """
+    from normlift_ns.planning import Diagnostic  # noqa: PLC0415
+
+    try:
+        return function()
+    except Exception as error:
+        if not isinstance(error, (ValueError, OSError, MemoryError)):
+            raise
+        message, code = describe_error(error)
+        if code == EXIT_INTERNAL_ERROR:
+            raise
+        rows.append(Diagnostic(name, "error", message))
+        return None
+
+
+def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
+    table = Table("", "", "result", "what to do")
+    colors = {"ok": "green", "warning": "yellow", "error": "red"}
+    for row in rows:
+        table.add_row(
+            plain_text(row.what),
+            Text(row.state, style=colors[row.state]),
+            plain_text(row.found),
+            plain_text(row.advice),
+        )
+    CONSOLE.print(table)
+    if plan is None:
+        info("Correct the errors above to see how long the lift will take.")
+        return
+    from normlift_ns.cli.dry_run import describe_needs, plan_table  # noqa: PLC0415
+
+    CONSOLE.print(plan_table(plan))
+    info(describe_needs(plan))
+
+
+def _to_json(rows: list[Diagnostic], plan: Plan | None) -> str:
+    content: dict[str, Any] = {
+        "version": normlift_ns.__version__,
+        "findings": [asdict(row) for row in rows],
+        "plan": None if plan is None else plan.to_json(),
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def entrypoint() -> None:
+    """Run ns-normlift-check in a process that continues afterwards."""
+    run_command(NormLiftCheck)
+
+
+def main() -> None:
+    """Run ns-normlift-check as a process."""
+    run_command_process(NormLiftCheck)

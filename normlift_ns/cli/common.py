@@ -1,0 +1,509 @@
+"""One-line messages for command-line errors, in place of the boxes that tyro draws on standard error."""
+
+from __future__ import annotations
+
+import atexit
+import io
+import os
+import re
+import shlex
+import shutil
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
+from dataclasses import fields, is_dataclass
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from types import FrameType
+from typing import IO, Annotated, Any, NamedTuple, NoReturn, Protocol, TextIO, TypeVar, cast, get_type_hints
+
+import docstring_parser
+import tyro
+from rich.console import Console
+from rich.text import Text
+
+import normlift_ns
+from normlift_ns.errors import EXIT_USER_ERROR, InputError, OutputError, describe_error, escape_unprintable
+from normlift_ns.options import named_as_flags
+
+_CORNERS = ("╭", "┏")
+_REWRITES = (
+    (r"Error parsing (--\S+): no type matching \S+ could be instantiated from \[(.*)\]\.", r"\1 cannot be \2."),
+    (r"Error parsing (--\S+): (?:invalid literal|could not convert).*?: ('.*')$", r"\1 cannot be \2."),
+    (r"Error parsing \S+: (?=--)", r""),
+    (r"invalid choice ('.*?') for argument '(--\S+)'\.", r"\2 cannot be \1."),
+    (r"Expected one of \((.*?),?\)\.", r"Expected one of \1."),
+    (r"Missing value for argument '(--\S+)'\. Expected 1 values\.", r"\1 needs a value."),
+    (r"Missing from (\S+):", r"\1 needs:"),
+    (r"Unrecognized options:", r"Unknown options:"),
+    (r"\n+ *Got errors:(?:\n *- .*)*", r""),
+    (r" *Argument helptext:\n", r""),
+    (r"^ {3,}(--\S+ \S.*)\n +", r"\1: "),
+    (r"For full helptext, (?:run|see):?\s+(\S.*?) --help", r"\n\nAll options: \1 --help"),
+)
+"""tyro's phrases and their replacements; the phrases of other tyro versions stay as they are."""
+
+
+@contextmanager
+def one_line_errors(program: str) -> Iterator[None]:
+    """Raise InputError where tyro would draw a box on standard error and exit; print warnings afterwards.
+
+    Args:
+        program: Program name that tyro prints; messages show it without its folder.
+    """
+    stderr, columns = io.StringIO(), os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "1000"  # keeps tyro from wrapping lines
+    try:
+        with redirect_stderr(stderr):
+            yield
+        sys.stderr.write(stderr.getvalue())
+    except SystemExit as stop:
+        if stop.code in (None, 0):
+            raise
+        raise InputError(_unboxed(stderr.getvalue(), program)) from None
+    finally:
+        os.environ.pop("COLUMNS")
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
+
+
+def _unboxed(stderr: str, program: str) -> str:
+    r"""Return the text inside tyro's box, or below its dashed line if the terminal has no box characters.
+
+    >>> print(_unboxed("╭─ Missing ─╮\n│ Missing value for argument '--k'. Expected 1 values. │\n╰─────╯", "/bin/x"))
+    --k needs a value.
+    >>> print(_unboxed(" Missing\n -----\n  Missing value for argument '--k'. Expected 1 values.\n", "/bin/x"))
+    --k needs a value.
+    """
+    stderr = re.sub(r"\x1b\[[\d;]*m", "", stderr)  # terminal colors
+    lines = stderr.splitlines()
+    lines = lines[1:-1] if stderr.startswith(_CORNERS) else lines[2:]
+    lines = [line.strip("│┃").removeprefix(" ").rstrip(" ─━") for line in lines]
+    text = "\n".join("" if set(line) <= set(" -") else line for line in lines)
+    text = text.replace(program, Path(program).name)
+    for pattern, replacement in _REWRITES:
+        text = re.sub(pattern, replacement, text, flags=re.MULTILINE)
+    parts = [" ".join(part.split()) for part in text.split("\n\n")]
+    return " ".join(part if part.endswith((".", ":", "--help")) else f"{part}." for part in parts if part)
+
+
+# Output flags of all commands: `--quiet` and `--log-file`.
+
+
+OUTPUT_FLAGS_HELP = (
+    "Every command accepts --quiet (print results, warnings and errors, but no progress), --log-file FILE (append all "
+    "output to this file, including the warnings of other packages) and --version."
+)
+_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+"""Terminal escape sequences that set colors or move the cursor."""
+
+
+class OutputSettings(NamedTuple):
+    """Output settings of a command."""
+
+    quiet: bool = False
+    log_file: Path | None = None
+
+
+output_settings = [OutputSettings()]
+"""Stack of output settings; the last ones belong to the running command."""
+
+
+def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]:
+    """Split a command line into the words without output flags, and the output settings.
+
+    Raises:
+        InputError: --log-file has no file, or --quiet is neither True nor False.
+
+    >>> split_output_flags(["--k", "8", "--quiet", "--log-file", "a.log"])
+    (['--k', '8'], Terminal(quiet=True, log_file=PosixPath('a.log')))
+    """
+    rest, quiet, log_file = [], False, None
+    indices = iter(range(len(words)))
+    for i in indices:
+        following = words[i + 1] if i + 1 < len(words) else "--"
+        if words[i] == "--":  # the rest is for another command
+            return [*rest, *words[i:]], OutputSettings(quiet, log_file)
+        if words[i] == "--quiet":
+            quiet = following != "False"
+            if not following.startswith("-"):
+                if following not in ("True", "False"):
+                    raise InputError(f"--quiet must be True or False, got {following!r}")
+                next(indices)
+        elif words[i] in ("--log-file", "--log_file"):
+            if following.startswith("--"):
+                raise InputError("--log-file needs a file name")
+            log_file = Path(following)
+            next(indices)
+        else:
+            rest.append(words[i])
+    return rest, OutputSettings(quiet, log_file)
+
+
+@contextmanager
+def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[None]:
+    """Apply output settings to everything that runs in this context.
+
+    Raises:
+        InputError: The log file cannot be written.
+    """
+    streams = sys.stdout, sys.stderr
+    output_settings.append(terminal)
+    log = None
+    try:
+        if terminal.log_file is not None:
+            log = _open_log(terminal.log_file)
+            log.write(f"{datetime.now().astimezone().isoformat(timespec='seconds')} {command}\n")
+            sys.stdout, sys.stderr = (_logged(stream, log) for stream in streams)
+        yield
+    finally:
+        sys.stdout, sys.stderr = streams
+        output_settings.pop()
+        if log is not None:
+            log.close()
+
+
+def write_log_line(text: str) -> None:
+    """Write a line to the log file only, if there is one."""
+    log = getattr(sys.stderr, "log", None)
+    if log is not None:
+        log.write(text)
+
+
+def _open_log(path: Path) -> IO[str]:
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}, given with --log-file, exists and is not a regular file; give another name")
+        return path.open("a", encoding="utf8", errors="backslashreplace")
+    except OSError as error:
+        raise InputError(f"{path}, given with --log-file, cannot be written: {error.strerror}") from error
+
+
+class _LoggedStream:
+    """A stream whose output also goes to a log file, without escape sequences."""
+
+    def __init__(self, stream: IO[str], log: IO[str]) -> None:
+        self._stream, self.log = stream, log
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        self.log.write(_ESCAPES.sub("", text))
+        return self._stream.write(text)
+
+
+def _logged(stream: Any, log: IO[str]) -> Any:
+    return None if stream is None else cast(Any, _LoggedStream(stream, log))
+
+
+# Shared parts of the commands: flags and help, printing, warnings, exit codes.
+
+
+_PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
+CONSOLE = Console(**_PLAIN)
+"""Console for results, on standard output. Markup in texts is not interpreted."""
+if CONSOLE.is_terminal:  # tables fit the terminal; pipes and files get the full width
+    CONSOLE.width = min(CONSOLE.width, shutil.get_terminal_size().columns)
+ERROR_CONSOLE = Console(**_PLAIN, stderr=True)
+
+_OUTPUT_ERROR = "The output of the command cannot be written: {}. Redirect it elsewhere."
+_PACKAGE = str(Path(normlift_ns.__file__).parent)
+
+
+class CommandProtocol(Protocol):
+    """A command: a dataclass of its flags."""
+
+    def main(self) -> object:
+        """Run the command."""
+        ...
+
+
+_Command = TypeVar("_Command", bound=CommandProtocol)
+
+
+class TerminatedError(BaseException):
+    """SIGTERM from the system, for example before preemption."""
+
+
+def run_command(command: type[CommandProtocol]) -> None:
+    """Parse flags as nerfstudio's commands do (--flag True), run the command, and exit unless it succeeds.
+
+    The exit code is 1 for user errors and for a full disk or memory, and 70 for internal errors. It is 130 for Ctrl-C
+    and 143 for SIGTERM, after partial files are removed.
+    """
+    streams: tuple[Any, ...] = (sys.stdout, sys.stderr)
+    for stream in streams:
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # for code pages that lack a character
+    try:
+        words, flags = split_output_flags(sys.argv[1:])
+        with apply_output_settings(flags, shlex.join(sys.argv)):
+            code = _exit_code(command, words)
+    except InputError as error:
+        code = _report_error(error)
+    for stream in streams:
+        code = _flush(stream, report=code == 0) or code
+    if code != 0:
+        sys.exit(code)
+
+
+def run_command_process(command: type[CommandProtocol]) -> NoReturn:
+    """Run a command as the only task of this process, and exit without the second that torch's teardown takes.
+
+    Idle OpenMP threads of torch and of compiled kernels sleep instead of spinning on cores that other threads and
+    other lifts could use. A policy set by the user takes precedence.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is imported
+    code: Any = 0
+    try:
+        run_command(command)
+    except SystemExit as stop:
+        code = stop.code
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        _flush(stream, report=False)  # the output of those functions
+    os._exit(code)
+
+
+def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
+    """Run the command and return the exit code."""
+    try:
+        with _sigterm_raises(), _plain_warnings(), _checked_output(), named_as_flags():
+            _parse_and_run(command, words)
+    except SystemExit as stop:  # from tyro after --help, or from rich if the output pipe is closed
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
+    except (KeyboardInterrupt, TerminatedError) as stop:
+        number = signal.SIGINT if isinstance(stop, KeyboardInterrupt) else signal.SIGTERM
+        word = "Interrupted" if number == signal.SIGINT else "Terminated"
+        print_error(f"{word}. No partial files remain; rerun the command to resume.")
+        return 128 + number
+    except Exception as error:  # a traceback would not help the user
+        return _report_error(error)
+    return 0
+
+
+def _report_error(error: Exception) -> int:
+    """Print an error and return the exit code."""
+    if isinstance(error, BrokenPipeError):  # the reader of the pipe has gone
+        return EXIT_USER_ERROR
+    message, code = (str(error), EXIT_USER_ERROR) if isinstance(error, OutputError) else describe_error(error)
+    with suppress(OSError):
+        ERROR_CONSOLE.print(Text("Error", style="bold red"))
+    print_error(message)
+    return code
+
+
+def _parse_and_run(command: type[CommandProtocol], words: list[str]) -> None:
+    if "--version" in words:
+        info(f"normlift_ns {normlift_ns.__version__}")
+        return
+    tyro.extras.set_accent_color("bright_yellow")
+    parse_flags(command, words).main()
+
+
+def parse_flags(command: type[_Command], words: Sequence[str], name: str | None = None) -> _Command:
+    """Parse the words after the name of a command.
+
+    Args:
+        command: Dataclass of the command.
+        words: Words of the command line.
+        name: Name of the command; None: the name that this process was started with.
+    Raises:
+        InputError: The command does not know the words.
+        SystemExit: The help was printed; the exit code is 0.
+    """
+    name = name or _module_name()
+    flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
+    words = fill_boolean_values(words, boolean_flags(command))
+    prints_help = {"-h", "--help"} & set(words)
+    with nullcontext() if prints_help else one_line_errors(name or sys.argv[0]):
+        return tyro.cli(flags, prog=name, args=words, description=f"{first_paragraph(command)} {OUTPUT_FLAGS_HELP}")
+
+
+def _module_name() -> str | None:
+    """Return how to start a command that runs as a module; None for installed commands."""
+    program = Path(sys.argv[0])
+    return f"python -m {__package__}.{program.stem}" if program.parent == Path(__file__).parent else None
+
+
+def boolean_flags(options: Any) -> set[str]:
+    """Return the boolean flags of an options dataclass."""
+    flags = set()
+    for name, hint in get_type_hints(options).items():
+        flags |= (
+            boolean_flags(hint) if is_dataclass(hint) else {f"--{name.replace('_', '-')}"} if hint is bool else set()
+        )
+    return flags
+
+
+def fill_boolean_values(words: Sequence[str], flags: Collection[str]) -> list[str]:
+    """Insert True after every boolean flag that has no value.
+
+    >>> fill_boolean_values(["--save", "--text", "a", "--stdin"], {"--save", "--stdin"})
+    ['--save', 'True', '--text', 'a', '--stdin', 'True']
+    """
+    words_with_values = []
+    for word, following in zip(words, [*words[1:], "--"]):
+        words_with_values.append(word)
+        if word.replace("_", "-") in flags and following.startswith("--"):
+            words_with_values.append("True")
+    return words_with_values
+
+
+def plain_text(value: object) -> Text:
+    """Return a prompt, path or name as rich text without markup."""
+    return Text(escape_unprintable(str(value)))
+
+
+def info(text: str) -> None:
+    """Print a line on standard output without wrapping."""
+    CONSOLE.print(plain_text(text), soft_wrap=True)
+
+
+def info_progress(text: str) -> None:
+    """Print a progress message on standard output, unless --quiet is set."""
+    if not output_settings[-1].quiet:
+        info(text)
+
+
+def info_opening(*paths: Path) -> None:
+    """Print which files are being opened, unless --quiet is set; on standard error, which programs do not parse."""
+    if not output_settings[-1].quiet:
+        print_error("Opening " + ", ".join(map(str, paths)))
+
+
+def print_error(text: str) -> None:
+    """Print a message on standard error without wrapping."""
+    with suppress(OSError):  # standard error is closed or full
+        ERROR_CONSOLE.print(Text(escape_unprintable(text)), soft_wrap=True)
+
+
+def _flush(stream: TextIO | None, report: bool) -> int:
+    """Flush a stream; return exit code 1 if that fails.
+
+    Args:
+        stream: The stream, or None.
+        report: Print a message on failure, unless the reader has closed the pipe.
+    """
+    try:
+        if stream is not None and not stream.closed:
+            stream.flush()
+        return 0
+    except OSError as error:
+        with suppress(OSError):  # keeps Python from flushing again at exit
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull, cast(TextIO, stream).fileno())
+            os.close(devnull)
+        if report and not isinstance(error, BrokenPipeError):
+            print_error(_OUTPUT_ERROR.format(error.strerror))
+        return EXIT_USER_ERROR
+
+
+class _CheckedStream:
+    """Standard output that raises OutputError if it cannot be written."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _output_errors():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with _output_errors():
+            self._stream.flush()
+
+
+@contextmanager
+def _output_errors() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(_OUTPUT_ERROR.format(error.strerror)) from error
+
+
+@contextmanager
+def _checked_output() -> Iterator[None]:
+    stream = sys.stdout
+    if stream is not None:
+        sys.stdout = cast(TextIO, _CheckedStream(stream))
+    try:
+        yield
+    finally:
+        sys.stdout = stream
+
+
+@contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    """Let SIGTERM end this context with an exception, as Ctrl-C does."""
+
+    def terminate(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # partial files are being removed
+        raise TerminatedError
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print our warnings as one line, and write deprecation warnings of other packages to the log file only.
+
+    Other warnings of other packages stay unchanged.
+    """
+    with warnings.catch_warnings():
+        default = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], filename: str, *rest: Any, **more: Any) -> None:
+            if filename.startswith(_PACKAGE):
+                print_error(f"Warning: {message}")
+            elif issubclass(category, DeprecationWarning | PendingDeprecationWarning | FutureWarning):
+                write_log_line(warnings.formatwarning(message, category, filename, rest[0]))
+            else:
+                default(message, category, filename, *rest, **more)
+
+        warnings.showwarning = show
+        yield
+
+
+@cache
+def add_help_texts(options: Any, *, nested: bool = False) -> Any:
+    """Return an options dataclass with help texts from its docstrings.
+
+    The docstring under each field becomes the help of its flag, and the first paragraph of the class docstring the help
+    of a group. tyro reads docstrings itself, but keeps the line breaks of the source. Options nested in a group join
+    that group.
+    """
+    hints = get_type_hints(options, include_extras=True)
+    texts: dict[str, str] = {}
+    for cls in filter(is_dataclass, reversed(options.__mro__)):  # a command may inherit flags
+        params = docstring_parser.parse_from_object(cls).params
+        texts |= {param.arg_name: param.description or "" for param in params}
+    for field in fields(options):
+        hint, text, name = hints[field.name], texts.get(field.name, ""), None
+        if is_dataclass(hint):
+            add_help_texts(hint, nested=True)
+            text, name = first_paragraph(hint), "" if nested else None
+        options.__annotations__[field.name] = Annotated[hint, tyro.conf.arg(name=name, help=" ".join(text.split()))]
+    return options
+
+
+def first_paragraph(options: Any) -> str:
+    """Return the first paragraph of a docstring as one line."""
+    return " ".join((options.__doc__ or "").split("\n\n")[0].split())

@@ -1,0 +1,136 @@
+"""make demo: generate a small room, lift it, query it, and compare the answers with the ground truth."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+import warnings
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+from unittest.mock import patch
+
+from rich.table import Table
+
+from normlift_ns.cli.common import CONSOLE, info, run_command_process
+from normlift_ns.cli.lift import NormLift
+from normlift_ns.cli.preflight import check_writable_folder
+from normlift_ns.cli.query import NormLiftQuery
+from normlift_ns.io.atomic import atomic_file, write_text_file
+from normlift_ns.options import AskOptions, SourceOptions, check_options
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+
+_PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
+REGION_COUNT = 700
+"""Superpixels per view: small enough to separate the green star of a tomato."""
+_ASK_OPTIONS = AskOptions(threshold="auto")
+_COMPILE = "import torch; from normlift_ns.rasterization.numba import warm; warm(torch.float32).join()"
+
+
+@dataclass
+class Demo:
+    """Generate a room with a trained run, lift it with ns-normlift, and search it for objects by name."""
+
+    folder: Path = Path("demo")
+    """Output folder; existing files of the demo are replaced."""
+    num_gaussians: int = 45_000
+    """Number of Gaussians in the room, at least 2,000; larger values give finer surfaces and take longer."""
+    views: int = 24
+    """Number of training views, at least 3; more views take longer."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def main(self) -> dict[str, float]:
+        """Run the demo and return the mIoU before and after refinement."""
+        check_writable_folder(self.folder, "--folder")
+        CONSOLE.rule("Generating a room")
+        for category in (FutureWarning, SyntaxWarning):  # from dependencies
+            warnings.simplefilter("ignore", category)
+        # Meanwhile, another core compiles the kernels that are not cached.
+        compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
+        from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
+        from normlift_ns.demo.room import demo_room  # noqa: PLC0415
+        from normlift_ns.evidence_collection import sample_evenly  # noqa: PLC0415
+
+        room = demo_room(self.num_gaussians)
+        with patch("nerfstudio.utils.misc.torch_compile", lambda: lambda function: function):
+            # Without training, torch's compiler is not needed; it takes 2 of 10 s to import.
+            import_module("normlift_ns.method_configs.normlift")
+        write_capture(room, self.folder / "room", views=self.views)
+        config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
+        compiling.wait()
+
+        CONSOLE.rule("Lifting")
+        flags = ("--encoder", "colour", "--region-count", REGION_COUNT)
+        _show("ns-normlift", "--load-config", config, *flags, "--queries", *_PROMPTS)
+        source = SourceOptions(encoder="colour", region_count=REGION_COUNT)
+        run = NormLift(config, source=source, queries=_PROMPTS, timestamp="demo", overwrite=True).main()
+        assert run is not None  # this is the only process
+
+        CONSOLE.rule("Searching")
+        renders, answers = self.folder / "pictures", self.folder / "answers.json"
+        flags = ("--threshold", "auto", "--render-dir", renders, "--json", answers)
+        _show("ns-normlift-query", "--load-config", run.config, "--text", *_PROMPTS, *flags)
+        NormLiftQuery(run.config, _PROMPTS, ask=_ASK_OPTIONS, render_dir=renders, json=answers, overwrite=True).main()
+        middle = f"{sample_evenly(self.views, 3)[1]:04d}"
+        _join_images(
+            [renders / f"{middle}_{i}_{text.replace(' ', '_')}.png" for i, text in enumerate(_PROMPTS[:3])], renders
+        )
+
+        CONSOLE.rule("Comparing with the ground truth")
+        scores = {}
+        for name, refined in (("before refinement", False), ("after refinement", True)):
+            answer = run.ask(*room.names, refined=refined)
+            classes = answer.relevancy.argmax(dim=1).where(answer.valid, -1)
+            scores[name] = iou_per_class(classes, room.labels, len(room.names))
+        table = Table("class", *scores, title="IoU over the Gaussians of each class")
+        for i, name in enumerate(room.names):
+            table.add_row(name, *(f"{values[i]:.3f}" for values in scores.values()))
+        table.add_section()
+        means = {name: float(values.mean()) for name, values in scores.items()}
+        table.add_row("mIoU", *(f"{value:.3f}" for value in means.values()))
+        CONSOLE.print(table)
+        write_text_file(self.folder / "miou.json", json.dumps(means, indent=2) + "\n", overwrite=True)
+        info(f"Renders are in {renders}. To explore the room in the browser, type:")
+        info(shlex.join(("ns-normlift-view", "--load-config", str(run.config))))
+        return means
+
+
+def _join_images(paths: list[Path], folder: Path) -> None:
+    """Join images of the same height into overview.png."""
+    from PIL import Image  # noqa: PLC0415
+
+    images = [Image.open(path).convert("RGB") for path in paths]
+    joined = Image.new("RGB", (sum(image.width for image in images), images[0].height))
+    left = 0
+    for image in images:
+        joined.paste(image, (left, 0))
+        left += image.width
+    with atomic_file(folder / "overview.png", overwrite=True) as draft:
+        joined.save(draft, compress_level=1)
+
+
+def iou_per_class(predicted: Int[Tensor, " n"], truth: Int[Tensor, " n"], classes: int) -> Float[Tensor, " classes"]:
+    """Return the IoU of each class over the Gaussians whose class is known (truth >= 0)."""
+    import torch  # noqa: PLC0415
+
+    known = truth >= 0
+    predicted, truth = predicted[known], truth[known]
+    ious = [((predicted == c) & (truth == c)).sum() / ((predicted == c) | (truth == c)).sum() for c in range(classes)]
+    return torch.stack(ious)
+
+
+def _show(*words: object) -> None:
+    CONSOLE.print("$ " + shlex.join(map(str, words)), style="bold", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    run_command_process(Demo)

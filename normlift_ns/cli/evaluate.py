@@ -1,0 +1,273 @@
+"""ns-normlift-eval: score lifted runs by published protocols or against instance masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+from rich.table import Column, Table
+
+from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_command, run_command_process
+from normlift_ns.cli.preflight import check_lifted_run, check_readable_file, check_readable_folder, check_writable_file
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.options import LerfOptions, MaskOptions, ScannetOptions, pose_output_paths
+from normlift_ns.io.atomic import refuse_existing
+from normlift_ns.options import check_device, check_options
+
+if TYPE_CHECKING:
+    from normlift_ns.evaluation.options import Evaluation
+    from normlift_ns.evaluation.protocols import EvaluatedRun
+    from normlift_ns.evaluation.studies import Evaluate, Row
+
+
+_WITH_FIGURE = ("sweeps", "signals")
+"""Studies with a figure."""
+_WITHOUT_TRUTH = ("coverage", "timing")
+"""Studies that need no ground truth."""
+
+
+@dataclass
+class NormLiftEval:
+    """Evaluate lifted runs. Prints a table and writes a JSON file in the format of ns-eval."""
+
+    load_config: tuple[Path, ...]
+    """Paths to config YAML files of lifted runs, one per scene."""
+    protocol: Literal["scannet", "lerf", "masks", "none"] = "none"
+    """Evaluation protocol. scannet: 3D, one Gaussian per labeled vertex. lerf: 2D, polygons of LERF-OVS. masks:
+    instance masks of any capture, 3D and 2D. none: no ground truth and no scores, for --study coverage and timing."""
+    labels: tuple[Path, ...] = ()
+    """Ground truth of every run, in the order of --load-config. scannet: *_vh_clean_2.labels.ply file. lerf: folder of
+    JSON files. masks: folder of masks. none: leave out."""
+    output_path: Path = Path("output.json")
+    """Path of the output file."""
+    overwrite: bool = False
+    """Replace an existing output file and the figures next to it."""
+    refined: bool = True
+    """Evaluate the directions after the vote. False: the directions of the lift alone."""
+    study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
+    """Additional measurements, which hold all runs in memory. ablation: variants of the refinement, with and without
+    consensus. sweeps: every vote parameter around its value in the run, and its default. signals: Gaussians without
+    evidence, accuracy by R and by norm, R against opacity. timing: seconds of the lift and, on a GPU, of SFS's method
+    (512 channels through gsplat). baselines: the ideas of SFS, Occam's LGS, VALA and Dr.Splat, in our implementation
+    on the features of the run. coverage: regions without reliable evidence, unused images that would help, and new
+    poses, as renders and as a camera path."""
+    text_vectors: Path | None = None
+    """NPZ file with one vector per class name, used instead of the encoder that lifted the runs."""
+    data: Path | None = None
+    """Current path of the dataset, if it was moved; for a single run."""
+    device: str = "auto"
+    """Device for the text encoder and --study: auto, cpu or cuda."""
+    scannet: ScannetOptions = field(default_factory=ScannetOptions)
+    lerf: LerfOptions = field(default_factory=LerfOptions)
+    masks: MaskOptions = field(default_factory=MaskOptions)
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def main(self) -> Evaluation:
+        """Evaluate the runs, write the output file and print the tables."""
+        self._check()
+        info_opening(*self.load_config)
+        from normlift_ns.api import open_run  # noqa: PLC0415
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation.coverage import (
+            coverage_of,  # noqa: PLC0415
+            write_poses,  # noqa: PLC0415
+        )
+        from normlift_ns.evaluation.options import write_evaluation  # noqa: PLC0415
+        from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
+        from normlift_ns.evaluation.studies import (  # noqa: PLC0415
+            study_ablation,
+            study_baselines,
+            study_timing,
+            study_votes,
+            sweeps,  # noqa: PLC0415
+        )
+        from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
+
+        device = choose_device(self.device)
+        names: list[tuple[str, str]] = []
+
+        def load(config: Path) -> EvaluatedRun:
+            run = open_run(config, data=self.data, device=device, text_vectors=self.text_vectors)
+            names.append((run.scene.name, str(run.scene.checkpoint_path)))
+            texts = cast(Any, None) if self.protocol == "none" else run.texts  # no encoder is needed without prompts
+            return EvaluatedRun(run.scene, run.field, texts, self.refined, cache_folder(run.folder))
+
+        # Scenes are large: only studies hold more than one in memory.
+        runs: Iterable[EvaluatedRun] = (load(config) for config in self.load_config)
+        if self.study or self.protocol == "masks":
+            runs = list(runs)
+        evaluate, measure_signals = self._protocol(runs)
+        evaluation, studies, poses = evaluate(runs), {}, ((), ())
+        for name in self.study:
+            loaded = list(runs)
+            if name == "signals":
+                studies[name] = measure_signals(loaded)
+            elif name == "timing":
+                studies[name] = study_timing(loaded, device, info)
+            elif name == "baselines":
+                studies[name] = study_baselines(loaded, evaluate, device)
+            elif name == "coverage":
+                coverage = coverage_of(loaded[0].scene, loaded[0].field, device=device)
+                studies[name] = [coverage.to_json()]
+                poses = coverage.poses, coverage.pictures
+            elif name == "ablation":
+                studies[name] = study_ablation(loaded, evaluate, device, info)
+            else:
+                studies[name] = study_votes(loaded, evaluate, sweeps, device)
+        experiments, checkpoints = (", ".join(values) for values in zip(*names))
+        write_evaluation(
+            self.output_path, evaluation, experiment_name=experiments, method_name="normlift", checkpoint=checkpoints,
+            studies=studies, overwrite=self.overwrite,
+        )  # fmt: skip
+        written = [self.output_path, *self._plots(studies, evaluation.results)]
+        written += write_poses(self._coverage_stem, *poses, overwrite=self.overwrite)
+        if len(evaluation.results) > 0:
+            CONSOLE.print(rows_table(evaluation.rows))
+            if len(evaluation.scenes) > 1:
+                CONSOLE.print(rows_table(evaluation.scenes, "scenes"))
+            CONSOLE.print(_results_table(evaluation))
+        for name, rows in studies.items():
+            if name == "coverage":
+                for part in ("regions", "photographs", "poses"):
+                    CONSOLE.print(rows_table([_short(i, row) for i, row in enumerate(rows[0][part], 1)], part))
+                for remark in rows[0]["remarks"]:
+                    info(remark)
+            else:
+                CONSOLE.print(signals_table(rows) if name == "signals" else rows_table(rows, name))
+        info(f"Written: {', '.join(map(str, written))}")
+        return evaluation
+
+    def _check(self) -> None:
+        """Raise errors that can be detected before anything is loaded."""
+        check_device(self.device)
+        if self.protocol == "none":
+            self._check_without_truth()
+        elif len(self.load_config) == 0 or len(self.load_config) != len(self.labels):
+            raise InputError(
+                f"got {len(self.load_config)} runs and {len(self.labels)} --labels; give one --labels path for each "
+                "run, in the same order"
+            )
+        if len(self.load_config) > 1 and (self.protocol == "masks" or self.data is not None):
+            raise InputError("protocol masks and --data take one run at a time; name a single --load-config")
+        if len(self.load_config) > 1 and "coverage" in self.study:
+            raise InputError("--study coverage takes one run at a time; name a single --load-config")
+        check_readable_file(self.text_vectors, "--text-vectors")
+        for config in self.load_config:
+            check_lifted_run(config, self.data)
+        for labels in self.labels:
+            (check_readable_file if self.protocol == "scannet" else check_readable_folder)(labels, "--labels")
+        check_readable_file(self.masks.names, "--names")
+        figures = [self._figure(name) for name in _WITH_FIGURE if name in self.study]
+        figures += pose_output_paths(self._coverage_stem) if "coverage" in self.study else []
+        refuse_existing(self.output_path, *figures, overwrite=self.overwrite, instead="--output-path")
+        for path in (self.output_path, *figures):
+            check_writable_file(path, "--output-path")
+
+    def _check_without_truth(self) -> None:
+        """Raise InputError unless the options fit a study without ground truth."""
+        others = [name for name in self.study if name not in _WITHOUT_TRUTH]
+        if len(self.load_config) == 0 or len(self.study) == 0 or len(others) > 0 or len(self.labels) > 0:
+            raise InputError(
+                f"protocol none needs --load-config and --study {' or '.join(_WITHOUT_TRUTH)}, without --labels; for "
+                "other studies and for scores, give another --protocol"
+            )
+
+    def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
+        """Return a function that scores runs, and one that measures the signals of R."""
+        from normlift_ns.evaluation import protocols, studies  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evaluation.options import Evaluation  # noqa: PLC0415
+
+        if self.protocol == "none":
+            return lambda runs: Evaluation({}, [], {"protocol": "none"}), lambda runs: []
+        if self.protocol == "scannet":
+            kwargs = {"labels": self.labels, "options": self.scannet}
+            return partial(protocols.run_scannet, **kwargs), partial(studies.scannet_signals, **kwargs)
+        if self.protocol == "lerf":
+            evaluate = partial(protocols.run_lerf, labels=self.labels, options=self.lerf)
+            return evaluate, partial(studies.plain_signals, labels=self.labels)
+        run = next(iter(runs))
+        truth = protocols.mask_truth(run.scene, self.labels[0], self.masks, settings=run.settings)
+        return (
+            lambda runs: protocols.run_masks(next(iter(runs)), truth),
+            lambda runs: studies.mask_signals(runs[0], truth),
+        )
+
+    def _plots(self, studies: Mapping[str, list[Row]], results: Mapping[str, float]) -> Iterator[Path]:
+        """Draw the figures next to the output file and yield their paths; sweeps show the first result."""
+        from normlift_ns.evaluation.studies import plot_signals, plot_sweeps  # noqa: PLC0415
+
+        metric, result = next(iter(results.items()), ("", 0.0))
+        for name in _WITH_FIGURE:
+            if name not in studies:
+                continue
+            path = self._figure(name)
+            if name == "sweeps":
+                plot_sweeps(studies[name], metric, metric, path, result=result, overwrite=self.overwrite)
+            else:
+                plot_signals(studies[name], path, overwrite=self.overwrite)
+            yield path
+
+    @property
+    def _coverage_stem(self) -> Path:
+        """Common beginning of the paths of the coverage study."""
+        return self.output_path.with_name(f"{self.output_path.stem}_coverage")
+
+    def _figure(self, study: str) -> Path:
+        return self.output_path.with_name(f"{self.output_path.stem}_{study}.svg")
+
+
+def _results_table(evaluation: Evaluation) -> Table:
+    """Return a table of the mean results."""
+    table = Table("metric", "value", title=f"Protocol {evaluation.settings['protocol']}")
+    for name, value in evaluation.results.items():
+        table.add_row(name, f"{value:.4f}")
+    return table
+
+
+def rows_table(rows: Sequence[Row], title: str | None = None) -> Table:
+    """Return a table of rows, for example one per class, frame or vote variant."""
+    table = Table(
+        *(Column(plain_text(name), overflow="fold") for name in (rows[0] if len(rows) > 0 else ())), title=title
+    )
+    for row in rows:
+        table.add_row(*(f"{x:.3f}" if isinstance(x, float) else plain_text(x) for x in row.values()))
+    return table
+
+
+def _short(number: int, row: Row) -> Row:
+    """Return a numbered row of the coverage study, without values that only programs need."""
+    shown: dict[str, Any] = {"": number}
+    for name, value in row.items():
+        if name not in ("box", "camera_to_world", "lifted_reliability"):
+            is_vector = isinstance(value, list) and all(isinstance(x, float) for x in value)
+            shown[name] = " ".join(f"{x:.2f}" for x in value) if is_vector else value
+    return shown
+
+
+def signals_table(rows: Sequence[Row]) -> Table:
+    """Return a table of signals with one column per scene."""
+    scenes = (Column(plain_text(row.get("scene", "value")), overflow="fold") for row in rows)
+    table = Table("signal", *scenes, title="signals")
+    for name in (key for key in rows[0] if key != "scene"):
+        digits = ".3g" if name.endswith("_p") else ".3f"  # p-values may be tiny
+        table.add_row(name, *(f"{row[name]:{digits}}" for row in rows))
+    return table
+
+
+def entrypoint() -> None:
+    """Run ns-normlift-eval in a process that continues afterwards."""
+    run_command(NormLiftEval)
+
+
+def main() -> None:
+    """Run ns-normlift-eval as a process."""
+    run_command_process(NormLiftEval)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,228 @@
+"""ns-normlift-export: write a lifted run as a PLY file of Gaussians and a table of objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.table import Table
+
+from normlift_ns.cli.common import CONSOLE, info, info_opening, plain_text, run_command, run_command_process
+from normlift_ns.cli.preflight import (
+    check_lifted_run,
+    check_readable_file,
+    check_writable_file,
+    check_writable_folder,
+    has_stored_queries,
+)
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import refuse_existing
+from normlift_ns.options import (
+    FLOATER_THRESHOLD,
+    LABEL_ARRAY_FILES,
+    MAX_TRANSFER_DISTANCE,
+    OBJECT_MAX_GAP,
+    OBJECT_MIN_GAUSSIANS,
+    AskOptions,
+    check_device,
+    check_options,
+    check_prompt_list,
+)
+
+
+@dataclass
+class NormLiftExport:
+    """Write a lifted run, a selection of its Gaussians, or the rest of the scene, for other splat tools."""
+
+    load_config: Path
+    """Path to config YAML file of the lifted run."""
+    output_dir: Path
+    """Output folder, created if missing."""
+    text: tuple[str, ...] = ()
+    """Prompts to search for. Default: the queries stored in the run, with their stored options."""
+    part: Literal["scene", "selection", "rest", "clean"] = "scene"
+    """Gaussians to export. scene: all. selection: those that any prompt selects. rest: all others. clean: all except
+    likely floaters, which are Gaussians floating in front of the cameras."""
+    ask: AskOptions = field(default_factory=AskOptions)
+    output_filename: str = "splat.ply"
+    """Name of the PLY file. <name>_rows.npy has the index of each Gaussian in the run, <name>_names.json the names of
+    class_id and instance_id values, and <name>_objects.json the objects."""
+    masks_dir: Path | None = None
+    """Folder for a PNG mask of every training image: 255 for pixels of selected Gaussians, else 0. With --part rest,
+    the values are swapped. Masks fit the undistorted images that the scene was trained with."""
+    arrays_dir: Path | None = None
+    """Folder for the Gaussians of the PLY file as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored
+    Gaussians) and names.json."""
+    transfer: Path | None = None
+    """PLY point cloud or mesh to label. <name of the cloud>_labels.ply is a copy with the class_id, instance_id and
+    relevancies of the nearest visible Gaussian; 0 if none is near enough."""
+    transfer_distance: float = MAX_TRANSFER_DISTANCE
+    """Largest distance from a point to the center of its Gaussian for --transfer, > 0; larger values label more points.
+    In units of the median distance from a Gaussian to the nearest one at another position."""
+    transfer_coordinates: Literal["capture", "scene"] = "capture"
+    """Coordinates of the cloud for --transfer. capture: the cameras' coordinates before nerfstudio rotated and scaled
+    them. scene: the Gaussians' coordinates, as in exported files."""
+    reach: float = OBJECT_MAX_GAP
+    """Largest gap between Gaussians of one object, in units of the selection's median spacing, > 0; larger values merge
+    more objects."""
+    min_size: int = OBJECT_MIN_GAUSSIANS
+    """Smallest number of Gaussians in an object, at least 1; larger values list fewer objects."""
+    floater_limit: float = FLOATER_THRESHOLD
+    """Score above which a Gaussian counts as a floater for --part clean; larger values leave out fewer Gaussians."""
+    overwrite: bool = False
+    """Replace existing files of the same names."""
+    data: Path | None = None
+    """Current path of the dataset, if it was moved."""
+    device: str = "auto"
+    """Device for the text encoder: auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def main(self) -> Path:
+        """Write the files and return the path of the PLY file."""
+        check_device(self.device)
+        check_prompt_list("text", self.text)
+        check_lifted_run(self.load_config, self.data, self.ask if len(self.text) > 0 else None)
+        if self.part in ("selection", "rest") and len(self.text) == 0 and not has_stored_queries(self.load_config):
+            raise InputError(f"--part {self.part} needs prompts, and the run stores no queries; give --text")
+        name = Path(self.output_filename).name
+        if name == "":
+            raise InputError("--output-filename is empty; give the name of a PLY file, such as splat.ply")
+        target = self.output_dir / name
+        suffixes = ("rows.npy", "names.json", "objects.json")
+        files = (target, *(target.with_name(f"{target.stem}_{suffix}") for suffix in suffixes))
+        refuse_existing(*files, overwrite=self.overwrite, instead="--output-dir or --output-filename")
+        for file in files:
+            check_writable_file(file, "--output-dir")
+        self._check_extras(files)
+        info_opening(self.load_config)
+        from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
+        from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.cli import answers  # noqa: PLC0415
+        from normlift_ns.exports import (  # noqa: PLC0415
+            answer_instances,  # noqa: PLC0415
+            check_no_properties,
+            read_cloud,
+        )
+        from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
+
+        cloud = None if self.transfer is None else read_cloud(self.transfer)
+        run = open_run(
+            self.load_config,
+            data=self.data,
+            device=self.device,
+            text_vectors=self.ask.text_vectors,
+            text_template=self.ask.text_template,
+        )
+        if self.masks_dir is not None:
+            refuse_existing(*mask_files(run.scene, self.masks_dir), overwrite=self.overwrite, instead="--masks-dir")
+        answer = run.ask(*self.text, **self.ask.rules()) if len(self.text) > 0 else run.ask_stored()
+        mask = None if answer is None or self.part == "scene" else answer.mask
+        mask = ~mask if mask is not None and self.part == "rest" else mask
+        if self.part == "clean":
+            floaters = run.floaters(self.floater_limit).mask
+            mask = ~floaters
+            info(f"{int(floaters.sum()):,} likely floaters are left out")
+        objects: dict[str, Any] | None = None
+        instances = None
+        if answer is not None:
+            limits, question = {"reach": self.reach, "min_size": self.min_size}, answer.question
+            instances = answer_instances(answer, **limits)
+            objects = {
+                "queries": object_tables(run.field, answer.means, instances),
+                "relevancy": question.rule,
+                "threshold": question.threshold,
+                "min_reliability": question.min_reliability,
+            }
+            if cloud is not None:  # before anything is written
+                count = len(objects["queries"])
+                check_no_properties(cloud, ("class_id", "instance_id", *(f"relevancy_{i}" for i in range(count))))
+        rows = run.export(
+            target, mask, answer=answer, objects=objects, reach=self.reach, min_size=self.min_size,
+            overwrite=self.overwrite,
+        )  # fmt: skip
+        info(f"{len(rows):,} of {len(run.scene.gaussians):,} Gaussians in {target}")
+        if answer is not None and instances is not None:
+            if self.masks_dir is not None:
+                answers.export_masks(
+                    run, answer.mask, self.masks_dir, rest=self.part == "rest", overwrite=self.overwrite
+                )
+            if self.arrays_dir is not None:
+                answers.export_label_arrays(run, instances, rows, self.arrays_dir, overwrite=self.overwrite)
+            if cloud is not None:
+                limit, coordinates, path = self.transfer_distance, self.transfer_coordinates, self._labeled_cloud
+                answers.export_labeled_cloud(
+                    run, answer, instances, cloud, path, limit, coordinates, overwrite=self.overwrite
+                )
+        if objects is not None:
+            CONSOLE.print(_objects_table(objects["queries"]))
+        return target
+
+    @property
+    def _labeled_cloud(self) -> Path:
+        """Path of the labeled point cloud."""
+        return self.output_dir / f"{Path() if self.transfer is None else self.transfer.stem}_labels.ply"
+
+    def _check_extras(self, files: Sequence[Path]) -> None:
+        """Raise errors about masks, arrays and point clouds that can be detected before anything is loaded."""
+        for name in ("masks_dir", "arrays_dir", "transfer"):
+            if getattr(self, name) is None:
+                continue
+            flag = f"--{name.replace('_', '-')}"
+            if len(self.text) == 0 and not has_stored_queries(self.load_config):
+                raise InputError(f"{flag} needs prompts, and the run stores no queries; give --text")
+            if name != "transfer":
+                check_writable_folder(getattr(self, name), flag)
+        if self.masks_dir is not None and self.part == "clean":
+            raise InputError("--masks-dir writes masks of a selection or of its rest; it cannot mask --part clean")
+        if self.arrays_dir is not None:
+            paths = [self.arrays_dir / name for name in LABEL_ARRAY_FILES]
+            refuse_existing(*paths, overwrite=self.overwrite, instead="--arrays-dir")
+        if self.transfer is not None:
+            check_readable_file(self.transfer, "--transfer")
+            path = self._labeled_cloud
+            if path in files:
+                raise InputError(
+                    f"{path} would be both the splat and the labeled cloud; give another --output-filename"
+                )
+            check_writable_file(path, "--output-dir")
+            refuse_existing(path, overwrite=self.overwrite, instead="--output-dir")
+
+
+def _objects_table(queries: list[dict[str, Any]]) -> Table:
+    table = Table("text", "object", title="Objects, in scene units")
+    for name in ("Gaussians", "centroid", "box size", "mean reliability"):
+        table.add_column(name, justify="right", overflow="fold")
+    for entry in queries:
+        for i, item in enumerate(entry["objects"]):
+            box = item["box"]
+            sizes = (high - low for low, high in zip(box["min"], box["max"]))
+            vectors = (" ".join(f"{x:.2f}" for x in vector) for vector in (item["centroid"], sizes))
+            numbers = (f"{item['size']:,}", *vectors, f"{item['mean_reliability']:.3f}")
+            table.add_row(plain_text(entry["text"] if i == 0 else ""), str(item["instance_id"]), *numbers)
+        table.add_row(
+            plain_text("" if entry["objects"] else entry["text"]),
+            "smaller",
+            f"{entry['in_smaller_parts']:,}",
+            "",
+            "",
+            "",
+        )
+    return table
+
+
+def entrypoint() -> None:
+    """Run ns-normlift-export in a process that continues afterwards."""
+    run_command(NormLiftExport)
+
+
+def main() -> None:
+    """Run ns-normlift-export as a process."""
+    run_command_process(NormLiftExport)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,397 @@
+"""Commands that run in several processes."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from rich.console import Group
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column, Table
+from rich.text import Text
+
+from normlift_ns.cli import common
+from normlift_ns.cli.common import (
+    CONSOLE,
+    TerminatedError,
+    info,
+    info_progress,
+    plain_text,
+    print_error,
+    run_command,
+    run_command_process,
+)
+from normlift_ns.cli.preflight import (
+    check_new_run,
+    check_readable_file,
+    check_run_config,
+    check_source_options,
+    check_splat_paths,
+    check_unused_options,
+    check_writable_folder,
+)
+from normlift_ns.distributed.launch import (
+    LAUNCHED_VARIABLE,
+    PeerFailureError,
+    describe_failure,
+    distributed_context,
+    launch_processes,
+    rank_and_world_size,
+)
+from normlift_ns.errors import InputError
+from normlift_ns.options import LiftOptions, SourceOptions, SplatOptions, check_device, check_number, check_options
+
+if TYPE_CHECKING:
+    from normlift_ns.core.partition import Communicator, ProgressCallback
+    from normlift_ns.core.scene import Scene
+    from normlift_ns.lifted_run import LiftedRun
+
+
+@contextmanager
+def join_processes(device: str) -> Iterator[Communicator]:
+    """Join the processes that this one was started with, if any; only the first process prints.
+
+    Args:
+        device: cpu, cuda or auto.
+    """
+    started_by_us = LAUNCHED_VARIABLE in os.environ  # the process that started this one reports failures
+    try:
+        with distributed_context(device, print_error) as team:
+            if team.rank > 0:
+                CONSOLE.quiet = True
+                warnings.simplefilter("ignore")
+            yield team
+    except PeerFailureError as error:
+        if not error.lost.failed:
+            print_error(describe_failure(error.lost))
+        sys.exit(1)
+    except (KeyboardInterrupt, TerminatedError):
+        if started_by_us:
+            sys.exit(1)
+        raise
+
+
+# ns-normlift: lift 2D features onto a trained splat to make it searchable with text.
+
+
+@dataclass
+class NormLift:
+    """Lift 2D features onto the Gaussians of a trained splat, without training. The splat is a splatfacto run, a PLY
+    file or a checkpoint of gsplat's trainer."""
+
+    load_config: Path | None = None
+    """Path to config YAML file of the trained run."""
+    load_ply: Path | None = None
+    """PLY file of a splat, instead of --load-config; needs --colmap or --transforms."""
+    load_gsplat: Path | None = None
+    """Checkpoint of gsplat's simple_trainer, ckpt_<step>_rank0.pt, instead of --load-config; needs --colmap."""
+    splat: SplatOptions = field(default_factory=SplatOptions)
+    add_images: Path | None = None
+    """COLMAP project folder or transforms.json with images taken after training, which are lifted too. It must also
+    contain training images, whose cameras must not have moved."""
+    check: bool = True
+    """Compare three training views with renders of the scene before the lift. False: lift without this comparison."""
+    dry_run: bool = False
+    """Print what the lift will need, without lifting: seconds of every stage, memory, disk, and what is cached. The
+    speed is measured on a few images."""
+    data: Path | None = None
+    """Current path of the dataset, if it was moved after training."""
+    load_step: int | None = None
+    """Training step of the checkpoint to load. Default: the last one."""
+    output_dir: Path | None = None
+    """Output folder to use instead of that of the trained run."""
+    timestamp: str | None = None
+    """Name of the new run directory. Default: the current time."""
+    overwrite: bool = False
+    """Replace an existing run directory of that name, and exported files whose content differs."""
+    device: str = "auto"
+    """Device to lift on: auto, cpu or cuda."""
+    num_devices: int = 1
+    """Number of processes on this machine, each with its own GPU or an equal share of the CPU cores. For several
+    machines, use torchrun."""
+    queries: tuple[str, ...] = ()
+    """Prompts to store in the run; ns-render and ns-viewer show their relevancy."""
+    export_langsplat: Path | None = None
+    """Folder for a copy of the lifted regions and features, in the format of LangSplat's preprocessing."""
+    source: SourceOptions = field(default_factory=SourceOptions)
+    lift: LiftOptions = field(default_factory=LiftOptions)
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def main(self) -> LiftedRun | None:
+        """Lift and return the new run; None for a dry run, or if another process writes the run."""
+        self.check_early()
+        if self.dry_run:
+            self._plan()
+            return None
+        if self.num_devices > 1 and rank_and_world_size(os.environ) is None:
+            cores = os.cpu_count() or 1
+            if self.num_devices > cores:
+                info(f"{self.num_devices} processes share {cores} cores; more than {cores} will hardly be faster.")
+            code = launch_processes(
+                [sys.executable, "-m", "normlift_ns.cli.lift", *sys.argv[1:]], self.num_devices, print_error
+            )
+            if code > 0:
+                sys.exit(code)
+            return None
+        with join_processes(self.device) as team:
+            return self._lift(team)
+
+    def _plan(self) -> None:
+        start_time = time.perf_counter()
+        info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
+        from normlift_ns.cli.dry_run import describe_needs, dry_run, plan_table  # noqa: PLC0415 (loads torch)
+
+        plan = dry_run(self, start_time)
+        CONSOLE.print(plan_table(plan))
+        info(describe_needs(plan))
+
+    def _lift(self, team: Communicator) -> LiftedRun | None:
+        start_time = time.perf_counter()
+        info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
+        from normlift_ns.api import scene_opener  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
+        from normlift_ns.pipeline import lift_run_distributed  # noqa: PLC0415
+
+        import_time = time.perf_counter()
+        message_times: list[float] = []
+
+        def on_message(text: str) -> None:
+            message_times.append(time.perf_counter())
+            info_progress(text)
+
+        with progress_bars() as report:
+            trained = self.trained()
+            is_config = isinstance(trained, Path)
+            run = lift_run_distributed(
+                team,
+                scene_opener(trained, self.data if is_config else None, self.load_step if is_config else None),
+                source=self.source,
+                features=None,
+                texts=None,
+                lift=self.lift,
+                queries=self.queries,
+                output_dir=self.output_dir,
+                timestamp=self.timestamp,
+                overwrite=self.overwrite,
+                check=self.check,
+                device=self.device,
+                export=None if self.export_langsplat is None else FeatureExport(self.export_langsplat, self.overwrite),
+                report=report,
+                say=on_message,
+            )
+        if run is None:
+            return None
+        before = {"start": import_time - start_time, "open": (message_times or [import_time])[0] - import_time}
+        if not common.output_settings[-1].quiet:
+            CONSOLE.print(lift_summary(run, before, time.perf_counter() - start_time))
+        info(next_command(run.config, self.queries))
+        return run
+
+    def check_early(self) -> None:
+        """Raise errors that can be detected before anything is loaded."""
+        check_device(self.device)
+        check_number("num_devices", self.num_devices, int)
+        if self.num_devices > 1 and ":" in self.device:
+            raise InputError(
+                f"--device {self.device} is one GPU, but --num-devices is {self.num_devices}; give --device cuda"
+            )
+        self._check_splat()
+        if self.load_config is None:
+            check_splat_paths(self.load_ply, self.load_gsplat, self.splat)
+        else:
+            check_run_config(self.load_config, self.data, self.load_step)
+        if self.add_images is not None and not self.add_images.is_dir():
+            check_readable_file(self.add_images, "--add-images")
+        check_unused_options(self.lift)
+        check_source_options(self.source, self.queries)
+        check_new_run(self.load_config, self.splat, self.output_dir, self.timestamp, self.overwrite)
+        check_writable_folder(self.export_langsplat, "--export-langsplat")
+
+    def _check_splat(self) -> None:
+        """Raise InputError unless one trained splat is given, with options that apply to it."""
+        paths = [path for path in (self.load_config, self.load_ply, self.load_gsplat) if path is not None]
+        if len(paths) != 1:
+            raise InputError(
+                f"Give one trained splat, got {len(paths)}: --load-config with the config.yml of a splatfacto run, "
+                "--load-ply with a PLY file, or --load-gsplat with a checkpoint of gsplat's trainer."
+            )
+        default = SplatOptions()
+        if self.load_config is None:
+            options, names, hint = self, ("data", "load_step"), "--load-config; for a splat see --images"
+        else:
+            options, names, hint = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
+        for name in names:
+            if getattr(options, name) != getattr(default, name, None):
+                raise InputError(f"--{name.replace('_', '-')} is for {hint}. Leave it out.")
+
+    def trained(self) -> Path | Scene:
+        """Return the config of the run; for a splat, or with --add-images, the opened scene."""
+        splat = self.load_ply or self.load_gsplat
+        if splat is None and self.add_images is None:
+            return cast(Path, self.load_config)
+        from normlift_ns.api import open_scene  # noqa: PLC0415 (as above)
+        from normlift_ns.data.extra_images import add_extra_images  # noqa: PLC0415
+        from normlift_ns.data.open_splat import open_splat  # noqa: PLC0415
+
+        if splat is not None:
+            scene: Any = open_splat(splat, self.splat, say=info_progress)
+        else:
+            scene = open_scene(cast(Path, self.load_config), data=self.data, load_step=self.load_step)
+        if self.add_images is None:
+            return scene
+        count = len(scene.train)
+        scene = add_extra_images(scene, self.add_images)
+        info_progress(f"Added {len(scene.train) - count} new images from {self.add_images} to the lift.")
+        return scene
+
+
+@contextmanager
+def progress_bars() -> Iterator[ProgressCallback]:
+    """Show one bar with elapsed time per stage, or one line per stage if output goes to a pipe or a log file."""
+    names = {"features": "2D features", "lift": "lift, reliability", "store": "choosing storage"}
+    columns = (
+        TextColumn("{task.description:>17}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    started: set[str] = set()
+
+    def print_stage(stage: str, done: int, total: int) -> None:
+        if stage not in started:
+            started.add(stage)
+            info_progress(f"{names.get(stage, stage)} …")
+
+    if not CONSOLE.is_terminal or common.output_settings[-1] != common.OutputSettings():
+        yield print_stage
+        return
+    with Progress(*columns, console=CONSOLE) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(names.get(stage, stage), total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Group:
+    """Return the table that is printed after a lift: statistics, seconds, memory, storage and path.
+
+    Args:
+        run: The lifted run.
+        before: Seconds of the stages before the lift, by name.
+        total: Seconds of the whole command.
+    """
+    manifest: dict[str, Any] = dict(run.field.manifest)
+    statistics = manifest["statistics"]
+    storage = manifest["form"]
+    table = Table.grid(Column(), Column(overflow="fold"), padding=(0, 2))
+    unseen = f"{statistics['zero_evidence_share']:.1%} are not visible in any image"
+    table.add_row("Gaussians", f"{statistics['gaussians']:,}; {unseen}")
+    if statistics["excluded"] > 0:
+        table.add_row("not drawn", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")
+    if statistics["left_out"] > 0:
+        table.add_row("left out", f"{statistics['left_out']} images without features")
+    features = manifest["features"]
+    kind = features["kind"] if "kind" in features else features["regions"]["kind"]
+    table.add_row("2D features", kind)
+    if "consensus" in statistics:
+        consensus = statistics["consensus"]
+        levels = (describe_consensus(agreement, consensus["least"], kind) for agreement in consensus["agreement"])
+        table.add_row("consensus", "; ".join(levels))
+    table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
+    if "refined_share" in statistics:
+        unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
+        refined = f"{statistics['refined_share']:.1%} of Gaussians took over a neighbor's feature"
+        table.add_row("refined", f"{refined}; {unsupported}")
+    seconds = {**before, **run.seconds}
+    seconds |= {"other": total - sum(seconds.values())}
+    stages = ", ".join(f"{name} {t:.1f}" for name, t in seconds.items() if round(t, 1) > 0)
+    table.add_row("time", f"{total:.1f} s: {stages}")
+    cost = manifest["cost"]
+    gpu = f", GPU {cost['gpu_memory_gib']:.2f} GiB" if "gpu_memory_gib" in cost else ""
+    if "memory_gib" in cost:
+        table.add_row("peak memory", f"{cost['memory_gib']:.2f} GiB{gpu}")
+    sizes = {name: f"{name} {form['bytes'] / 1e6:.1f} MB" for name, form in manifest["forms"].items()}
+    error = f"cosine error at most {manifest['forms'][storage]['bound']:.1e}"
+    table.add_row("stored as", f"{sizes.pop(storage)}, {error}")
+    table.add_row("", "instead of " + ", ".join(sizes.values()))
+    table.add_row("run", plain_text(run.folder))
+    return Group(Text("Lifted", style="bold green"), table, Text("Search it with:"))
+
+
+def next_command(config: Path, queries: tuple[str, ...]) -> str:
+    """Return the command to type next, as one line.
+
+    >>> next_command(Path("a b/config.yml"), ("red mug",))
+    "ns-normlift-query --load-config 'a b/config.yml' --text 'red mug'"
+    """
+    rest = f"--text {shlex.quote(queries[0])}" if len(queries) > 0 else "--interactive"
+    return f"ns-normlift-query --load-config {shlex.quote(str(config))} {rest}"
+
+
+def describe_reliability(quantiles: dict[str, float]) -> str:
+    """Describe quantiles of the reliability in words.
+
+    >>> describe_reliability({"0.05": 0.21, "0.5": 0.68, "0.95": 0.93})
+    'from 0 (views contradict each other) to 1 (all agree): half of the Gaussians above 0.68, 95% above 0.21'
+    """
+    values = {float(q): value for q, value in quantiles.items()}
+    if not {0.05, 0.5} <= values.keys():
+        return "no Gaussian has a direction"
+    return (
+        "from 0 (views contradict each other) to 1 (all agree): "
+        f"half of the Gaussians above {values[0.5]:.2f}, 95% above {values[0.05]:.2f}"
+    )
+
+
+def describe_consensus(agreement: float, least: float, kind: str) -> str:
+    """Describe the effect of the consensus on one level of regions.
+
+    Args:
+        agreement: B of the level, in 0..1.
+        least: Value of --consensus-least.
+        kind: Kind of regions, such as sam or superpixel.
+
+    >>> describe_consensus(0.3, 0.4, "superpixel")
+    'regions overlap by chance (agreement 0.30, needs more than 0.40), features stay unchanged'
+    >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
+    'if they are bad masks of objects, try --consensus-least 0'
+    """
+    from normlift_ns.core.consensus import AGREEMENT_RAMP  # noqa: PLC0415 (torch is loaded by now)
+
+    if agreement > least:
+        extent = "applied" if agreement >= least + AGREEMENT_RAMP else "applied in part"
+        return f"agreement {agreement:.2f}, {extent}"
+    unchanged = (
+        f"regions overlap by chance (agreement {agreement:.2f}, needs more than {least:.2f}), features stay unchanged"
+    )
+    if kind in ("superpixel", "grid", "patches"):
+        return unchanged
+    return f"{unchanged}; if they are bad masks of objects, try --consensus-least 0"
+
+
+def entrypoint() -> None:
+    """Run ns-normlift in a process that continues afterwards."""
+    run_command(NormLift)
+
+
+def main() -> None:
+    """Run ns-normlift as a process."""
+    run_command_process(NormLift)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,386 @@
+"""Names and paths in a config.yml, read without nerfstudio and without constructing any object."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import complete_interrupted_writes
+from normlift_ns.io.run_dir import (
+    FIELD_FOLDER,
+    cache_folder,
+    field_folder,
+    refuse_existing_run,
+    run_directory,
+    text_cache_folder,
+)
+from normlift_ns.options import AskOptions, LiftOptions, SourceOptions, SplatOptions, check_prompt_list, short_repr
+
+_MAX_CONFIG_BYTES = 2**22
+"""Largest size of a config; those of nerfstudio have a few thousand bytes."""
+
+
+@dataclass(frozen=True)
+class ConfigPaths:
+    """Names and paths of a trained or lifted run; None if the config does not store them as nerfstudio does."""
+
+    experiment: str | None
+    output_dir: Path | None
+    """Folder that contains the experiment folder."""
+    data: tuple[Path, ...]
+    """Possible paths of the dataset; empty if the config has none."""
+
+
+def read_config_paths(config: Path) -> ConfigPaths:
+    """Read names and paths from a config.yml.
+
+    Raises:
+        InputError: The file is not valid YAML, or not a nerfstudio config.
+    """
+    expected = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+    if config.stat().st_size > _MAX_CONFIG_BYTES:
+        raise InputError(
+            f"{config} is not a nerfstudio config: it has more than {_MAX_CONFIG_BYTES:,} bytes. {expected}"
+        )
+    try:
+        root = yaml.compose(config.read_text("utf8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except OSError as error:
+        raise OSError(f"{config} cannot be read: {error.strerror}. {expected}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        reason = error.problem if isinstance(error, yaml.MarkedYAMLError) else " ".join(str(error).split())
+        raise InputError(f"{config} is not a nerfstudio config: it is not valid YAML ({reason}). {expected}") from None
+    method = _string(_value(root, "method_name"))
+    if method is None:
+        raise InputError(f"{config} is not a nerfstudio config: it has no method_name. {expected}")
+    experiment, timestamp = _string(_value(root, "experiment_name")), _string(_value(root, "timestamp"))
+    run_dir = Path(os.path.abspath(config)).parent
+    names = (experiment, method, timestamp)
+    parent = run_dir.parents[2] if None not in names and run_dir.parts[-3:] == names else None
+    manager = _value(root, "pipeline", "datamanager")
+    data = _config_path(_value(manager, "data")) or _config_path(_value(manager, "dataparser", "data"))
+    configured = _config_path(_value(root, "output_dir"))
+    output_dir = parent
+    if parent is None and configured is not None:
+        from normlift_ns.data.nerfstudio.config import fallback_output_dir  # noqa: PLC0415 (rarely needed)
+
+        output_dir = fallback_output_dir(configured)
+    if data is None or configured is None:
+        return ConfigPaths(experiment, output_dir, ())
+    tail = Path(os.path.normpath(configured)).parts
+    if parent is not None and parent.parts[-len(tail) :] == tail:  # this gives the working directory of the training
+        roots = [Path(*parent.parts[: -len(tail)]), Path.cwd()]
+    else:
+        roots = [*(parent or Path(os.path.abspath(configured))).parents, Path.cwd()]
+    data_paths = tuple(dict.fromkeys(Path(os.path.abspath(folder / data)) for folder in roots))
+    return ConfigPaths(experiment, output_dir, data_paths)
+
+
+def _value(node: yaml.Node | None, *keys: str) -> yaml.Node | None:
+    """Return the value at a path of keys in nested mappings."""
+    for key in keys:
+        entries = node.value if isinstance(node, yaml.MappingNode) else ()
+        node = next((value for name, value in entries if isinstance(name, yaml.ScalarNode) and name.value == key), None)
+    return node
+
+
+def _string(node: yaml.Node | None) -> str | None:
+    return node.value if isinstance(node, yaml.ScalarNode) else None
+
+
+def _config_path(node: yaml.Node | None) -> Path | None:
+    """Return a path that nerfstudio wrote as a list of its parts."""
+    if not isinstance(node, yaml.SequenceNode) or not node.tag.endswith("Path"):
+        return None
+    parts = [_string(part) for part in node.value]
+    return Path(*(part for part in parts if part is not None)) if parts and None not in parts else None
+
+
+# Checks of options and files that run before the slow import of torch and nerfstudio.
+#
+# The code that uses a file checks it again.
+
+
+_LEVELS = {"sam": ("s", "m", "l", "default"), "langsplat": ("s", "m", "l", "default", "sum")}
+
+
+def check_readable_file(path: Path | None, flag: str) -> None:
+    """Raise FileNotFoundError if the path is missing, or InputError if it is not a regular file."""
+    if path is None:
+        return
+    mode = _mode(path, flag)
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise InputError(f"{path}, given with {flag}, is {kind}; give a file")
+    _check_access(path, flag)
+
+
+def check_readable_folder(path: Path | None, flag: str) -> None:
+    """Raise FileNotFoundError if the path is missing, or InputError if it is not a folder."""
+    if path is None:
+        return
+    if not stat.S_ISDIR(_mode(path, flag)):
+        raise InputError(f"{path}, given with {flag}, is not a folder; give the folder that contains the files")
+    _check_access(path, flag)
+
+
+def _mode(path: Path, flag: str) -> int:
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        link = " (a broken link)" if path.is_symlink() else ""
+        raise FileNotFoundError(f"{path}{link}, given with {flag}, does not exist; check the path") from None
+    except OSError as error:  # a link to itself, a name that is too long, a folder without search permission
+        raise OSError(f"{short_repr(str(path))}, given with {flag}, cannot be opened: {error.strerror}") from None
+
+
+def _check_access(path: Path, flag: str) -> None:
+    if not os.access(path, os.R_OK):
+        raise PermissionError(f"{path}, given with {flag}, is not readable; change its permissions")
+
+
+def check_writable_file(path: Path | None, flag: str) -> None:
+    """Raise InputError or OSError if a file cannot be written; its parent folders need not exist."""
+    if path is None:
+        return
+    if path.name == "":
+        raise InputError(f"{path}, given with {flag}, is the name of a folder; give a file name")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}, given with {flag}, exists and is not a regular file; give another name")
+    check_writable_folder(path.parent, flag)
+
+
+def check_writable_folder(path: Path | None, flag: str) -> None:
+    """Raise InputError or OSError if a folder cannot be written; it need not exist."""
+    if path is None:
+        return
+    for parent in (path, *path.absolute().parents):
+        try:
+            mode = parent.stat().st_mode
+        except FileNotFoundError:
+            if not parent.is_symlink():
+                continue
+            raise InputError(f"{parent}, named with {flag}, is a broken link; give another folder") from None
+        except NotADirectoryError:
+            continue  # one of the parents is a file
+        except OSError as error:
+            raise OSError(f"{short_repr(str(path))}, named with {flag}, cannot be opened: {error.strerror}") from None
+        if not stat.S_ISDIR(mode):
+            raise InputError(f"{parent}, named with {flag}, is not a folder; give another path")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise PermissionError(f"{parent}, named with {flag}, is not writable; give another folder")
+        return
+
+
+def check_distinct_paths(**paths: Path | None) -> None:
+    """Raise InputError if two flags name the same file."""
+    names: dict[str, str] = {}
+    for name, path in paths.items():
+        target = None if path is None else os.path.realpath(path)
+        if target is not None and target in names:
+            raise InputError(f"--{names[target]} and --{name.replace('_', '-')} name the same file, {path}")
+        if target is not None:
+            names[target] = name.replace("_", "-")
+
+
+def check_run_config(config: Path, data: Path | None, step: int | None = None, *, wrote: str = "ns-train") -> None:
+    """Check a config.yml, its dataset and its checkpoint.
+
+    Args:
+        config: Path of the config.
+        data: Current path of the dataset, if it was moved.
+        step: Training step of the checkpoint; None: any.
+        wrote: Command that wrote the config, for messages.
+    Raises:
+        FileNotFoundError: The config, the dataset or the checkpoint is missing.
+        InputError: The file is not a nerfstudio config.
+    """
+    run_dir = Path(os.path.abspath(config)).parent
+    if not run_dir.exists():
+        complete_interrupted_writes(run_dir.parent)  # finish a replacement of the run that was killed
+    if not config.is_file():
+        hint = f"; {config / 'config.yml'} exists, give that path" if (config / "config.yml").is_file() else ""
+        method = "splatfacto" if wrote == "ns-train" else "normlift"
+        raise FileNotFoundError(
+            f"No config at {config}{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
+        )
+    _check_access(config, "--load-config")
+    if data is not None and not data.exists():
+        raise FileNotFoundError(
+            f"No dataset at {data}, given with --data. Expected the folder or the transforms.json that "
+            "ns-train was run with."
+        )
+    paths = read_config_paths(config)
+    located = data is not None or (run_dir / "splat.json").is_file()  # a lifted splat stores its image paths
+    if not located and len(paths.data) > 0 and not any(path.exists() for path in paths.data):
+        raise FileNotFoundError(
+            f"The dataset of {config} is not at {' nor at '.join(map(str, paths.data[:2]))}. If it was moved, give its "
+            "new path with --data."
+        )
+    checkpoints = run_dir / "nerfstudio_models"
+    pattern = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
+    if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
+        files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
+        raise FileNotFoundError(
+            f"No checkpoint {pattern} in {checkpoints}, which contains {files}. Copy it there again."
+        )
+
+
+def check_lifted_run(config: Path, data: Path | None, ask: AskOptions | None = None) -> None:
+    """Check a lifted run, and with `ask` also its text encoder."""
+    check_run_config(config, data, wrote="ns-normlift")
+    folder = field_folder(Path(os.path.abspath(config)).parent)
+    if ask is None:
+        return
+    check_readable_file(ask.text_vectors, "--text-vectors")
+    stored = _encoder_of(folder)
+    if ask.text_vectors is None and stored.get("text_vectors") is None:
+        names = text_cache_folder(folder.parent)
+        if not (names.is_dir() and any(names.iterdir())):  # the cache may contain the prompts
+            _check_stored_encoder(stored)
+
+
+def _check_stored_encoder(stored: dict[str, Any]) -> None:
+    """Check the encoder options of a manifest if the encoder is installed."""
+    from normlift_ns.encoders.registry import find_encoder_kind  # noqa: PLC0415 (not needed for --help)
+
+    kind = find_encoder_kind(stored.get("encoder"))
+    try:
+        options = SourceOptions(**stored)
+    except (TypeError, ValueError):  # reported when the run is opened
+        return
+    if kind is not None:
+        kind.check(options)
+
+
+def _encoder_of(folder: Path) -> dict[str, Any]:
+    """Return the encoder options of a manifest; empty if it is damaged, which is reported when the run is opened."""
+    try:
+        encoder = json.loads((folder / "manifest.json").read_text("utf8")).get("encoder")
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return {}
+    return encoder if isinstance(encoder, dict) else {}
+
+
+def has_stored_queries(config: Path) -> bool:
+    """Return whether a lifted run stores queries."""
+    return (Path(os.path.abspath(config)).parent / FIELD_FOLDER / "queries.safetensors").exists()
+
+
+def check_new_run(
+    config: Path | None, splat: SplatOptions, output_dir: Path | None, timestamp: str | None, overwrite: bool
+) -> None:
+    """Raise if the directory of a new run cannot be written, or if another run exists there."""
+    check_writable_folder(output_dir, "--output-dir")
+    name, outputs = new_run_location(config, splat, output_dir)
+    run_dir = run_directory(outputs or Path(), name or "run", timestamp)
+    if name is None or outputs is None:
+        return
+    if timestamp is not None:
+        refuse_existing_run(run_dir, overwrite)
+    check_writable_folder(cache_folder(run_dir), "--output-dir")
+
+
+def new_run_location(
+    config: Path | None, splat: SplatOptions, output_dir: Path | None
+) -> tuple[str | None, Path | None]:
+    """Return the capture name and output folder for `run_directory`; None if they require opening the capture.
+
+    Raises:
+        InputError, OSError: The config is invalid or cannot be read.
+    """
+    if config is not None:
+        paths = read_config_paths(config)
+        return paths.experiment, output_dir or paths.output_dir
+    cameras = (splat.colmap or splat.transforms or Path()).absolute()
+    name = (cameras.parent if cameras.suffix == ".json" else cameras).name
+    return name or "splat", output_dir or Path("outputs")
+
+
+def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions) -> None:
+    """Check a splat without a nerfstudio run, its cameras and its images."""
+    check_readable_file(ply, "--load-ply")
+    check_readable_file(gsplat, "--load-gsplat")
+    if (splat.colmap is None) == (splat.transforms is None):
+        count = "none" if splat.colmap is None else "two"
+        raise InputError(
+            f"A splat needs one file of cameras, got {count}: give a COLMAP project folder with --colmap, or a "
+            "transforms.json with --transforms."
+        )
+    check_readable_folder(splat.colmap, "--colmap")
+    if splat.transforms is not None and not splat.transforms.is_dir():
+        check_readable_file(splat.transforms, "--transforms")
+    check_readable_folder(splat.images, "--images")
+    check_readable_folder(splat.masks, "--masks")
+    check_readable_file(splat.world_transform, "--world-transform")
+
+
+def check_unused_options(lift: LiftOptions) -> None:
+    """Raise InputError for options that have no effect because their step is off."""
+    default = LiftOptions()
+    for name in ("consensus_power", "consensus_sample", "consensus_least"):
+        if not lift.consensus and getattr(lift, name) != getattr(default, name):
+            raise InputError(f"--{name.replace('_', '-')} is for --consensus True. Set that, or leave it out.")
+    if lift.vote.vote != "posterior" and lift.vote.prior != default.vote.prior:
+        raise InputError("--prior is for --vote posterior. Set that, or leave it out.")
+
+
+def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
+    """Check the folders, weights, levels and prompts of 2D features."""
+    from normlift_ns.encoders.registry import (
+        encoder_kind,  # noqa: PLC0415 (not needed for --help)
+        is_local_path,  # noqa: PLC0415
+    )
+
+    texts = tuple(queries)
+    check_prompt_list("queries", texts)
+    if source.regions == "sam3" and len(source.looking_for(texts).region_texts) == 0:
+        raise InputError('regions "sam3" need prompts: give them with --queries, such as --queries mug plate')
+    check_readable_folder(source.regions_dir, "--regions-dir")
+    check_readable_folder(source.features_dir, "--features-dir")
+    check_readable_file(source.text_vectors, "--text-vectors")
+    regions = source.regions
+    if regions == "auto" and (source.regions_dir is not None or source.sam_model is not None):
+        regions = "sam" if source.regions_dir is None else "files"
+    if source.features == "none" and regions == "files" and source.regions_dir is None:
+        raise InputError(
+            'regions "files" need a folder of label maps, one PNG or NPY file per image: give it with --regions-dir'
+        )
+    if source.features != "none" and source.features_dir is None:
+        raise InputError(f"features {source.features!r} need their folder: give it with --features-dir")
+    _check_level(source.level, "langsplat" if source.features == "langsplat" else regions)
+    if source.sam_model is not None and is_local_path(source.sam_model, 2):
+        _mode(Path(source.sam_model), "--sam-model")
+    if source.text_template not in ("{}", "ensemble") and "{}" not in source.text_template:
+        raise InputError(
+            f"--text-template {short_repr(source.text_template)} has no {{}} for the prompt; give a template such as "
+            '"a photo of a {}"'
+        )
+    needed = source.features == "none" or (len(texts) > 0 and source.text_vectors is None)
+    kind = encoder_kind(source.encoder)  # raises for an unknown encoder
+    if needed:
+        kind.check(source)
+
+
+def _check_level(level: str | None, kind: str) -> None:
+    if level is None or kind == "auto":
+        return
+    if kind == "files":
+        if not (level.isascii() and level.isdigit()):
+            raise InputError(
+                f"--level must be the number of a map, 0, 1, ..., for --regions files; got {short_repr(level)}"
+            )
+        return
+    levels = _LEVELS.get(kind, ())
+    if len(levels) == 0:
+        raise InputError(f'--level {short_repr(level)} is for --regions files or sam, not for "{kind}"; leave it out')
+    if level not in levels:
+        raise InputError(f"--level must be one of {', '.join(levels)} for {kind}, got {short_repr(level)}")

@@ -1,0 +1,128 @@
+"""ns-normlift-view: view a lifted run in the browser, which renders the Gaussians itself."""
+
+from __future__ import annotations
+
+import socket
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from normlift_ns.cli.common import TerminatedError, info, run_command, run_command_process
+from normlift_ns.cli.preflight import check_lifted_run, check_readable_file
+from normlift_ns.errors import InputError
+from normlift_ns.options import check_device, check_options
+
+if TYPE_CHECKING:
+    from normlift_ns.viewer.adapter import Door
+
+
+@dataclass
+class NormLiftView:
+    """View a lifted run in the browser: search, select, hide and export. The browser renders, so this machine needs no
+    GPU.
+
+    Colors are those of spherical harmonics of degree 0.
+    """
+
+    load_config: Path
+    """Path to config YAML file of the lifted run."""
+    host: str = "127.0.0.1"
+    """Address to bind to. 127.0.0.1 accepts connections from this machine only, 0.0.0.0 from other machines too."""
+    port: int = 7008
+    """Port to listen on, in 1..65535; if it is in use, the next free one."""
+    share_readonly: bool = False
+    """Forbid visitors to store prompts in the run or to write files on this machine; their exports become browser
+    downloads."""
+    most_drawn: int = 1_000_000
+    """Largest number of Gaussians to render. Larger scenes show their most opaque and largest Gaussians; larger values
+    need more browser memory."""
+    text_vectors: Path | None = None
+    """NPZ file with one vector per prompt, used instead of encoding prompts."""
+    text_template: str | None = None
+    """Template of the text that the network encodes, with {} for the prompt. Default: the template of the lift."""
+    data: Path | None = None
+    """Current path of the dataset, if it was moved."""
+    device: str = "auto"
+    """Device for the text encoder: auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def main(self) -> None:
+        """Serve the viewer until the process is interrupted."""
+        check_device(self.device)
+        _check_host(self.host)
+        check_lifted_run(self.load_config, self.data)
+        check_readable_file(self.text_vectors, "--text-vectors")
+        from normlift_ns.viewer.adapter import Door  # noqa: PLC0415 (--help should not wait for viser)
+
+        door = Door(self.host, self.port)
+        if door.server.port != self.port:
+            info(f"Port {self.port} is already in use.")
+        host = "127.0.0.1" if self.host == "0.0.0.0" else self.host
+        info(f"The viewer is at http://{host}:{door.server.port} (press Ctrl-C to stop it)")
+        try:
+            self.open(door)
+            until_stopped()
+        except (KeyboardInterrupt, TerminatedError):
+            info("Stopped.")
+
+    def open(self, door: Door) -> None:
+        """Load the run and start to serve pages, including those that are already waiting; return immediately."""
+        from normlift_ns.api import open_run  # noqa: PLC0415 (pages load while torch is imported)
+        from normlift_ns.session.selection import SelectionContext  # noqa: PLC0415
+        from normlift_ns.viewer.person import People  # noqa: PLC0415
+        from normlift_ns.viewer.shared import (
+            Run,  # noqa: PLC0415
+            make_records,  # noqa: PLC0415
+        )
+
+        run = open_run(
+            self.load_config,
+            data=self.data,
+            device=self.device,
+            text_vectors=self.text_vectors,
+            text_template=self.text_template,
+        )
+        space = SelectionContext(run.field, run.scene.gaussians.means.detach())
+        records = make_records(run.scene, self.most_drawn)
+        shared = Run(run.folder, run.scene, space, records, lambda: run.texts, self.share_readonly, lambda: run.votes)
+        people = People(shared)
+        door.open(f"normlift: {run.scene.name}", people.come, people.go)
+
+
+def until_stopped() -> NoReturn:
+    """Wait for Ctrl-C or SIGTERM.
+
+    The loop wakes up every second. An endless wait would miss a signal that reaches another thread, or this thread
+    just before it waits.
+    """
+    while True:
+        time.sleep(1)
+
+
+def _check_host(host: str) -> None:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"--host {host} is not an address that this machine can listen on ({error}). Leave it out to accept "
+            "connections from this machine only, or give 0.0.0.0 to accept them from other machines too."
+        ) from None
+
+
+def entrypoint() -> None:
+    """Run ns-normlift-view in a process that continues afterwards."""
+    run_command(NormLiftView)
+
+
+def main() -> None:
+    """Run ns-normlift-view as a process."""
+    run_command_process(NormLiftView)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Partition of the Gaussians among processes that lift one scene, and the interface for their communication."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from normlift_ns.core.sparse import SparseRows
+
+ProgressCallback = Callable[[str, int, int], None]
+"""Progress callback, called with (stage, steps done, total steps)."""
+VIEW_STAGES = ("features", "evidence")
+"""Stages of a lift that count views."""
+PARTITION_BLOCK = 2**13
+"""Number of consecutive Gaussians on the curve that form a block. Each process has whole blocks, so the shapes of
+products do not depend on the number of processes; their rounding may depend on shapes."""
+
+
+class Communicator:
+    """Communication between processes, implemented here for a single process.
+
+    All processes must call the same methods in the same order.
+    """
+
+    rank: int = 0
+    """Rank of this process, in 0..size-1."""
+    size: int = 1
+    """Number of processes."""
+
+    def join(self, rows: Tensor) -> Tensor:
+        """Return the concatenated rows of all processes, in every process."""
+        return rows
+
+    def deliver(self, rows: Tensor) -> list[Tensor] | None:
+        """Return the rows of every process in process 0, and None in the others."""
+        return [rows]
+
+    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        """Send parts[r] to process r, and return the parts that all processes sent to this one."""
+        return list(parts)
+
+    def add(self, values: Tensor) -> Tensor:
+        """Return the sum over all processes, in every process."""
+        return values
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Return the values of process 0 in every process; the others pass arrays of the same shape and type."""
+        return values
+
+    def tell(self, value: Any) -> Any:
+        """Return the JSON-ready object of process 0 in every process."""
+        return value
+
+    def tell_all(self, value: Any) -> list[Any]:
+        """Return the JSON-ready objects of all processes in every process."""
+        return [value]
+
+    def counted(self, report: ProgressCallback) -> ProgressCallback:
+        """Wrap a callback to report all processes in stages that count views, and process 0 in other stages."""
+        return report
+
+    @contextmanager
+    def shares(self, folder: Path) -> Iterator[None]:
+        """Provide a context in which `chunks` can be called.
+
+        Args:
+            folder: directory that all processes share.
+        """
+        yield
+
+    def chunks(self, count: int) -> Iterator[int]:
+        """Yield indices in 0..count-1 of the work items of this process; each item belongs to one process only."""
+        return iter(range(count))
+
+
+SINGLE_PROCESS = Communicator()
+"""The communication of a single process."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Partition of the Gaussians by segments of a curve through space, so most neighbors are in the same process.
+
+    Arrays of a portion have one row for each Gaussian of this process, in index order.
+
+    >>> import torch
+    >>> means = torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])
+    >>> portion = Partition.of(SINGLE_PROCESS, means)
+    >>> portion.gaussians.tolist(), portion.along.tolist()
+    ([0, 1, 2], [1, 2, 0])
+    """
+
+    team: Communicator
+    order: Int64[Tensor, " n"]
+    """Indices of all Gaussians in curve order."""
+
+    @staticmethod
+    def of(team: Communicator, means: Float[Tensor, "n 3"]) -> Partition:
+        """Partition the Gaussians with these means."""
+        return Partition(team, spatial_order(means))
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @cached_property
+    def by_owner(self) -> list[Int64[Tensor, " m"]]:
+        """Indices of the Gaussians of every process, ascending; each process has whole blocks of the curve."""
+        n, size = len(self.order), self.team.size
+        blocks = -(-n // PARTITION_BLOCK)
+        bounds = [min(n, blocks * rank // size * PARTITION_BLOCK) for rank in range(size + 1)]
+        if size == 1:
+            return [torch.arange(n, device=self.order.device)]
+        return [self.order[first:last].sort().values for first, last in pairwise(bounds)]
+
+    @property
+    def gaussians(self) -> Int64[Tensor, " m"]:
+        """Indices of the Gaussians of this process, ascending."""
+        return self.by_owner[self.team.rank]
+
+    @cached_property
+    def place(self) -> tuple[Int32[Tensor, " n"], Int32[Tensor, " n"]]:
+        """Rank that owns each Gaussian, and row of the Gaussian in that process."""
+        owner, row = (torch.empty_like(self.order, dtype=torch.int32) for _ in range(2))
+        for rank, gaussians in enumerate(self.by_owner):
+            owner[gaussians] = rank
+            row[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=self.order.device)
+        return owner, row
+
+    @cached_property
+    def along(self) -> Int64[Tensor, " m"]:
+        """Rows of the portion in curve order."""
+        if self.team.size == 1:
+            return self.order
+        first = sum(map(len, self.by_owner[: self.team.rank]))
+        return self.place[1][self.order[first : first + len(self)]].long()
+
+    def blocks(self) -> Iterator[Int64[Tensor, " b"]]:
+        """Yield the rows of the portion in curve order, one block at a time."""
+        return iter(self.along.split(PARTITION_BLOCK))
+
+    def join(self, rows: Tensor) -> Tensor:
+        """Combine the arrays of all portions into one, in index order, in every process."""
+        if self.team.size == 1:
+            return rows
+        joined = self.team.join(rows)
+        return torch.empty_like(joined).index_copy_(0, torch.cat(self.by_owner), joined)
+
+    def deliver_sparse(self, rows: SparseRows) -> SparseRows | None:
+        """Combine sparse matrices with one row per Gaussian in process 0, and return None in the others."""
+        if self.team.size == 1:
+            return rows
+        parts = [self.team.deliver(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
+        if any(part is None for part in parts):
+            return None
+        lengths, column, weight = (torch.cat(part) for part in parts if part is not None)
+        joined = SparseRows(torch.cat([lengths.new_zeros(1), lengths.cumsum(0)]), column, weight)
+        count = torch.arange(len(self.order), device=self.order.device)
+        return joined.select_rows(torch.empty_like(self.order).index_copy_(0, torch.cat(self.by_owner), count))
+
+
+def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
+    """Return the concatenated rows of all processes, in every process."""
+    lengths = team.join(rows.offsets.diff())
+    offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    return SparseRows(offsets, team.join(rows.column), team.join(rows.weight))
+
+
+def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+    """Return the indices of all Gaussians along a Morton curve, on which neighbors in space are near each other.
+
+    The curve has 1,024 steps per side. Its sides end at the 1st and 99th percentile, because far outliers would
+    otherwise put all other Gaussians into one cell.
+    """
+    sample = means[:: max(1, len(means) // 100_000)]
+    sample = sample[sample.isfinite().all(dim=1)].double()
+    if len(sample) == 0:
+        return torch.arange(len(means), device=means.device)
+    low, high = sample.quantile(sample.new_tensor([0.01, 0.99]), dim=0)
+    cell = ((means - low) / (high - low).clamp(min=1e-12) * 1023).nan_to_num(0).clamp(0, 1023).long()
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        cell = (cell | (cell << shift)) & mask
+    return (cell[:, 0] | cell[:, 1] << 1 | cell[:, 2] << 2).int().argsort(stable=True)

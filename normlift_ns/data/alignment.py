@@ -1,0 +1,215 @@
+"""Check, from a few renders before a lift, that images, cameras and Gaussians belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.scene import Scene, View
+from normlift_ns.errors import InputError
+from normlift_ns.rasterization.rasterize import render_image
+from normlift_ns.rasterization.settings import RasterSettings
+
+_MAX_RENDER_SIDE = 400
+"""Longer side of the renders in pixels."""
+_MAX_DIVISOR_AS_TRAINED = 4.0
+"""Divisor of an image's size below which it is compared with a render in the trained mode, with the rasterizer's 0.3
+square pixels scaled down. Above it, that render would be too thick. An antialiased one is used instead, which preserves
+the mean of Gaussians smaller than a pixel."""
+_SMALL_EPS2D = 0.1
+"""Square pixels that the antialiased renders add to projected Gaussians."""
+MIN_PSNR = 24.0
+"""Usual minimum in dB; real scenes reach 25 to 40 dB on their training images."""
+_FOCAL_STEP, _FOCAL_GAIN = 1.02, 1.0
+"""Factor on the focal length, and gain in dB that counts. A focal length that is 2 % off costs about 15 dB on a sharp
+scene, so 1 dB is well beyond chance."""
+_MIN_VISIBLE = 0.001
+"""Fraction of the Gaussians that at least one of the views must see."""
+
+
+class _SmallView(NamedTuple):
+    """A view at no more than 400 pixels, and the divisor of its size."""
+
+    view: View
+    divisor: float
+
+
+class Alignment(NamedTuple):
+    """Agreement between renders and images."""
+
+    psnr: float
+    """Mean over the views, in dB."""
+    worst: tuple[str, float]
+    """Name of the image with the lowest PSNR, and that PSNR in dB."""
+    in_view: float
+    """Largest fraction of the Gaussians that lies in one view, in 0..1."""
+    grey_psnr: float
+    """PSNR in dB of a constant image in the mean color of each image."""
+    focal_factor: float
+    """Factor on the focal lengths, of 1 / 1.02, 1 and 1.02, that fits best by at least 1 dB; otherwise 1."""
+
+
+def measure_alignment(scene: Scene, settings: RasterSettings | None = None, *, device: str = "cpu") -> Alignment:
+    """Render three training views at no more than 400 pixels and compare them with their images.
+
+    Args:
+        scene: Gaussians, cameras and images.
+        settings: constants of the rasterizer at full size; None: those of gsplat 1.4.
+        device: torch device to render on.
+    Raises:
+        FileNotFoundError, ValueError: if an image is missing or cannot be read.
+    """
+    views, settings = _sample_views(scene), settings or RasterSettings()
+    render = partial(_render, scene, scene.gaussians.to(device), settings)
+    visible = max(_visible_fraction(scene, small.view.camera) for small in views)
+    psnrs = {small.view.name: _psnr(small.view, render(small, 1.0)) for small in views}
+    mean, worst = sum(psnrs.values()) / len(psnrs), min(psnrs, key=lambda name: psnrs[name])
+    constant = sum(_psnr(small.view, _mean_color(small.view)) for small in views) / len(views)
+    others = {factor: _mean_psnr(render, views, factor) for factor in (1 / _FOCAL_STEP, _FOCAL_STEP)}
+    best = max(others, key=lambda factor: others[factor])
+    focal = best if others[best] > mean + _FOCAL_GAIN else 1.0
+    return Alignment(mean, (worst, psnrs[worst]), visible, constant, focal)
+
+
+def mean_psnr(scene: Scene) -> float:
+    """Return `Match.psnr` alone, in dB."""
+    return focal_psnrs(scene, [1.0])[0]
+
+
+def focal_psnrs(scene: Scene, factors: Sequence[float]) -> list[float]:
+    """Return the mean PSNR in dB on the three views for each factor on the focal lengths."""
+    views, render = _sample_views(scene), partial(_render, scene, scene.gaussians, RasterSettings())
+    return [_mean_psnr(render, views, factor) for factor in factors]
+
+
+def alignment_warning(match: Alignment, *, own_cameras: bool) -> str | None:
+    """Return a warning in whole sentences, or None if renders and images agree.
+
+    Args:
+        match: result of `measure_alignment`.
+        own_cameras: whether, as far as the files show, the splat was trained with these cameras.
+    Raises:
+        ValueError: if Gaussians and cameras are unrelated.
+    """
+    causes = (
+        "Likely causes: cameras of another capture; cameras in a different world from the splat's (give "
+        "--world-transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
+        "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
+        "training images; another --rasterize-mode or --background"
+    )
+    if own_cameras:
+        causes = (
+            "Likely causes: the images, their exposure or transforms.json have changed since the training, or the "
+            "training was stopped early"
+        )
+    if match.in_view < _MIN_VISIBLE:
+        raise InputError(
+            f"The cameras do not look at this splat: at most {match.in_view:.2%} of its Gaussians are in any of three "
+            f"training views. {causes}. --check False lifts anyway."
+        )
+    if match.psnr < match.grey_psnr and not own_cameras:
+        raise InputError(
+            f"The splat does not show what its images show: renders from three of the cameras are further from the "
+            f"images ({match.psnr:.1f} dB) than their mean color is ({match.grey_psnr:.1f} dB). {causes}. --check "
+            "False lifts anyway."
+        )
+    if match.focal_factor != 1.0:
+        return (
+            f"Focal lengths that are {abs(match.focal_factor - 1):.0%} "
+            f"{'longer' if match.focal_factor > 1 else 'shorter'} fit the images better by more than 1 dB. The cameras "
+            "may not be those of the training: has their file changed since, or were the images resized?"
+        )
+    name, lowest = match.worst
+    if match.psnr >= MIN_PSNR > lowest:
+        return (
+            f"The splat reaches only {lowest:.1f} dB on {name}, one of the three training images that were checked; "
+            f"{MIN_PSNR:.0f} dB or more is usual. Has this image or its camera changed since the training? If so, "
+            "other images may have changed too: only three are checked."
+        )
+    if match.psnr < MIN_PSNR:
+        return (
+            f"The splat reaches {match.psnr:.1f} dB on three training images; {MIN_PSNR:.0f} dB or more is usual. "
+            f"Expect equally inexact semantics. {causes}."
+        )
+    return None
+
+
+def _sample_views(scene: Scene) -> list[_SmallView]:
+    last = len(scene.train) - 1
+    views = [_shrink(scene.train[index]) for index in sorted({0, last // 2, last})]
+    usable = [small for small in views if small.view.mask is None or bool(small.view.mask.any())]
+    if len(usable) == 0:
+        raise InputError(
+            f"The masks of {', '.join(small.view.name for small in views)} leave no pixels. Expected masks that are "
+            "zero at pixels to ignore; are they inverted?"
+        )
+    return usable
+
+
+def _shrink(view: View) -> _SmallView:
+    """Shrink a view by averaging pixels, which needs no further filter."""
+    camera = view.camera
+    divisor = max(1.0, max(camera.width, camera.height) / _MAX_RENDER_SIDE)
+    width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
+    channels = view.image.permute(2, 0, 1)[None].float()
+    image = torch.nn.functional.interpolate(channels, (height, width), mode="area")[0].permute(1, 2, 0)
+    mask = view.mask
+    if mask is not None:
+        coverage = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
+        mask = coverage > 0.999
+    smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
+    return _SmallView(View(smaller, image.round().to(torch.uint8), mask, view.name), divisor)
+
+
+def _mean_psnr(render: Callable[[_SmallView, float], Tensor], views: Sequence[_SmallView], factor: float) -> float:
+    return sum(_psnr(small.view, render(small, factor)) for small in views) / len(views)
+
+
+def _render(
+    scene: Scene, gaussians: GaussianScene, settings: RasterSettings, small: _SmallView, factor: float
+) -> UInt8[Tensor, "h w 3"]:
+    """Render the scene so that it looks like a downscaled render at full size."""
+    camera = _scale_focal(small.view.camera, factor)
+    as_trained = small.divisor < _MAX_DIVISOR_AS_TRAINED
+    small_settings = replace(settings, eps2d=settings.eps2d / small.divisor**2 if as_trained else _SMALL_EPS2D)
+    mode = scene.rasterize_mode if as_trained else "antialiased"
+    return render_image(scene, camera, settings=small_settings, mode=mode, gaussians=gaussians)
+
+
+def _scale_focal(camera: Camera, factor: float) -> Camera:
+    scale = torch.tensor([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    return Camera(camera.K * scale, camera.world_to_camera, camera.width, camera.height)
+
+
+def _psnr(view: View, render: UInt8[Tensor, "h w 3"]) -> float:
+    difference = (view.image.float() - render.float()) / 255
+    if view.mask is not None:
+        difference = difference[view.mask]
+    return float(-10 * difference.square().mean().clamp(min=1e-9).log10()) if difference.numel() > 0 else 0.0
+
+
+def _mean_color(view: View) -> UInt8[Tensor, "h w 3"]:
+    pixels = view.image.float() if view.mask is None else view.image[view.mask].float()
+    color = pixels.reshape(-1, 3).mean(dim=0).nan_to_num()
+    return color.round().to(torch.uint8).expand_as(view.image)
+
+
+def _visible_fraction(scene: Scene, camera: Camera) -> float:
+    return float(in_frustum(scene.gaussians.means, camera).float().mean())
+
+
+def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
+    """Return the mask of the Gaussians whose centers lie inside the image and in front of the camera."""
+    world_to_camera = camera.world_to_camera.to(means)
+    points = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    pixels = points @ camera.K.to(means).T
+    x, y, depth = (pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2], points[:, 2])
+    return (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

@@ -1,0 +1,406 @@
+"""Safe unpickling of NumPy scalars, such as the learning rates in nerfstudio's scheduler states."""
+
+from __future__ import annotations
+
+import codecs
+import pickle
+import re
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.data.splat import SplatParameters, splat_from_parameters, validate_splat
+from normlift_ns.errors import InputError
+
+_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # the names in numpy 1 and in numpy 2
+
+
+@contextmanager
+def allow_numpy_scalars() -> Iterator[None]:
+    """Allow `torch.load(weights_only=True)` to read NumPy scalars in addition to tensors and plain containers.
+
+    torch before 2.4 cannot build NumPy scalars, so it reads each of them as None.
+    """
+    if hasattr(torch.serialization, "safe_globals"):
+        with torch.serialization.safe_globals(numpy_scalar_globals()):
+            yield
+        return
+    if hasattr(torch.serialization, "add_safe_globals"):
+        torch.serialization.add_safe_globals(numpy_scalar_globals())  # torch 2.4 cannot remove them again
+        yield
+        return
+    allowed: dict[str, Any] = torch._weights_only_unpickler._get_allowed_globals()  # pyright: ignore
+    before = dict(allowed)
+    allowed |= {"numpy.dtype": _unread_dtype, "_codecs.encode": _latin1}
+    allowed |= {f"{module}.scalar": _unread for module in _MODULES}
+    try:
+        yield
+    finally:
+        allowed.clear()
+        allowed.update(before)
+
+
+def numpy_scalar_globals() -> list[Any]:
+    """Return the types and functions that unpickle NumPy scalars, for torch's allow-list."""
+    rebuild: Any = np.float64(0).__reduce__()[0]
+    dtypes = {type(np.dtype(code)) for code in "?bBhHiIlLqQefd"}
+    return [
+        np.dtype,
+        *dtypes,
+        _renamed(_latin1, "_codecs", "encode"),
+        *(_renamed(rebuild, module, "scalar") for module in _MODULES),
+    ]
+
+
+def _latin1(text: str, encoding: str) -> bytes:
+    """Encode text as pickle encodes bytes. Other encodings could expand a small file to gigabytes."""
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"bytes in the encoding {encoding}")
+    return codecs.latin_1_encode(text)[0]
+
+
+def _unread(*_: object) -> None:
+    """Stand-in for a NumPy scalar."""
+
+
+def _unread_dtype(*_: object) -> torch.nn.Parameter:
+    """Stand-in for a NumPy dtype: the only kind of object with a custom state that old torch versions build."""
+    stand_in: Any = torch.nn.Parameter(torch.empty(0))
+    stand_in.__setstate__ = _unread
+    return stand_in
+
+
+def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[..., Any]:
+    """Return the function under another name, because torch's allow-list compares names."""
+
+    def alias(*args: Any) -> Any:
+        return function(*args)
+
+    alias.__module__, alias.__name__, alias.__qualname__ = module, name, name
+    return alias
+
+
+# Safe reading of nerfstudio checkpoints, which runs no code from the file.
+
+
+GAUSSIAN_PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
+_PREFIX = "gauss_params."
+_MAX_STEP = 10**9
+
+
+class Checkpoint(NamedTuple):
+    """Step and model state of a trained run."""
+
+    path: Path
+    step: int
+    model: dict[str, Tensor]
+    """State of the model on the CPU: gauss_params.* in float32, camera_optimizer.*, …, without optimizers and LPIPS."""
+
+
+def find_checkpoint(folder: Path, step: int | None = None) -> Path:
+    """Return the checkpoint of a step; None: of the last step.
+
+    Raises:
+        FileNotFoundError: if there is no checkpoint, or none of that step; the message lists the steps that exist.
+    """
+    steps = {path: _step_of(path) for path in sorted(folder.glob("step-*.ckpt"))}
+    checkpoints = {number: path for path, number in steps.items() if number is not None}
+    if not checkpoints:
+        raise FileNotFoundError(
+            f"No checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes every "
+            "--steps-per-save steps and at the end; copy it there, or finish the training."
+        )
+    if step is None:
+        return checkpoints[max(checkpoints)]
+    if step not in checkpoints:
+        raise FileNotFoundError(
+            f"No checkpoint of step {step} in {folder}; it has the steps {', '.join(map(str, sorted(checkpoints)))}. "
+            "Give one of them with --load-step, or omit it for the last step."
+        )
+    return checkpoints[step]
+
+
+def _step_of(path: Path) -> int | None:
+    """Return the step in a file name of nerfstudio's form; None for other names, and for anything but a file."""
+    number = path.name.removeprefix("step-").removesuffix(".ckpt")
+    return int(number) if path.name == f"step-{number}.ckpt" and number.isdecimal() and path.is_file() else None
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read step and model of a splatfacto checkpoint, full or slim; optimizer states stay on disk.
+
+    Gaussians in float16, bfloat16 or float64 become float32, as in nerfstudio. Gaussians that are not finite stay, and
+    are never drawn.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is truncated, damaged, not a splatfacto checkpoint or without Gaussians, or its step is
+            invalid or differs from its name.
+    """
+    advice = "give another checkpoint with --load-step"
+    loaded = load_torch_archive(path, "as ns-train splatfacto writes them", advice)
+    state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+    if not isinstance(state, dict) or "step" not in loaded:
+        keys = sorted(map(str, loaded)) if isinstance(loaded, dict) else type(loaded).__name__
+        raise InputError(f"{path} is not a nerfstudio checkpoint: expected `step` and `pipeline` in it, found {keys}.")
+    step = validate_step(loaded["step"], path)
+    model = _model_state(state, path)
+    missing = [_PREFIX + name for name in GAUSSIAN_PARAMETERS if _PREFIX + name not in model]
+    if missing:
+        raise InputError(
+            f"{path} does not hold splatfacto Gaussians: {', '.join(missing)} missing. "
+            "Train the capture with: ns-train splatfacto --data ..."
+        )
+    splat = splat_from_parameters({name: model[_PREFIX + name] for name in GAUSSIAN_PARAMETERS}, path)
+    return Checkpoint(path, step, model | {_PREFIX + name: value for name, value in splat.parameters.items()})
+
+
+def validate_step(step: Any, path: Path) -> int:
+    """Validate and return a training step.
+
+    Raises:
+        ValueError: if the step is not a whole number in range, or not the step in the file name.
+    """
+    if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
+        raise InputError(
+            f"{path}: its step is {str(step)[:40]} ({type(step).__name__}), expected a whole number from 0 to "
+            f"{_MAX_STEP:,}. Copy it again, or give another checkpoint with --load-step."
+        )
+    expected = _step_of(path)
+    if expected is not None and expected != step:
+        raise InputError(
+            f"{path} was saved at step {step}, which is not the step in its name. Rename it to step-{step:09d}.ckpt, "
+            "or give another checkpoint with --load-step."
+        )
+    return step
+
+
+def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
+    """Load a file written by torch.save, memory-mapped on the CPU.
+
+    Only tensors, plain containers and NumPy scalars are unpickled (`weights_only=True` plus the allow-list of
+    `unpickling`), so a file from a stranger runs no code.
+
+    Args:
+        path: the file.
+        writer: clause for error messages that names the writer of such files.
+        advice: for error messages, an alternative to copying the file again.
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is truncated or damaged, or holds other Python objects.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file {path}. Expected a file written by torch.save; {advice}.")
+    _check_archive(path, advice)
+    try:
+        with allow_numpy_scalars(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "TypedStorage is deprecated")  # torch 2.1 itself uses TypedStorage
+            return torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        match = re.search(r"(?:GLOBAL|Unsupported class) (\S+)", str(error))
+        raise InputError(
+            f"{path} is rejected because it holds Python objects{f' ({match[1]})' if match else ''}: expected only "
+            f"tensors and numbers, {writer}. {advice[0].upper()}{advice[1:]}."
+        ) from error
+    except Exception as error:  # torch does not document its exceptions for files that torch.save did not write
+        raise InputError(
+            f"{path} is damaged ({str(error).strip().split('. ')[0]}). Copy it again, or {advice}."
+        ) from error
+
+
+def _check_archive(path: Path, advice: str) -> None:
+    """Check the sizes and the CRC-32 of every tensor, which torch.load ignores; torch.save never compresses."""
+    size = path.stat().st_size
+    try:
+        if not zipfile.is_zipfile(path):
+            raise InputError(
+                f"{path} is truncated or not a checkpoint: its {size:,} bytes are not a ZIP archive as torch.save "
+                f"writes it. Copy it again, or {advice}."
+            )
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            is_compressed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
+            if is_compressed or sum(entry.file_size for entry in entries) > size:
+                raise InputError(
+                    f"{path} declares more content than its {size:,} bytes, or holds compressed entries, which "
+                    f"torch.save never writes. Copy it again, or {advice}."
+                )
+            damage = archive.testzip()
+    except InputError:
+        raise
+    except Exception as error:  # zipfile raises any kind of exception on a damaged file
+        damage = str(error)
+    if damage is not None:
+        raise InputError(
+            f"{path} is damaged ({damage}): a checksum does not match its content. Copy it again, or {advice}."
+        )
+
+
+def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
+    """Return the model's tensors by their names on one GPU; training on several GPUs prefixes names with `module.`."""
+    state: dict[str, Tensor] = {}
+    for name, value in pipeline.items():
+        if not isinstance(name, str):
+            raise InputError(
+                f"{path}: `pipeline` has the key {str(name)[:40]} ({type(name).__name__}), expected tensor names. "
+                "Copy it again, or give another checkpoint with --load-step."
+            )
+        _, model, rest = name.removeprefix("module.").partition("_model.")
+        rest = rest.removeprefix("module.")
+        if not model or not isinstance(value, Tensor) or rest.startswith("lpips."):
+            continue
+        if rest in state:
+            raise InputError(f"{path} holds {rest} twice. Expected every tensor once; copy it again.")
+        check_dense_tensor(value, rest, path)
+        state[rest] = value.detach().clone()
+    return state
+
+
+def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
+    """Raise if a tensor would take more memory than it has storage, or is not a plain array of real numbers.
+
+    Raises:
+        ValueError: if the tensor is sparse, quantized, complex, nested, not on the CPU or larger than its storage, for
+            example because it repeats its content.
+    """
+    if (
+        value.layout != torch.strided
+        or value.device.type != "cpu"
+        or value.is_quantized
+        or value.is_complex()
+        or value.is_nested
+        or value.numel() * value.element_size() > value.untyped_storage().nbytes()
+    ):
+        raise InputError(
+            f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on {value.device} that "
+            "is not stored as a dense array. Expected plain tensors, as trainers save them; save the file again."
+        )
+
+
+# Checkpoints of gsplat's simple_trainer.
+
+
+_RANK = re.compile(r"(ckpt_\d+_rank)(\d+)(\.pt)")
+_ADVICE = "give another file with --load-gsplat"
+_UNSUPPORTED = {
+    "app_module": "an appearance network (--app_opt), without which its Gaussians have no colors",
+}
+
+
+class GsplatCheckpoint(NamedTuple):
+    """Contents of a gsplat checkpoint."""
+
+    files: tuple[Path, ...]
+    """One file per GPU of the training."""
+    step: int
+    splat: SplatParameters
+    pose_adjust: Float[Tensor, "v 9"] | None
+    """Pose adjustment of each training view: a translation, and a rotation in six numbers."""
+
+
+def read_gsplat_checkpoint(path: Path) -> GsplatCheckpoint:
+    """Read ckpt_<step>_rank<r>.pt; after training on several GPUs, read the files of all ranks, in order.
+
+    Raises:
+        FileNotFoundError: if there is no such file, or a rank is missing.
+        ValueError: if a file is damaged, comes from another trainer or training run, or needs an appearance network, or
+            if the Gaussians cannot be drawn.
+    """
+    files = _rank_files(path)
+    loaded = [_read_rank(file) for file in files]
+    steps = {step for step, _, _ in loaded}
+    if len(steps) > 1:
+        raise InputError(
+            f"{files[0].parent} has ranks of different steps: {', '.join(map(str, sorted(steps)))}. Expected the files "
+            "of one training run; put them into a separate folder."
+        )
+    splats = [splat_from_parameters(tensors, file) for file, (_, tensors, _) in zip(files, loaded)]
+    if len({splat.degree for splat in splats}) > 1:
+        raise InputError(
+            f"{files[0].parent} has ranks with different spherical harmonics. Expected the files of one training run; "
+            "put them into a separate folder."
+        )
+    names = splats[0].parameters
+    merged = SplatParameters(**{name: torch.cat([splat.parameters[name] for splat in splats]) for name in names})
+    validate_splat(merged, files[0])
+    return GsplatCheckpoint(files, steps.pop(), merged, loaded[0][2])
+
+
+def _rank_files(path: Path) -> tuple[Path, ...]:
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"There is no checkpoint at {path}. With --load-gsplat, give a file that gsplat's simple_trainer wrote, "
+            "for example results/garden/ckpts/ckpt_29999_rank0.pt."
+        )
+    match = _RANK.fullmatch(path.name)
+    if match is None:
+        return (path,)
+    ranks = {
+        int(other[2]): file
+        for file in sorted(path.parent.iterdir())
+        if (other := _RANK.fullmatch(file.name)) is not None and other[1] == match[1] and file.is_file()
+    }
+    if max(ranks) >= len(ranks):
+        missing = next(rank for rank in range(len(ranks)) if rank not in ranks)
+        raise FileNotFoundError(
+            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {missing}. Every "
+            "rank holds a part of the Gaussians; copy all files of the training run."
+        )
+    return tuple(ranks[rank] for rank in sorted(ranks))
+
+
+def _read_rank(path: Path) -> tuple[int, dict[str, Tensor], Tensor | None]:
+    """Read the step, the parameters by splatfacto's names, and the pose adjustments."""
+    loaded = load_torch_archive(path, "as gsplat's simple_trainer writes them", _ADVICE)
+    splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
+    if not isinstance(splats, Mapping):
+        keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__
+        hint = "; for a nerfstudio run, give its config.yml with --load-config" if "pipeline" in keys else ""
+        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats` in it, found {keys}{hint}.")
+    for key, meaning in _UNSUPPORTED.items():
+        if key in loaded:
+            raise InputError(
+                f"{path} holds `{key}`: {meaning}. Train it again without that option, or export a PLY file with the "
+                "trainer's --save_ply and give that with --load-ply."
+            )
+    missing = [name for name in ("means", "quats", "scales", "opacities", "sh0", "shN") if name not in splats]
+    if missing or not all(isinstance(value, Tensor) for value in splats.values()):
+        raise InputError(
+            f"{path} has no {', '.join(missing) or 'tensors'} in its `splats`, which holds "
+            f"{', '.join(sorted(map(str, splats)))}. Expected the parameters of 3D Gaussians with spherical harmonics, "
+            "as gsplat's simple_trainer writes them."
+        )
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        check_dense_tensor(splats[name], name, path)
+    if splats["sh0"].ndim != 3 or splats["sh0"].shape[1:] != (1, 3) or splats["opacities"].ndim != 1:
+        raise InputError(
+            f"{path}: sh0 has shape {tuple(splats['sh0'].shape)} and opacities {tuple(splats['opacities'].shape)}, "
+            "expected (N, 1, 3) and (N,)."
+        )
+    parameters = {name: splats[name] for name in ("means", "quats", "scales")}
+    parameters["opacities"] = splats["opacities"][:, None]
+    parameters["features_dc"], parameters["features_rest"] = splats["sh0"][:, 0], splats["shN"]
+    return validate_step(loaded.get("step", 0), path), parameters, _pose_adjust(path, loaded)
+
+
+def _pose_adjust(path: Path, loaded: Mapping[str, Any]) -> Float[Tensor, "v 9"] | None:
+    state = loaded.get("pose_adjust")
+    if state is None:
+        return None
+    deltas = state.get("embeds.weight") if isinstance(state, Mapping) else None
+    if isinstance(deltas, Tensor):
+        check_dense_tensor(deltas, "pose_adjust", path)
+    if not isinstance(deltas, Tensor) or deltas.ndim != 2 or deltas.shape[1] != 9 or not bool(deltas.isfinite().all()):
+        raise InputError(
+            f"{path}: its `pose_adjust` is not what gsplat's --pose_opt writes. Expected embeds.weight with finite "
+            f"numbers of shape (views, 9); {_ADVICE}."
+        )
+    return deltas.double()

@@ -1,0 +1,279 @@
+"""COLMAP reconstructions in text and binary format."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from normlift_ns.data.frames import Intrinsics
+from normlift_ns.errors import InputError
+
+_INTRINSICS = {
+    "SIMPLE_PINHOLE": lambda f, cx, cy: (f, f, cx, cy, {}),
+    "PINHOLE": lambda fx, fy, cx, cy: (fx, fy, cx, cy, {}),
+    "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, {"k1": k}),
+    "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, {"k1": k1, "k2": k2}),
+    "OPENCV": lambda fx, fy, cx, cy, k1, k2, p1, p2: (fx, fy, cx, cy, {"k1": k1, "k2": k2, "p1": p1, "p2": p2}),
+}
+"""COLMAP's camera models: functions from their parameters to fx, fy, cx, cy and distortion."""
+_MODEL_SIZES = (
+    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)  # fmt: skip
+"""Camera models in the order of their IDs in binary files, each with its number of parameters."""
+_MAX_SIDE, _MAX_VALUE = 2**16, 1e30
+_MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+_ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
+
+
+def find_colmap_model(folder: Path) -> Path:
+    """Return the folder of the reconstruction: the given folder, its sparse/0 or a similar subfolder.
+
+    Raises:
+        FileNotFoundError: if none of them holds a reconstruction; the message lists them.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"There is no folder {folder}. Give the folder of the COLMAP project, which holds images and sparse/0, "
+            "with --colmap."
+        )
+    for subfolder in _MODEL_FOLDERS:
+        if any((folder / subfolder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
+            return folder / subfolder
+    raise FileNotFoundError(
+        f"{folder} holds no COLMAP reconstruction: neither it nor its {', '.join(_MODEL_FOLDERS[1:])} contains "
+        "cameras.bin or cameras.txt. Give the folder that holds sparse/0 with --colmap."
+    )
+
+
+class ColmapCamera(NamedTuple):
+    """A camera as stored in the file."""
+
+    camera_id: int
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+class ColmapImage(NamedTuple):
+    """A registered image as stored in the file, with a world-to-camera pose in OpenCV convention."""
+
+    image_id: int
+    name: str
+    rotation: list[float]
+    """Quaternion w, x, y, z."""
+    translation: list[float]
+    camera: int
+
+
+def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
+    """Read the cameras, by ID, and the registered images, in file order.
+
+    Args:
+        model: folder of the reconstruction.
+        text_first: if both formats exist, read the text files, as nerfstudio does; otherwise read the binary files, as
+            COLMAP does.
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if a file is damaged or holds duplicate IDs, impossible image sizes, poses that are not finite, no
+            images, or an image without its camera.
+    """
+    as_text = text_first and (model / "cameras.txt").exists()
+    cameras: dict[int, ColmapCamera] = {}
+    for camera in _read(model, "cameras", _cameras_text, _cameras_binary, as_text):
+        if camera.camera_id in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
+            raise InputError(
+                f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels is listed "
+                f"twice, or its sides are not 1 to {_MAX_SIDE:,} pixels. {_ADVICE}"
+            )
+        if not (np.abs(camera.parameters) < _MAX_VALUE).all():
+            raise InputError(
+                f"{model}: camera {camera.camera_id} has the parameters {camera.parameters}. Expected finite numbers "
+                f"below {_MAX_VALUE:g}. {_ADVICE}"
+            )
+        cameras[camera.camera_id] = camera
+    images = _read(model, "images", _images_text, _images_binary, as_text)
+    for image in images:
+        pose = np.array([*image.rotation, *image.translation])
+        if not (np.abs(pose) < _MAX_VALUE).all() or not np.any(pose[:4]):
+            raise InputError(
+                f"{model}: the pose of {image.name} is not finite, or its quaternion is zero: {image.rotation} "
+                f"{image.translation}. {_ADVICE}"
+            )
+    orphans = [image for image in images if image.camera not in cameras]
+    if orphans or len(images) == 0:
+        problem = f"{orphans[0].name} needs camera {orphans[0].camera}, which is missing" if orphans else "no image"
+        raise InputError(
+            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected a camera "
+            "for every image; copy the whole reconstruction again."
+        )
+    if len({image.image_id for image in images}) < len(images):
+        raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
+    return cameras, images
+
+
+def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
+    """Return the intrinsics of a camera.
+
+    Raises:
+        ValueError: if `normlift_ns` cannot undistort images of this camera model.
+    """
+    if camera.model not in _INTRINSICS:
+        raise InputError(
+            f"{model}: camera {camera.camera_id} has the model {camera.model}; supported models are "
+            f"{', '.join(_INTRINSICS)}. Undistort the images with: colmap image_undistorter, train the scene on those, "
+            "and give that folder."
+        )
+    fx, fy, cx, cy, distortion = _INTRINSICS[camera.model](*camera.parameters)
+    return Intrinsics(fx, fy, cx, cy, camera.width, camera.height, **distortion)
+
+
+def colmap_pose(image: ColmapImage) -> Float[np.ndarray, "3 4"]:
+    """Return the camera-to-world pose in OpenGL convention."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (nerfstudio runs do not need SciPy)
+
+    matrix = Rotation.from_quat(np.roll(image.rotation, -1)).as_matrix()  # SciPy has w last
+    return np.concatenate([matrix.T * [1.0, -1.0, -1.0], -matrix.T @ np.array(image.translation)[:, None]], axis=1)
+
+
+def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:
+    """Read the points of the reconstruction, sorted by their IDs.
+
+    Raises:
+        FileNotFoundError: if there is no points3D file.
+        ValueError: if the file is damaged or holds points that are not finite.
+    """
+    positions = dict(_read(model, "points3D", _points_text, _points_binary))
+    points = np.array([positions[point_id] for point_id in sorted(positions)], dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(points).all():
+        raise InputError(f"{model}: points3D has coordinates that are NaN or infinite. {_ADVICE}")
+    return points
+
+
+def _read(
+    model: Path,
+    name: str,
+    parse_text: Callable[[list[str]], Iterator[Any]],
+    parse_binary: Callable[[_ByteReader], Iterator[Any]],
+    as_text: bool = False,
+) -> list[Any]:
+    path = model / f"{name}.bin"
+    if as_text or not path.is_file():
+        path = model / f"{name}.txt"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{model} has neither {name}.bin nor {name}.txt. Expected cameras, images and points3D, as COLMAP's mapper "
+            f"writes them. {_ADVICE}"
+        )
+    try:
+        if path.suffix == ".bin":
+            data = _ByteReader(path.read_bytes())
+            entries = list(parse_binary(data))
+            data.check_end()
+            return entries
+        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines()]
+        return list(parse_text([line for line in lines if not line.startswith("#")]))
+    except (ValueError, IndexError, struct.error, KeyError, OverflowError) as error:
+        raise InputError(f"{path} is damaged or not a COLMAP file ({error}). {_ADVICE}") from error
+
+
+class _ByteReader:
+    """Sequential reader of little-endian binary data."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.offset = data, 0
+
+    def unpack(self, code: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{code}", self.data, self.offset)
+        self.offset += struct.calcsize(f"<{code}")
+        return values
+
+    def string(self) -> str:
+        end = self.data.index(b"\0", self.offset)
+        value = self.data[self.offset : end].decode("utf8")
+        self.offset = end + 1
+        return value
+
+    def skip(self, count: int) -> None:
+        if self.offset + count > len(self.data):
+            raise InputError(f"it ends after {len(self.data):,} bytes")
+        self.offset += count
+
+    def count(self) -> int:
+        """Read the number of entries that follow. Each takes at least eight bytes, which exposes a damaged number."""
+        number = self.unpack("Q")[0]
+        if number > len(self.data) // 8:
+            raise InputError(f"it declares {number:,} entries, but has {len(self.data):,} bytes")
+        return number
+
+    def check_end(self) -> None:
+        if self.offset != len(self.data):
+            raise InputError(f"{len(self.data) - self.offset:,} bytes too many")
+
+
+def _cameras_binary(data: _ByteReader) -> Iterator[ColmapCamera]:
+    for _ in range(data.count()):
+        camera_id, model_id, width, height = data.unpack("iiQQ")
+        if not 0 <= model_id < len(_MODEL_SIZES):
+            raise InputError(f"camera {camera_id} has the unknown model ID {model_id}")
+        name, count = _MODEL_SIZES[model_id]
+        yield ColmapCamera(camera_id, name, width, height, data.unpack(f"{count}d"))
+
+
+def _cameras_text(lines: list[str]) -> Iterator[ColmapCamera]:
+    counts = dict(_MODEL_SIZES)
+    for line in filter(None, lines):
+        camera_id, name, width, height, *parameters = line.split()
+        if name in counts and len(parameters) != counts[name]:
+            raise InputError(f"camera {camera_id} has {len(parameters)} parameters, {name} needs {counts[name]}")
+        yield ColmapCamera(int(camera_id), name, int(width), int(height), tuple(map(float, parameters)))
+
+
+def _images_binary(data: _ByteReader) -> Iterator[ColmapImage]:
+    for _ in range(data.count()):
+        image_id, *pose, camera_id = data.unpack("I7dI")
+        name = data.string()
+        data.skip(24 * data.unpack("Q")[0])
+        yield ColmapImage(image_id, name, pose[:4], pose[4:], camera_id)
+
+
+def _images_text(lines: list[str]) -> Iterator[ColmapImage]:
+    iterator = iter(lines)
+    for line in iterator:
+        if line == "":
+            continue
+        points = next(iterator, "").split()  # the next line lists the image's points and may be empty
+        if len(points) % 3 != 0 or not all(_is_number(point) for point in points[:9]):
+            raise InputError(f"the line after that of {line.split()[-1]} does not list points as x, y and point ID")
+        image_id, *values, camera_id, name = line.split(maxsplit=9)
+        pose = list(map(float, values))
+        yield ColmapImage(int(image_id), name, pose[:4], pose[4:], int(camera_id))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _points_binary(data: _ByteReader) -> Iterator[tuple[int, tuple[float, ...]]]:
+    for _ in range(data.count()):
+        point_id, *position = data.unpack("Q3d")
+        data.skip(3 + 8)
+        data.skip(8 * data.unpack("Q")[0])
+        yield point_id, tuple(position)
+
+
+def _points_text(lines: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
+    for line in filter(None, lines):
+        point_id, x, y, z, *_ = line.split(maxsplit=4)
+        yield int(point_id), (float(x), float(y), float(z))

@@ -1,0 +1,171 @@
+"""Extra images: taken after the training and registered together with the training images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.scene import View, Views
+from normlift_ns.data.cameras import CameraFile, read_camera_file
+from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
+from normlift_ns.data.images import ImageViews
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.data.open_splat import SplatScene
+from normlift_ns.data.transforms import read_transforms, relative_name
+from normlift_ns.errors import InputError
+from normlift_ns.options import SplatOptions
+
+EXTRA_IMAGES_FILE = "added_photographs.json"
+"""File in a lifted nerfstudio run: cameras of the added images, in the world of its Gaussians."""
+_MAX_SHIFT, _MAX_ROTATION = 1e-3, 0.1
+"""Largest change of a known camera: a fraction of the extent of all cameras, and degrees."""
+_Scene = TypeVar("_Scene", NerfstudioScene, SplatScene)
+
+
+class _ConcatenatedViews:
+    """`Views` of two datasets, one after the other."""
+
+    def __init__(self, first: Views, second: Views) -> None:
+        self._first, self._second = first, second
+        self.names = [*first.names, *second.names]
+        self.cameras = [*first.cameras, *second.cameras]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int, /) -> View:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"view {index} of {len(self)}")
+        index %= len(self)
+        first = self._first
+        return first[index] if index < len(first) else self._second[index - len(first)]
+
+
+def add_extra_images(scene: _Scene, cameras: Path, images: Path | None = None) -> _Scene:
+    """Return the scene with extra images among its training views.
+
+    The camera file must contain images of the scene too. Their names show which images are new, and their cameras align
+    the file's world with the scene's. Images that were held out of the training are not new.
+
+    Args:
+        scene: the scene to extend.
+        cameras: folder of a COLMAP project, or a transforms.json, with old and new images.
+        images: folder of the images; None: as in `SplatOptions.images`.
+    Raises:
+        FileNotFoundError, ValueError: as in `open_splat`; or if there is no new image, there are fewer than two known
+            images, or known cameras have moved relative to each other. The message names the image.
+    """
+    path = cameras.absolute()
+    is_transforms = path.suffix == ".json" or (path / "transforms.json").is_file()
+    options = (
+        SplatOptions(transforms=path, images=images) if is_transforms else SplatOptions(colmap=path, images=images)
+    )
+    extended = read_camera_file(options, f"remove them from {path}")
+    known = _known_cameras(scene)
+    new = [frame for frame in extended.frames if _key(frame.name) not in known]
+    if len(new) == 0:
+        raise InputError(
+            f"All images in {extended.source} already belong to {scene.name}. Give a camera file that contains both "
+            "new and old images, or omit --add-images."
+        )
+    world = _align(extended, known)
+    base = scene.photographs if isinstance(scene, SplatScene) else scene.location.folder
+    placed = [replace(frame, name=relative_name(frame.file, base)) for frame in transform_frames(new, world)]
+    placed.sort(key=lambda frame: frame.file)  # the order in which a lifted run reads them
+    identity = {**scene.identity, "added_photographs": [frame.name for frame in placed]}
+    return replace(_with_frames(scene, placed), identity=identity)
+
+
+def _with_frames(scene: _Scene, frames: Sequence[Frame]) -> _Scene:
+    """Return the scene with more training views, whose cameras are in its world.
+
+    Raises:
+        FileNotFoundError, ValueError: if an image is missing or cannot be read.
+    """
+    views = ImageViews(frames, scene.background)
+    remarks = (*scene.remarks, *views.check_files())
+    if isinstance(scene, SplatScene):
+        train = sorted([*scene.train.frames, *frames], key=lambda frame: frame.file)
+        return replace(scene, train=ImageViews(train, scene.background), remarks=remarks)
+    return replace(scene, train=_ConcatenatedViews(scene.train, views), remarks=remarks, added=tuple(frames))
+
+
+def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:
+    """Return the scene of a lifted run with the extra images that the run stores, if any.
+
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
+    """
+    path = run_dir / EXTRA_IMAGES_FILE
+    if not path.is_file():
+        return scene
+    added = read_transforms(path, base=scene.location.folder, advice="put them back, or lift without --add-images")
+    check_frames(added.frames, path)
+    return _with_frames(scene, added.frames)
+
+
+def _key(name: str) -> str:
+    """Return the part of an image name that all camera files share: without the top folder images/ or images_4/.
+
+    >>> _key("images_4/left/0001.jpg"), _key("0001.jpg")
+    ('left/0001.jpg', '0001.jpg')
+    """
+    first, *rest = PurePosixPath(name).parts
+    return "/".join(rest) if len(rest) > 0 and first.startswith("images") else name
+
+
+def _known_cameras(scene: NerfstudioScene | SplatScene) -> dict[str, Camera]:
+    splits = (scene.train, scene.held_out)
+    return {_key(name): camera for views in splits for name, camera in zip(views.names, views.cameras)}
+
+
+def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
+    """Return the similarity from the file's world to the scene's, from the cameras that both have.
+
+    Raises:
+        ValueError: if there are fewer than two such cameras, or some have moved relative to each other.
+    """
+    old = [frame for frame in extended.frames if _key(frame.name) in known]
+    source = np.stack([frame.pose for frame in old]) if len(old) > 0 else np.zeros((0, 3, 4))
+    target = np.array([_opengl_pose(known[_key(frame.name)]).numpy() for frame in old]).reshape(-1, 3, 4)
+    centered_source, centered_target = (
+        poses[:, :, 3] - poses[:, :, 3].sum(axis=0) / max(1, len(old)) for poses in (source, target)
+    )
+    extent = float(np.linalg.norm(centered_target, axis=1).max(initial=0.0))
+    if len(old) < 2 or extent == 0 or not np.linalg.norm(centered_source) > 0:
+        raise InputError(
+            f"{extended.source} has {len(old)} of the {len(known)} images of the scene, such as {next(iter(known))}. "
+            "Expected at least two, at different positions, to locate the new cameras. Give a camera file that "
+            "contains both new and old images."
+        )
+    u, _, vt = np.linalg.svd(np.einsum("vij,vkj->ik", target[:, :, :3], source[:, :, :3]))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    scale = float((centered_target * (centered_source @ rotation.T)).sum() / (centered_source**2).sum())
+    translation = target[:, :, 3].mean(axis=0) - scale * rotation @ source[:, :, 3].mean(axis=0)
+    shifts = np.linalg.norm(scale * source[:, :, 3] @ rotation.T + translation - target[:, :, 3], axis=1) / extent
+    cosines = (np.einsum("ij,vjk,vik->v", rotation, source[:, :, :3], target[:, :, :3]) - 1) / 2
+    angles = np.degrees(np.arccos(cosines.clip(-1, 1)))
+    worst = int(np.argmax(np.maximum(shifts / _MAX_SHIFT, angles / _MAX_ROTATION)))
+    if not (shifts[worst] <= _MAX_SHIFT and angles[worst] <= _MAX_ROTATION and 0 < scale < math.inf):
+        raise InputError(
+            f"The worlds differ: in {extended.source}, the camera of {old[worst].name} has moved since the training, "
+            f"by {shifts[worst]:.2%} of the extent of the cameras and {angles[worst]:.2g} degrees ({len(old)} old "
+            "images were compared). Register new images without moving old ones (COLMAP: image_registrator on the old "
+            "model, no bundle adjustment). Cameras that the training itself optimized have moved too."
+        )
+    return WorldTransform(np.concatenate([rotation, translation[:, None] / scale], axis=1), scale)
+
+
+def _opengl_pose(camera: Camera) -> Float[Tensor, "3 4"]:
+    """Return a camera-to-world pose with x right, y up, z backward."""
+    pose = torch.linalg.inv(camera.world_to_camera.double())[:3]
+    return pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0])

@@ -1,0 +1,537 @@
+"""Allow-list of the classes that a config.yml may name, and its safe YAML loader and dumper."""
+
+from __future__ import annotations
+
+import os
+import types
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from normlift_ns.data.nerfstudio.config_classes import (
+    CONFIG_CLASS_NAMES,
+    CONFIG_CLASSES,
+    EventName,
+    FullImageDatamanagerConfig,
+    OptimizerConfig,
+    SchedulerConfig,
+    SplatfactoModelConfig,
+    SupportedDataParserConfig,
+    Target,
+    TrainerConfig,
+    intern_target,
+)
+from normlift_ns.errors import InputError
+from normlift_ns.options import LiftOptions, RefineConfig
+
+OBJECT_TAG = "tag:yaml.org,2002:python/object"
+_NAME_TAG, _TUPLE_TAG = "tag:yaml.org,2002:python/name:", "tag:yaml.org,2002:python/tuple"
+
+
+def _default_target(cls: type) -> str | None:
+    """Return the class that a configuration class names as its `_target`."""
+    target = {field.name: field for field in fields(cls)}.get("_target")
+    if target is None:
+        return None
+    factory: Any = target.default_factory
+    return factory().name
+
+
+def _target_name(name: str, cls: type) -> str | None:
+    target = _default_target(cls)
+    return name.removesuffix("Config") if target and name.startswith("normlift_ns.plugin.") else target
+
+
+CONFIG_TARGETS: dict[str, str | None] = {name: _target_name(name, cls) for name, cls in CONFIG_CLASSES.items()}
+"""Names of the configuration classes, and of the classes that they instantiate."""
+_TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
+_PATHS = {f"pathlib.{name}" for name in ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath", "Path")}
+
+
+class ConfigLoader(yaml.SafeLoader):
+    """YAML loader that constructs the parts of splatfacto's configs and rejects everything else.
+
+    nerfstudio reads config.yml with `yaml.Loader`, which imports any module and calls any function that the file names.
+    This loader imports nothing and calls only the constructors of paths and of one enum; objects are instances of the
+    mirrors of nerfstudio's classes.
+    """
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Reject merge keys (`<<`). Configs do not use them, and a few nested ones would fill the memory."""
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:merge":
+                raise _error("<< is not part of a configuration", key)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping, and reject duplicate keys."""
+        mapping = super().construct_mapping(node, deep)
+        if len(mapping) < len(node.value):
+            raise _error("a key is listed twice", node)
+        return mapping
+
+
+def _error(problem: str, node: yaml.Node) -> yaml.constructor.ConstructorError:
+    return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+
+
+def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
+    if name not in CONFIG_TARGETS or not isinstance(node, yaml.MappingNode):
+        kind = "one of the supported data parsers" if name.endswith("DataParserConfig") else "part of a configuration"
+        raise _error(f"{name} is not {kind}", node)
+    cls: Any = CONFIG_CLASSES[name]
+    target = CONFIG_TARGETS[name]
+    config = cls.__new__(cls)
+    yield config
+    values = loader.construct_mapping(node, deep=True)
+    known = {field.name: field for field in fields(cls)}
+    if "_target" in known and target is not None:
+        stored = values.get("_target", Target(target))
+        if stored != Target(target) or not isinstance(stored, Target):
+            stored_name = stored.name.rpartition(".")[2] if isinstance(stored, Target) else type(stored).__name__
+            raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
+        values["_target"] = intern_target(
+            _default_target(cls) or target
+        )  # the current name instead of that of version 0.1
+    if hasattr(config, "__setstate__"):
+        config.__setstate__(values)  # translates the field names of version 0.1
+        values = dict(vars(config))
+    vars(config).clear()
+    for key, field in known.items():  # fields that only newer nerfstudio versions have are dropped
+        if key in values:
+            vars(config)[key] = values[key]
+        elif field.default is not MISSING:
+            vars(config)[key] = field.default  # a field that the writer's version did not have
+        else:
+            raise _error(f"{name} has no {key}", node)
+
+
+def _construct_call(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
+    if not isinstance(node, yaml.SequenceNode) or name not in {*_PATHS, CONFIG_CLASS_NAMES[EventName]}:
+        raise _error(f"{name} is not part of a configuration", node)
+    parts = loader.construct_sequence(node, deep=True)
+    if not all(isinstance(part, str) for part in parts):
+        raise _error(f"the arguments of {name} are not text", node)
+    return Path(*parts) if name in _PATHS else EventName(*parts)  # paths of another operating system work too
+
+
+def _construct_name(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
+    if name not in _TARGETS:
+        raise _error(f"{name} is not part of a configuration", node)
+    return intern_target(name)
+
+
+def _construct_tuple(loader: ConfigLoader, node: Any) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}:", _construct_object)
+ConfigLoader.add_multi_constructor(f"{OBJECT_TAG}/apply:", _construct_call)
+ConfigLoader.add_multi_constructor(_NAME_TAG, _construct_name)
+ConfigLoader.add_constructor(_TUPLE_TAG, _construct_tuple)
+
+
+class _ConfigDumper(yaml.Dumper):
+    """YAML dumper that writes the mirrors as nerfstudio writes its own classes."""
+
+
+def _represent_object(dumper: _ConfigDumper, config: Any) -> yaml.Node:
+    return dumper.represent_mapping(f"{OBJECT_TAG}:{CONFIG_CLASS_NAMES[type(config)]}", vars(config))
+
+
+def _represent_event(dumper: _ConfigDumper, event: EventName) -> yaml.Node:
+    return dumper.represent_sequence(f"{OBJECT_TAG}/apply:{CONFIG_CLASS_NAMES[EventName]}", [event.value])
+
+
+for _cls in CONFIG_CLASS_NAMES:
+    _ConfigDumper.add_representer(_cls, _represent_event if _cls is EventName else _represent_object)
+_ConfigDumper.add_representer(Target, lambda dumper, target: dumper.represent_scalar(_NAME_TAG + target.name, ""))
+
+
+def dump_config(config: Any) -> str:
+    """Return the text of a config.yml, as nerfstudio writes it."""
+    return yaml.dump(config, Dumper=_ConfigDumper)
+
+
+# Validation of the values in a config.yml, before nerfstudio uses them.
+
+
+_PARTS = {
+    "pipeline": ("VanillaPipelineConfig", "NormLiftPipelineConfig"),
+    "pipeline.datamanager": ("FullImageDatamanagerConfig",),
+    "pipeline.datamanager.dataparser": tuple(cls.__name__ for cls in get_args(SupportedDataParserConfig)),
+    "pipeline.model": ("SplatfactoModelConfig", "NormLiftModelConfig"),
+}
+_UNCHECKED = ("_target", "vis")
+"""Fields that are not checked here. The loader compares `_target`; `vis` only matters for training, and programs set it
+to values that the flag does not accept."""
+_MAX_DEPTH, _MAX_INT = 12, 2**53
+_REMEDY = "Restore the config.yml that ns-train wrote, or train the capture again with: ns-train splatfacto --data ..."
+
+
+def check_config_values(config: Any, path: Path) -> None:
+    """Raise if a config holds values with which stock splatfacto cannot have been trained.
+
+    Raises:
+        ValueError: if a value does not match its type, a number is out of range, a folder name is invalid, or a
+            component is not splatfacto's.
+    """
+    if type(config) is not TrainerConfig:
+        raise InputError(f"{path} is a {type(config).__name__}, expected a TrainerConfig. {_REMEDY}")
+    check_components(config, path)
+    for name, value, expected in _type_errors(config, TrainerConfig, "", 0):
+        raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
+    _check_names(config, path)
+    pipeline: Any = config.pipeline
+    for name, value, in_range, expected in _ranges(pipeline.model, pipeline.datamanager):
+        if not in_range:
+            raise InputError(f"{path}: {name} is {_format(value)}, expected {expected}. {_REMEDY}")
+    if hasattr(pipeline, "lift"):
+        check_lift_options(pipeline.lift, f"{path}: pipeline.lift")
+
+
+def check_components(config: Any, path: Path) -> None:
+    """Raise if the pipeline, data manager, data parser or model is not one of the supported classes.
+
+    Raises:
+        ValueError: if one of them is an instance of another class; the message names both classes.
+    """
+    for name, classes in _PARTS.items():
+        part: Any = config
+        for step in name.split("."):
+            part = getattr(part, step)
+        cls = type(part)
+        if (
+            cls.__name__ not in classes
+            or CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}") not in CONFIG_TARGETS
+        ):
+            raise InputError(
+                f"{path} has the method {str(config.method_name)!r}, but its {name} is a {cls.__name__}, expected "
+                f"{' or '.join(classes)}; only stock splatfacto runs can be lifted. "
+                "Train the capture with: ns-train splatfacto --data ..."
+            )
+
+
+def _format(value: Any) -> str:
+    """Format any value briefly."""
+    if value is None or isinstance(value, str | bool | int | float | Path):
+        try:
+            text = "null" if value is None else repr(str(value) if isinstance(value, Path) else value)
+        except ValueError:  # an integer of thousands of digits
+            text = "a huge number"
+        return text if len(text) <= 60 else f"{text[:60]}…"
+    return f"a {type(value).__name__}"
+
+
+def _type_errors(value: Any, hint: Any, name: str, depth: int) -> Iterator[tuple[str, Any, str]]:
+    """Yield values that violate their type hints: field name, value, and what was expected."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if depth > _MAX_DEPTH:
+        yield name, value, "no more than a few levels"
+    elif hint is Any:
+        yield from _optimizer_errors(value, name) if name.startswith("optimizers.") else ()
+    elif origin in (Union, types.UnionType):
+        classes = [part for part in parts if is_dataclass(part) and type(value) is part]
+        errors = [list(_type_errors(value, part, name, depth)) for part in classes or parts]
+        if all(errors):
+            yield errors[0][0] if classes else (name, value, " or ".join(map(_describe, parts)))
+    elif origin is Literal:
+        if not any(type(value) is type(part) and value == part for part in parts):
+            yield name, value, " or ".join(map(repr, parts))
+    elif is_dataclass(hint):
+        if not isinstance(value, hint):  # type: ignore[arg-type]
+            yield name, value, _describe(hint)
+            return
+        hints = get_type_hints(type(value))
+        for field in fields(value):
+            if field.name not in _UNCHECKED:
+                full_name = f"{name}.{field.name}" if name else field.name
+                yield from _type_errors(getattr(value, field.name), hints[field.name], full_name, depth + 1)
+    elif origin is tuple:
+        if not isinstance(value, tuple | list) or (parts[-1] is not Ellipsis and len(value) != len(parts)):
+            yield name, value, _describe(hint)
+        else:
+            item_hints = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+            for i, (item, item_hint) in enumerate(zip(value, item_hints)):
+                yield from _type_errors(item, item_hint, f"{name}[{i}]", depth + 1)
+    elif origin is dict:
+        if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+            yield name, value, _describe(hint)
+        else:
+            for key, item in value.items():
+                yield from _type_errors(item, parts[1], f"{name}.{key[:40]}", depth + 1)
+    elif hint is float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e300:
+            yield name, value, "a finite number"
+    elif hint is int:
+        if type(value) is not int or abs(value) > _MAX_INT:
+            yield name, value, "a whole number"
+    elif hint is str or hint is Path:
+        if not isinstance(value, hint) or "\0" in str(value):
+            yield name, value, "text" if hint is str else "a path"
+    elif isinstance(hint, type) and not isinstance(value, hint):
+        yield name, value, _describe(hint)
+
+
+def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
+    """Check an entry of `optimizers`, for which nerfstudio has no type hints."""
+    if not isinstance(value, dict) or set(value) != {"optimizer", "scheduler"}:
+        yield name, value, "an optimizer and a scheduler"
+        return
+    yield from _type_errors(value["optimizer"], OptimizerConfig, f"{name}.optimizer", 2)
+    yield from _type_errors(value["scheduler"], SchedulerConfig | None, f"{name}.scheduler", 2)
+
+
+def _describe(hint: Any) -> str:
+    names = {float: "a number", int: "a whole number", str: "text", Path: "a path", type(None): "null"}
+    return names.get(hint) or getattr(hint, "__name__", None) or str(hint).replace("typing.", "")
+
+
+def _check_names(config: TrainerConfig, path: Path) -> None:
+    """Raise if a name or path would lead out of the run's folders."""
+    for name in ("experiment_name", "method_name", "timestamp"):
+        value = getattr(config, name)
+        if (
+            not isinstance(value, str)
+            or value.strip() in ("", ".", "..")
+            or {"/", "\\", "\0", "\n"} & set(value)
+            or len(value) > 255
+        ):
+            raise InputError(f"{path}: {name} is {_format(value)}, expected the name of one folder. {_REMEDY}")
+    relative = {
+        "viewer.relative_log_filename": Path(config.viewer.relative_log_filename),
+        "logging.relative_log_dir": config.logging.relative_log_dir,
+        "relative_model_dir": config.relative_model_dir,
+    }
+    for name, value in relative.items():
+        if value.is_absolute() or ".." in value.parts:
+            raise InputError(
+                f"{path}: {name} is {_format(value)}, expected a relative path in the folder of the run. {_REMEDY}"
+            )
+
+
+def _ranges(
+    model: SplatfactoModelConfig, datamanager: FullImageDatamanagerConfig
+) -> Iterator[tuple[str, Any, bool, str]]:
+    """Yield the numbers that a lift depends on: name, value, whether it is in range, and the range."""
+    yield "pipeline.model.sh_degree", model.sh_degree, 0 <= model.sh_degree <= 4, "0 to 4"
+    interval = model.sh_degree_interval
+    yield "pipeline.model.sh_degree_interval", interval, interval >= 1, "at least 1"
+    scale = datamanager.camera_res_scale_factor
+    yield "pipeline.datamanager.camera_res_scale_factor", scale, 0 < scale <= 1, "above 0 and at most 1"
+    parser: Any = datamanager.dataparser
+    limits = {
+        "scale_factor": (lambda value: value > 0, "above 0"),
+        "downscale_factor": (lambda value: value is None or 1 <= value <= 2**10, "1 to 1024, or null"),
+        "train_split_fraction": (lambda value: 0 < value <= 1, "above 0 and at most 1"),
+        "eval_interval": (lambda value: value >= 1, "at least 1"),
+    }
+    for name, (in_range, expected) in limits.items():
+        value = getattr(parser, name, None)
+        if hasattr(parser, name):
+            yield f"pipeline.datamanager.dataparser.{name}", value, in_range(value), expected
+
+
+def check_lift_options(options: LiftOptions, name: str) -> None:
+    """Run the constructors' checks, which neither a config.yml nor `ns-train --load-config` triggers.
+
+    Raises:
+        ValueError: if an option is out of range.
+    """
+    try:
+        RefineConfig(**vars(options.vote))
+        LiftOptions(**vars(options))
+    except ValueError as error:
+        raise InputError(f"{name}: {error}. {_REMEDY}") from error
+
+
+# Safe reading of a nerfstudio run's config.yml, and location of its files from any working directory.
+
+
+SUPPORTED_METHODS = (
+    *("splatfacto", "splatfacto-big", "splatfacto-mcmc"),  # the last one comes from nerfstudio's main branch
+    *("normlift", "normlift-lerf-ovs", "normlift-scannet"),
+)
+_MAX_BYTES = 2**18
+"""Largest config.yml that is read; nerfstudio's have 6,000 bytes."""
+_EXPECTED = "Expected the config.yml that ns-train splatfacto wrote; give that with --load-config."
+
+
+def read_trainer_config(path: Path) -> TrainerConfig:
+    """Read the config.yml of a splatfacto or normlift run, with its paths unchanged.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if nerfstudio did not write the config, or it has an unsupported method or data parser, classes
+            other than nerfstudio's configuration classes, or invalid values.
+    """
+    if not path.is_file():
+        hint = f"; {path / 'config.yml'} exists, give that" if (path / "config.yml").is_file() else ""
+        raise FileNotFoundError(
+            f"No config at {path}{hint}. Expected the config.yml that ns-train wrote, "
+            "for example --load-config outputs/fox/splatfacto/2024-05-01_120000/config.yml."
+        )
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it has {path.stat().st_size:,} bytes, more than {_MAX_BYTES:,}. "
+            f"{_EXPECTED}"
+        )
+    try:
+        loader = ConfigLoader(path.read_text("utf8"))
+        root = loader.get_single_node()
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(
+            f"{path} is not a nerfstudio config: it is not valid YAML ({_brief(error)}). {_EXPECTED}"
+        ) from error
+    method = _method_name(root)
+    if method is None:
+        raise InputError(f"{path} is not a nerfstudio config: it has no method_name. {_EXPECTED}")
+    if method not in SUPPORTED_METHODS:
+        raise InputError(
+            f"{path} is a run of method {method!r}; only Gaussians of {', '.join(SUPPORTED_METHODS)} can be lifted. "
+            "Train the capture with: ns-train splatfacto --data ...; or, if the run's Gaussians are standard ones, "
+            "export them with ns-export gaussian-splat and lift that file with --load-ply"
+        )
+    try:
+        config = loader.construct_document(root)
+    except Exception as error:  # PyYAML converts values to dates, numbers and sets without catching their errors
+        raise InputError(
+            f"{path} cannot be read: {_brief(error)}. Only the configuration classes of splatfacto and normlift_ns "
+            "are read, with nerfstudio's own optimizers and the data parsers nerfstudio-data, colmap and "
+            "blender-data. Convert other datasets to one of those formats with ns-process-data, and train on that."
+        ) from error
+    check_config_values(config, path)
+    return config
+
+
+def _method_name(root: yaml.Node | None) -> str | None:
+    """Return the method_name of any config, without constructing objects."""
+    if not isinstance(root, yaml.MappingNode) or not root.tag.startswith(f"{OBJECT_TAG}:"):
+        return None
+    for key, value in root.value:
+        if isinstance(key, yaml.ScalarNode) and key.value == "method_name" and isinstance(value, yaml.ScalarNode):
+            return value.value
+    return None
+
+
+def _brief(error: Exception) -> str:
+    """Summarize a YAML error in one line: problem and line number."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, yaml.MarkedYAMLError):
+        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
+        return f"{error.problem}{line}"
+    return " ".join(str(error).split())
+
+
+@dataclass(frozen=True)
+class RunLocation:
+    """Current absolute paths of a run's files."""
+
+    run_dir: Path
+    """Folder of config.yml."""
+    output_dir: Path
+    """Folder above experiment/method/timestamp, in which runs of this experiment are stored; outputs/ by default."""
+    root: Path | None
+    """Working directory of the training, from which stock ns-* commands must be run. None if it cannot be inferred,
+    because output_dir is absolute or the run was moved."""
+    data: Path
+    """The dataset: a folder or a .json file."""
+    moved_data: bool
+    """Whether `data` differs from the path in the config, read relative to `root`."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the dataset."""
+        return self.data.parent if self.data.suffix == ".json" else self.data
+
+    def portable(self, path: Path) -> Path:
+        """Return the path to store in a config: relative to `root` if it is inside it, otherwise unchanged."""
+        return path.relative_to(self.root) if self.root is not None and path.is_relative_to(self.root) else path
+
+
+def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
+    """Locate the files of a run from the path of its config.yml, whatever the current directory.
+
+    nerfstudio stores output_dir, data and other paths relative to the training's working directory, which config.yml
+    does not contain. But config.yml lies in output_dir/experiment/method/timestamp, from which the directory follows.
+
+    Args:
+        config: contents of config.yml.
+        config_path: path of config.yml.
+        data: current path of the dataset, relative to the current directory; None: the path in the config.
+    Raises:
+        FileNotFoundError: if there is no dataset; the message names every path tried.
+    """
+    run_dir = _absolute(config_path).parent
+    inferred = _strip_tail(run_dir, Path(str(config.experiment_name), str(config.method_name), config.timestamp))
+    output_dir = fallback_output_dir(config.output_dir) if inferred is None else inferred
+    root = None if inferred is None else _strip_tail(inferred, Path(os.path.normpath(config.output_dir)))
+    if data is not None:
+        if not data.exists():
+            raise FileNotFoundError(
+                f"There is no dataset at {_absolute(data)}, given with --data. Expected the folder or the "
+                "transforms.json that the run was trained with."
+            )
+        return RunLocation(run_dir, output_dir, root, _absolute(data), moved_data=True)
+    stored = dataset_in_config(config)
+    roots = [root] if root is not None else list(output_dir.parents)
+    tried = list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
+    for path in tried:
+        if path.exists():
+            moved = root is None or path != _absolute(root / stored)
+            return RunLocation(run_dir, output_dir, root, path, moved_data=moved)
+    raise FileNotFoundError(
+        f"The dataset of {config_path} is not at {' nor at '.join(map(str, tried))}; the config has {str(stored)!r}. "
+        "If it was moved, give its path with --data."
+    )
+
+
+def _strip_tail(path: Path, tail: Path) -> Path | None:
+    """Return `path` without the trailing relative path `tail`; None if it does not end in it."""
+    count = len(path.parts) - len(tail.parts)
+    return Path(*path.parts[:count]) if count > 0 and path.parts[count:] == tail.parts else None
+
+
+def dataset_in_config(config: Any) -> Path:
+    """Return the path of the dataset in the config."""
+    datamanager = config.pipeline.datamanager
+    return Path(datamanager.data if datamanager.data is not None else datamanager.dataparser.data)
+
+
+def fallback_output_dir(output_dir: Path) -> Path:
+    """Return the output folder for a moved run: inside the current directory, whatever its config names."""
+    return _absolute(Path("outputs") if output_dir.is_absolute() or ".." in output_dir.parts else output_dir)
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))
+
+
+def with_absolute_paths(config: Any, location: RunLocation) -> Any:
+    """Return a copy of the config with absolute paths, valid in any directory, and without seed points."""
+    config = deepcopy(config)
+    set_dataset(config, location.data)
+    skip_seed_points(config)
+    if location.root is not None:
+        config.output_dir = location.root / config.output_dir
+    config.relative_model_dir = location.run_dir / config.relative_model_dir
+    return config
+
+
+def set_dataset(config: Any, data: Path) -> None:
+    """Change the dataset in the three fields in which nerfstudio stores it."""
+    datamanager = config.pipeline.datamanager
+    config.data = datamanager.data = datamanager.dataparser.data = data
+
+
+def skip_seed_points(config: Any) -> None:
+    """Stop the dataparser from reading the initial point cloud, which a trained run does not need."""
+    dataparser = config.pipeline.datamanager.dataparser
+    if hasattr(dataparser, "load_3D_points"):
+        dataparser.load_3D_points = False
+    if hasattr(dataparser, "ply_path"):
+        dataparser.ply_path = None

@@ -1,0 +1,478 @@
+"""Placeholders for classes and functions that a config.yml names and this package does not need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.options import LiftOptions, RefineConfig, SourceOptions
+
+
+@dataclass(frozen=True)
+class Target:
+    """Name of a class or function in a config, which is neither imported nor called."""
+
+    name: str
+
+    def __deepcopy__(self, memo: object) -> Target:
+        """Return the object itself, as for a class."""
+        return self
+
+
+_TARGETS: dict[str, Target] = {}
+"""One object per name, which a dump references like a single class."""
+
+
+def intern_target(name: str) -> Target:
+    """Return the target of this name, always the same object."""
+    return _TARGETS.setdefault(name, Target(name))
+
+
+def target_factory(name: str) -> Callable[[], Target]:
+    """Return a default factory for a field that names a target."""
+    return lambda: intern_target(name)
+
+
+# Mirrors of nerfstudio's configuration classes for datasets; see `classes`.
+
+
+_DATA_MODULE = "nerfstudio.data"
+
+
+@dataclass
+class NerfstudioDataParserConfig:
+    """Mirror of nerfstudio's NerfstudioDataParserConfig."""
+
+    _target: Target = field(
+        default_factory=target_factory(f"{_DATA_MODULE}.dataparsers.nerfstudio_dataparser.Nerfstudio")
+    )
+    data: Path = Path()
+    scale_factor: float = 1.0
+    downscale_factor: int | None = None
+    scene_scale: float = 1.0
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    center_method: Literal["poses", "focus", "none"] = "poses"
+    auto_scale_poses: bool = True
+    eval_mode: Literal["fraction", "filename", "interval", "all"] = "fraction"
+    train_split_fraction: float = 0.9
+    eval_interval: int = 8
+    depth_unit_scale_factor: float = 1e-3
+    mask_color: tuple[float, float, float] | None = None
+    load_3D_points: bool = False
+
+
+@dataclass
+class ColmapDataParserConfig:
+    """Mirror of nerfstudio's ColmapDataParserConfig."""
+
+    _target: Target = field(
+        default_factory=target_factory(f"{_DATA_MODULE}.dataparsers.colmap_dataparser.ColmapDataParser")
+    )
+    data: Path = Path()
+    scale_factor: float = 1.0
+    downscale_factor: int | None = None
+    downscale_rounding_mode: Literal["floor", "round", "ceil"] = "floor"
+    scene_scale: float = 1.0
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    center_method: Literal["poses", "focus", "none"] = "poses"
+    auto_scale_poses: bool = True
+    assume_colmap_world_coordinate_convention: bool = True
+    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
+    train_split_fraction: float = 0.9
+    eval_interval: int = 8
+    depth_unit_scale_factor: float = 1e-3
+    images_path: Path = Path("images")
+    masks_path: Path | None = None
+    depths_path: Path | None = None
+    colmap_path: Path = Path("colmap/sparse/0")
+    load_3D_points: bool = True
+    max_2D_matches_per_3D_point: int = 0
+
+
+@dataclass
+class BlenderDataParserConfig:
+    """Mirror of nerfstudio's BlenderDataParserConfig."""
+
+    _target: Target = field(default_factory=target_factory(f"{_DATA_MODULE}.dataparsers.blender_dataparser.Blender"))
+    data: Path = Path("data/blender/lego")
+    scale_factor: float = 1.0
+    alpha_color: str | None = "white"
+    ply_path: Path | None = None
+
+
+SupportedDataParserConfig = NerfstudioDataParserConfig | ColmapDataParserConfig | BlenderDataParserConfig
+"""Supported data parsers."""
+
+
+@dataclass
+class FullImageDatamanagerConfig:
+    """Mirror of nerfstudio's FullImageDatamanagerConfig."""
+
+    _target: Target = field(
+        default_factory=target_factory(f"{_DATA_MODULE}.datamanagers.full_images_datamanager.FullImageDatamanager")
+    )
+    data: Path | None = None
+    masks_on_gpu: bool = False
+    images_on_gpu: bool = False
+    dataparser: SupportedDataParserConfig = field(default_factory=NerfstudioDataParserConfig)
+    camera_res_scale_factor: float = 1.0
+    eval_num_images_to_sample_from: int = -1
+    eval_num_times_to_repeat_images: int = -1
+    eval_image_indices: tuple[int, ...] | None = (0,)
+    cache_images: Literal["cpu", "gpu"] = "gpu"
+    cache_images_type: Literal["uint8", "float32"] = "float32"
+    max_thread_workers: int | None = None
+    train_cameras_sampling_strategy: Literal["random", "fps"] = "random"
+    train_cameras_sampling_seed: int = 42
+    fps_reset_every: int = 100
+
+
+# Mirrors of nerfstudio's configuration classes for optimizers and schedulers; see `classes`.
+
+
+@dataclass
+class OptimizerConfig:
+    """Mirror of nerfstudio's OptimizerConfig."""
+
+    _target: Target = field(default_factory=target_factory("torch.optim.adam.Adam"))
+    lr: float = 0.0005
+    eps: float = 1e-08
+    max_norm: float | None = None
+
+
+@dataclass
+class AdamOptimizerConfig(OptimizerConfig):
+    """Mirror of nerfstudio's AdamOptimizerConfig."""
+
+    weight_decay: float = 0
+
+
+@dataclass
+class RAdamOptimizerConfig(OptimizerConfig):
+    """Mirror of nerfstudio's RAdamOptimizerConfig."""
+
+    _target: Target = field(default_factory=target_factory("torch.optim.radam.RAdam"))
+    weight_decay: float = 0
+
+
+@dataclass
+class SchedulerConfig:
+    """Mirror of nerfstudio's SchedulerConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.Scheduler"))
+
+
+@dataclass
+class MultiStepSchedulerConfig(SchedulerConfig):
+    """Mirror of nerfstudio's MultiStepSchedulerConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.MultiStepScheduler"))
+    max_steps: int = 1000000
+    gamma: float = 0.33
+    milestones: tuple[int, ...] = (500000, 750000, 900000)
+
+
+@dataclass
+class ExponentialDecaySchedulerConfig(SchedulerConfig):
+    """Mirror of nerfstudio's ExponentialDecaySchedulerConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.ExponentialDecayScheduler"))
+    lr_pre_warmup: float = 1e-8
+    lr_final: float | None = None
+    warmup_steps: int = 0
+    max_steps: int = 100000
+    ramp: Literal["linear", "cosine"] = "cosine"
+
+
+@dataclass
+class CosineDecaySchedulerConfig(SchedulerConfig):
+    """Mirror of nerfstudio's CosineDecaySchedulerConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.engine.schedulers.CosineDecayScheduler"))
+    warm_up_end: int = 5000
+    learning_rate_alpha: float = 0.05
+    max_steps: int = 300000
+
+
+# Mirrors of the nerfstudio configuration classes that splatfacto uses: fields, types and defaults, without behavior.
+#
+# A config.yml is a dump of instances of these classes. Importing nerfstudio's own takes 13 s of CPU time, because
+# each imports the class that it configures; the mirrors keep only the name of that class, as `_target`.
+
+
+_BASE, _DATA, _OURS = "nerfstudio.configs.base_config", "nerfstudio.data", "normlift_ns.nerfstudio_plugin"
+
+
+class EventName(Enum):
+    """Quantities that nerfstudio prints during training."""
+
+    ITER_TRAIN_TIME = "Train Iter (time)"
+    TOTAL_TRAIN_TIME = "Train Total (time)"
+    ETA = "ETA (time)"
+    TRAIN_RAYS_PER_SEC = "Train Rays / Sec"
+    TEST_RAYS_PER_SEC = "Test Rays / Sec"
+    VIS_RAYS_PER_SEC = "Vis Rays / Sec"
+    CURR_TEST_PSNR = "Test PSNR"
+
+
+@dataclass
+class MachineConfig:
+    """Mirror of nerfstudio's MachineConfig."""
+
+    seed: int = 42
+    num_devices: int = 1
+    num_machines: int = 1
+    machine_rank: int = 0
+    dist_url: str = "auto"
+    device_type: Literal["cpu", "cuda", "mps"] = "cuda"
+
+
+@dataclass
+class LocalWriterConfig:
+    """Mirror of nerfstudio's LocalWriterConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.utils.writer.LocalWriter"))
+    enable: bool = False
+    stats_to_track: tuple[EventName, ...] = (
+        EventName.ITER_TRAIN_TIME,
+        EventName.TRAIN_RAYS_PER_SEC,
+        EventName.CURR_TEST_PSNR,
+        EventName.VIS_RAYS_PER_SEC,
+        EventName.TEST_RAYS_PER_SEC,
+        EventName.ETA,
+    )
+    max_log_size: int = 10
+
+
+@dataclass
+class LoggingConfig:
+    """Mirror of nerfstudio's LoggingConfig."""
+
+    relative_log_dir: Path = Path()
+    steps_per_log: int = 10
+    max_buffer_size: int = 20
+    local_writer: LocalWriterConfig = field(default_factory=lambda: LocalWriterConfig(enable=True))
+    profiler: Literal["none", "basic", "pytorch"] = "basic"
+
+
+@dataclass
+class ViewerConfig:
+    """Mirror of nerfstudio's ViewerConfig."""
+
+    relative_log_filename: str = "viewer_log_filename.txt"
+    websocket_port: int | None = None
+    websocket_port_default: int = 7007
+    websocket_host: str = "0.0.0.0"
+    num_rays_per_chunk: int = 32768
+    max_num_display_images: int = 512
+    quit_on_train_completion: bool = False
+    image_format: Literal["jpeg", "png"] = "jpeg"
+    jpeg_quality: int = 75
+    make_share_url: bool = False
+    camera_frustum_scale: float = 0.1
+    default_composite_depth: bool = True
+
+
+@dataclass
+class CameraOptimizerConfig:
+    """Mirror of nerfstudio's CameraOptimizerConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.cameras.camera_optimizers.CameraOptimizer"))
+    mode: Literal["off", "SO3xR3", "SE3"] = "off"
+    trans_l2_penalty: float = 1e-2
+    rot_l2_penalty: float = 1e-3
+    optimizer: OptimizerConfig | None = None
+    scheduler: SchedulerConfig | None = None
+
+
+@dataclass
+class SplatfactoModelConfig:
+    """Mirror of nerfstudio's SplatfactoModelConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.models.splatfacto.SplatfactoModel"))
+    enable_collider: bool = True
+    collider_params: dict[str, float] | None = field(default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0})
+    loss_coefficients: dict[str, float] = field(default_factory=lambda: {"rgb_loss_coarse": 1.0, "rgb_loss_fine": 1.0})
+    eval_num_rays_per_chunk: int = 4096
+    prompt: str | None = None
+    warmup_length: int = 500
+    refine_every: int = 100
+    resolution_schedule: int = 3000
+    background_color: Literal["random", "black", "white"] = "random"
+    num_downscales: int = 2
+    cull_alpha_thresh: float = 0.1
+    cull_scale_thresh: float = 0.5
+    reset_alpha_every: int = 30
+    densify_grad_thresh: float = 0.0008
+    use_absgrad: bool = True
+    densify_size_thresh: float = 0.01
+    n_split_samples: int = 2
+    sh_degree_interval: int = 1000
+    cull_screen_size: float = 0.15
+    split_screen_size: float = 0.05
+    stop_screen_size_at: int = 4000
+    random_init: bool = False
+    num_random: int = 50000
+    random_scale: float = 10.0
+    ssim_lambda: float = 0.2
+    stop_split_at: int = 15000
+    sh_degree: int = 3
+    use_scale_regularization: bool = False
+    max_gauss_ratio: float = 10.0
+    output_depth_during_training: bool = False
+    rasterize_mode: Literal["classic", "antialiased"] = "classic"
+    camera_optimizer: CameraOptimizerConfig = field(default_factory=CameraOptimizerConfig)
+    use_bilateral_grid: bool = False
+    grid_shape: tuple[int, int, int] = (16, 16, 8)
+    color_corrected_metrics: bool = False
+
+
+@dataclass
+class NormLiftModelConfig(SplatfactoModelConfig):
+    """Mirror of `normlift_ns.nerfstudio_plugin.model.NormLiftModelConfig`."""
+
+    _target: Target = field(default_factory=target_factory(f"{_OURS}.model.NormLiftModel"))
+    semantics: Path | None = None
+
+    @staticmethod
+    def upgrade(config: SplatfactoModelConfig, *, semantics: Path | None = None) -> NormLiftModelConfig:
+        """Return a config of the same model with a semantic field; all fields of the config are copied."""
+        values = {f.name: getattr(config, f.name) for f in fields(SplatfactoModelConfig) if f.name != "_target"}
+        return NormLiftModelConfig(**values, semantics=semantics)
+
+
+@dataclass
+class VanillaPipelineConfig:
+    """Mirror of nerfstudio's VanillaPipelineConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.pipelines.base_pipeline.VanillaPipeline"))
+    datamanager: FullImageDatamanagerConfig = field(default_factory=FullImageDatamanagerConfig)
+    model: SplatfactoModelConfig = field(default_factory=SplatfactoModelConfig)
+
+
+@dataclass
+class NormLiftPipelineConfig(VanillaPipelineConfig):
+    """Mirror of `normlift_ns.nerfstudio_plugin.pipeline.NormLiftPipelineConfig`."""
+
+    _target: Target = field(default_factory=target_factory(f"{_OURS}.pipeline.NormLiftPipeline"))
+    source: SourceOptions = field(default_factory=SourceOptions)
+    lift: LiftOptions = field(default_factory=LiftOptions)
+    queries: tuple[str, ...] = ()
+
+
+@dataclass
+class TrainerConfig:
+    """Mirror of nerfstudio's TrainerConfig."""
+
+    _target: Target = field(default_factory=target_factory("nerfstudio.engine.trainer.Trainer"))
+    output_dir: Path = Path("outputs")
+    method_name: str | None = None
+    experiment_name: str | None = None
+    project_name: str | None = "nerfstudio-project"
+    timestamp: str = "{timestamp}"
+    machine: MachineConfig = field(default_factory=MachineConfig)
+    logging: LoggingConfig = field(default_factory=LoggingConfig)
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
+    pipeline: VanillaPipelineConfig = field(default_factory=VanillaPipelineConfig)
+    optimizers: dict[str, Any] = field(
+        default_factory=lambda: {"fields": {"optimizer": OptimizerConfig(), "scheduler": SchedulerConfig()}}
+    )
+    vis: str = "wandb"
+    data: Path | None = None
+    prompt: str | None = None
+    relative_model_dir: Path = Path("nerfstudio_models")
+    load_scheduler: bool = True
+    steps_per_save: int = 1000
+    steps_per_eval_batch: int = 500
+    steps_per_eval_image: int = 500
+    steps_per_eval_all_images: int = 25000
+    max_num_iterations: int = 1000000
+    mixed_precision: bool = False
+    use_grad_scaler: bool = False
+    save_only_latest_checkpoint: bool = True
+    load_dir: Path | None = None
+    load_step: int | None = None
+    load_config: Path | None = None
+    load_checkpoint: Path | None = None
+    log_gradients: bool = False
+    gradient_accumulation_steps: dict[str, int] = field(default_factory=dict)
+    start_paused: bool = False
+
+
+CONFIG_CLASS_NAMES: dict[type, str] = {
+    TrainerConfig: "nerfstudio.engine.trainer.TrainerConfig",
+    MachineConfig: f"{_BASE}.MachineConfig",
+    LoggingConfig: f"{_BASE}.LoggingConfig",
+    LocalWriterConfig: f"{_BASE}.LocalWriterConfig",
+    ViewerConfig: f"{_BASE}.ViewerConfig",
+    VanillaPipelineConfig: "nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig",
+    FullImageDatamanagerConfig: f"{_DATA}.datamanagers.full_images_datamanager.FullImageDatamanagerConfig",
+    NerfstudioDataParserConfig: f"{_DATA}.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig",
+    ColmapDataParserConfig: f"{_DATA}.dataparsers.colmap_dataparser.ColmapDataParserConfig",
+    BlenderDataParserConfig: f"{_DATA}.dataparsers.blender_dataparser.BlenderDataParserConfig",
+    SplatfactoModelConfig: "nerfstudio.models.splatfacto.SplatfactoModelConfig",
+    CameraOptimizerConfig: "nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig",
+    OptimizerConfig: "nerfstudio.engine.optimizers.OptimizerConfig",
+    AdamOptimizerConfig: "nerfstudio.engine.optimizers.AdamOptimizerConfig",
+    RAdamOptimizerConfig: "nerfstudio.engine.optimizers.RAdamOptimizerConfig",
+    SchedulerConfig: "nerfstudio.engine.schedulers.SchedulerConfig",
+    ExponentialDecaySchedulerConfig: "nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig",
+    CosineDecaySchedulerConfig: "nerfstudio.engine.schedulers.CosineDecaySchedulerConfig",
+    MultiStepSchedulerConfig: "nerfstudio.engine.schedulers.MultiStepSchedulerConfig",
+    NormLiftModelConfig: f"{_OURS}.model.NormLiftModelConfig",
+    NormLiftPipelineConfig: f"{_OURS}.pipeline.NormLiftPipelineConfig",
+    EventName: "nerfstudio.utils.writer.EventName",
+}
+"""Name of each class in a config.yml."""
+CONFIG_CLASSES: dict[str, type] = {
+    **{
+        name: cls
+        for cls, name in CONFIG_CLASS_NAMES.items()
+        if cls not in (OptimizerConfig, SchedulerConfig, EventName)
+    },
+    "normlift_ns.plugin.model.NormLiftModelConfig": NormLiftModelConfig,  # names of version 0.1
+    "normlift_ns.plugin.pipeline.NormLiftPipelineConfig": NormLiftPipelineConfig,
+    "normlift_ns.plugin.lifting.LiftOptions": LiftOptions,
+    "normlift_ns.core.refine.RefineConfig": RefineConfig,
+    "normlift_ns.encoders.build.SourceOptions": SourceOptions,
+    "normlift_ns.options.LiftOptions": LiftOptions,
+    "normlift_ns.options.SourceOptions": SourceOptions,
+    "normlift_ns.options.RefineConfig": RefineConfig,
+}
+"""Classes that a config.yml may contain, by name."""
+
+
+# Background color and spherical harmonics degree of splatfacto renders.
+
+
+NAMED_COLORS = {
+    "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}  # fmt: skip
+"""nerfstudio's named colors, RGB in 0..1."""
+ASSUMED_STEP = 30000
+"""Step that splatfacto assumes for a loaded checkpoint, whatever its actual step."""
+_VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+
+
+def background_color(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
+    """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
+    name = config.background_color
+    return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(NAMED_COLORS[name])
+
+
+def active_sh_degree(config: Any, step: int) -> int | None:
+    """Return the degree of the spherical harmonics at a training step; None: colors do not depend on the view.
+
+    Args:
+        config: splatfacto's model config, nerfstudio's own or its mirror.
+        step: training step.
+    """
+    return min(step // config.sh_degree_interval, config.sh_degree) if config.sh_degree > 0 else None

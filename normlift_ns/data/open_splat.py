@@ -1,0 +1,399 @@
+"""Scenes without a nerfstudio run: a PLY file or gsplat checkpoint, with a file of cameras."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.data.alignment import MIN_PSNR, mean_psnr
+from normlift_ns.data.cameras import CameraFile, read_camera_file
+from normlift_ns.data.checkpoint import (
+    GAUSSIAN_PARAMETERS,
+    GsplatCheckpoint,
+    find_checkpoint,
+    read_checkpoint,
+    read_gsplat_checkpoint,
+)
+from normlift_ns.data.colmap import read_colmap_points
+from normlift_ns.data.frames import Frame, WorldTransform, check_frames, transform_frames
+from normlift_ns.data.images import ImageViews, held_out_names
+from normlift_ns.data.splat import PlySplat, SplatParameters, read_ply, splat_from_parameters
+from normlift_ns.data.transforms import gsplat_normalization, read_json_file, read_transforms, write_transforms
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import write_text_file
+from normlift_ns.options import Background, RasterizeMode, SplatOptions
+from normlift_ns.rasterization.rasterize import view_colors
+
+BACKGROUND_COLORS: dict[Background, Tensor] = {"black": torch.zeros(3), "white": torch.ones(3)}
+_MIN_POINTS, _PARALLEL = 4, 1e-6
+
+
+@dataclass(frozen=True)
+class SplatScene:
+    """A `Scene` made from a splat and its images, without a nerfstudio run."""
+
+    splat: SplatParameters
+    train: ImageViews
+    held_out: ImageViews
+    name: str
+    checkpoint_path: Path
+    """The PLY file, the first gsplat checkpoint, or the checkpoint of a lifted run."""
+    step: int
+    """Training step; 0 if unknown."""
+    runs_dir: Path
+    photographs: Path
+    """Folder that image names are relative to."""
+    identity: Mapping[str, Any]
+    rasterize_mode: RasterizeMode
+    background_name: Background
+    remarks: tuple[str, ...] = ()
+    """Warnings about the images, in whole sentences."""
+
+    renderer = None
+    """No renderer of its own: `normlift_ns` renders the scene."""
+    has_harmonics = True
+
+    @property
+    def gaussians(self) -> GaussianScene:
+        """The N Gaussians, activated."""
+        return self.splat.activated
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """Raw parameters as trained, by splatfacto's names."""
+        return self.splat.parameters
+
+    @property
+    def background(self) -> Float[Tensor, " 3"]:
+        """Background color, RGB in 0..1."""
+        return BACKGROUND_COLORS[self.background_name]
+
+    def colors(self, camera: Camera) -> Float[Tensor, "n 3"]:
+        """Return each Gaussian's RGB color, >= 0, as seen from the camera."""
+        coefficients = torch.cat([self.splat.features_dc[:, None], self.splat.features_rest], dim=1)
+        return view_colors(self.splat.means, coefficients, camera, self.splat.degree)
+
+
+def open_splat(
+    path: str | Path, options: SplatOptions, *, say: Callable[[str], None] = lambda text: None
+) -> SplatScene:
+    """Open a trained splat and its images.
+
+    Args:
+        path: a PLY file of Inria's trainer, gsplat or ns-export, or ckpt_<step>_rank<r>.pt of gsplat's simple_trainer;
+            the first bytes of the file distinguish the two.
+        options: locations of its cameras and images.
+        say: function that is called with one sentence per assumption, for example `print`.
+    Raises:
+        FileNotFoundError: if a file or image is missing.
+        ValueError: if a file cannot be read, does not match the others or is not a splat.
+        TypeError: if an argument has the wrong type.
+
+    >>> from normlift_ns import SplatOptions, open_run, open_splat
+    >>> run = open_run(config)
+    >>> rows = run.export(folder / "splat.ply")
+    >>> transforms, world = run.scene.location.folder / "transforms.json", config.parent / "dataparser_transforms.json"
+    >>> scene = open_splat(folder / "splat.ply", SplatOptions(transforms=transforms, world_transform=world))
+    >>> len(scene.gaussians) == len(rows), len(scene.train)
+    (True, 12)
+    """
+    if not isinstance(path, str | Path) or not isinstance(options, SplatOptions):
+        raise TypeError(
+            f"open_splat takes a path and SplatOptions, got {type(path).__name__} and {type(options).__name__}"
+        )
+    path = Path(path).absolute()
+    cameras = read_camera_file(options)
+    frames = cameras.frames
+    (splat, mode), checkpoint = _read(path)
+    held_out = cameras.held_out
+    if options.test_every is not None or len(options.holdout) > 0:
+        names = [frame.name for frame in frames]
+        held_out = held_out_names(names, test_every=options.test_every, holdout=options.holdout)
+    if len(held_out) == len(frames) and options.views == "train":
+        raise InputError(f"All {len(frames)} images are held out, so none is left to lift; give --views all.")
+    for text in _assumptions(path, options, mode, held_out, frames, cameras):
+        say(text)
+    worlds = _candidate_worlds(checkpoint, options, cameras)
+
+    def scene_in(world: WorldTransform) -> SplatScene:
+        placed = transform_frames(frames, world)
+        if checkpoint is not None and checkpoint.pose_adjust is not None:
+            placed = _adjust_poses(placed, held_out, checkpoint.pose_adjust, path)
+        background = BACKGROUND_COLORS[options.background]
+        lifted = [frame for frame in placed if options.views == "all" or frame.name not in held_out]
+        rest = [frame for frame in placed if options.views == "train" and frame.name in held_out]
+        step = 0 if checkpoint is None else checkpoint.step
+        train = ImageViews(lifted, background)
+        return SplatScene(
+            splat,
+            train,
+            ImageViews(rest, background),
+            cameras.folder.name or "splat",
+            path,
+            step,
+            Path("outputs").absolute(),
+            cameras.base,
+            {
+                "source_splat": str(path),
+                "source_cameras": str(cameras.source),
+                "source_step": step,
+                "source_world": {"transform": world.transform.tolist(), "scale": float(world.scale)},
+            },
+            options.rasterize_mode or mode or "classic",
+            options.background,
+            train.check_files(),
+        )
+
+    return _first_aligned(scene_in, worlds, say)
+
+
+def _read(path: Path) -> tuple[PlySplat, GsplatCheckpoint | None]:
+    """Read the splat, and the checkpoint if the file is one."""
+    if _is_checkpoint(path):
+        checkpoint = read_gsplat_checkpoint(path)
+        return PlySplat(checkpoint.splat, None), checkpoint
+    return read_ply(path), None
+
+
+def _is_checkpoint(path: Path) -> bool:
+    """Return whether a file is a checkpoint: torch.save writes ZIP archives. For a missing file, the suffix decides."""
+    if not path.is_file():
+        return path.suffix == ".pt"
+    with path.open("rb") as file:
+        return file.read(2) == b"PK" or path.suffix == ".pt"
+
+
+def _first_aligned(
+    scene_in: Callable[[WorldTransform], SplatScene],
+    worlds: Sequence[tuple[str, WorldTransform]],
+    say: Callable[[str], None],
+) -> SplatScene:
+    """Return the scene in the first world in which renders match the images, or in the first world if none does."""
+    (_, first), *others = worlds
+    scene = scene_in(first)
+    if len(others) == 0 or mean_psnr(scene) >= MIN_PSNR:
+        return scene
+    for text, world in others:
+        other = scene_in(world)
+        if mean_psnr(other) >= MIN_PSNR:
+            say(text)
+            return other
+    return scene
+
+
+_TURNED = "The axes of gsplat's normalization point the other way; rotated by half a turn, the splat fits its images."
+_NORMALIZED = "The splat does not fit its images in the world of its cameras, but it does in gsplat's normalized world."
+
+
+def _candidate_worlds(
+    checkpoint: GsplatCheckpoint | None, options: SplatOptions, cameras: CameraFile
+) -> list[tuple[str, WorldTransform]]:
+    """Return possible maps from the cameras' world to the splat's, each with a message for its use.
+
+    There are several if only the images can tell. A PLY file may come from gsplat's trainer too, so its normalized
+    world is the alternative if that of the cameras does not fit.
+    """
+    if cameras.to_splat is not None:
+        return [("", cameras.to_splat)]
+    same = [("", WorldTransform(np.eye(4)[:3], 1.0))]
+    if not options.gsplat_normalize or (checkpoint is None and options.colmap is None):
+        return same
+    try:
+        first, *turned = _normalizations(options, cameras)
+    except (ValueError, FileNotFoundError):
+        if checkpoint is None:
+            return same
+        raise
+    worlds = [("", first)] if checkpoint is not None else [*same, (_NORMALIZED, first)]
+    return [*worlds, *((_TURNED, world) for world in turned)]
+
+
+def _normalizations(options: SplatOptions, cameras: CameraFile) -> list[WorldTransform]:
+    """Recompute the normalizations that gsplat's trainer may have applied, from its COLMAP project."""
+    if options.colmap is None:
+        raise InputError(
+            "gsplat's trainer normalized the world of the splat by the points of its COLMAP project, so a "
+            "transforms.json is not enough. Give the project with --colmap, or a known transform with "
+            "--world-transform, or --gsplat-normalize False if the training used --no-normalize-world-space."
+        )
+    try:
+        points = read_colmap_points(cameras.source)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error} gsplat's trainer normalized the world by points3D.") from error
+    if len(points) < _MIN_POINTS:
+        raise InputError(
+            f"{cameras.source} has {len(points)} points, too few to recompute the normalization of gsplat's trainer. "
+            "Give the project that the splat was trained with, or --gsplat-normalize False if the training used "
+            "--no-normalize-world-space."
+        )
+    return gsplat_normalization(cameras.frames, points)
+
+
+def _adjust_poses(
+    frames: Sequence[Frame], held_out: frozenset[str], deltas: Float[Tensor, "v 9"], path: Path
+) -> list[Frame]:
+    """Return the frames with the pose adjustments that gsplat's --pose_opt learned for the training views."""
+    trained = [frame for frame in frames if frame.name not in held_out]
+    if len(trained) != len(deltas):
+        without_eighth = len(frames) - len(range(0, len(frames), 8))
+        hint = " The trainer holds out every eighth: give --test-every 8." if len(deltas) == without_eighth else ""
+        raise InputError(
+            f"{path} has pose adjustments for {len(deltas)} training views (--pose_opt), but {len(trained)} of "
+            f"{len(frames)} images are training views. Give the held-out images with --test-every or --holdout.{hint}"
+        )
+    by_name = {}
+    for frame, delta in zip(trained, deltas.numpy()):
+        first, second = delta[3:6] + np.eye(3)[0], delta[6:9] + np.eye(3)[1]
+        if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
+            raise InputError(
+                f"{path}: its `pose_adjust` for {frame.name} is not a valid rotation. Expected two axes that are not "
+                "parallel."
+            )
+        x = first / np.linalg.norm(first)
+        y = second - (x @ second) * x
+        y /= np.linalg.norm(y)
+        rotation = np.stack([x, y, np.cross(x, y)])
+        opencv = frame.pose * [1, -1, -1, 1]
+        pose = np.concatenate(
+            [opencv[:, :3] @ rotation * [1, -1, -1], opencv[:, :3] @ delta[:3, None] + opencv[:, 3:]], axis=1
+        )
+        by_name[frame.name] = replace(frame, pose=pose)
+    return [by_name.get(frame.name, frame) for frame in frames]
+
+
+def _assumptions(
+    path: Path,
+    options: SplatOptions,
+    mode: RasterizeMode | None,
+    held_out: frozenset[str],
+    frames: Sequence[Frame],
+    cameras: CameraFile,
+) -> list[str]:
+    """Return messages about settings that the files do not specify."""
+    texts = []
+    if options.rasterize_mode is not None and mode is not None and mode != options.rasterize_mode:
+        texts.append(
+            f"{path.name} has SplatRenderMode {mode}; --rasterize-mode {options.rasterize_mode} is used instead."
+        )
+    if options.rasterize_mode is None and mode is None:
+        texts.append(f"{path.name} does not name its rasterize mode; classic is assumed (see --rasterize-mode).")
+    texts.append(
+        "Weights are gsplat's, by the rules of --gsplat-rules (1.4 by default), where a Gaussian covers at most 0.999 "
+        "of a pixel. With the rules of 1.6 it is 0.99, as in Inria's trainer. Inria's trainer puts the principal point "
+        "in the middle. Images with distortion are undistorted as in ns-train."
+    )
+    if len(held_out) > 0:
+        lifted = "lifted too" if options.views == "all" else "not lifted"
+        texts.append(f"{len(held_out)} of {len(frames)} images were held out of the training; they are {lifted}.")
+    else:
+        texts.append(f"All {len(frames)} images are lifted; see --test-every and --holdout.")
+    if options.colmap is not None:
+        folder = (options.images or options.colmap / "images").absolute()
+        unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})
+        if unused > 0:
+            texts.append(f"{unused} files in {folder} have no camera and are skipped.")
+    return texts
+
+
+# Splat and cameras stored in a lifted run, which open it again without the original files.
+
+
+SPLAT_FILE, TRANSFORMS_FILE, CHECKPOINT_DIR = "splat.json", "transforms.json", "nerfstudio_models"
+_EXPECTED = "the file that ns-normlift wrote next to config.yml; copy the whole run again"
+
+
+class _Saved(msgspec.Struct):
+    name: str
+    rasterize_mode: RasterizeMode
+    background: Background
+    photographs: str
+    identity: dict[str, Any]
+
+
+def save_splat(folder: Path, scene: SplatScene) -> None:
+    """Write splat.json and the cameras, transforms.json, into the folder of a run."""
+    write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
+    saved = _Saved(
+        scene.name, scene.rasterize_mode, scene.background_name, str(scene.photographs), dict(scene.identity)
+    )
+    write_text_file(folder / SPLAT_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")
+
+
+def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
+    """Return the checkpoint that splatfacto loads: step and parameters.
+
+    Without spherical harmonics, splatfacto would read the colors as logits, so the first degree is added as zeros.
+    """
+    parameters = scene.parameters
+    if scene.splat.degree == 0:
+        parameters["features_rest"] = torch.zeros(len(scene.splat), 3, 3)
+    return {
+        "step": scene.step,
+        "pipeline": {f"_model.gauss_params.{name}": parameters[name] for name in GAUSSIAN_PARAMETERS},
+    }
+
+
+def is_saved_splat(run_dir: Path) -> bool:
+    """Return whether the run was lifted from a splat without a nerfstudio run."""
+    return (run_dir / SPLAT_FILE).is_file()
+
+
+def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int | None = None) -> SplatScene:
+    """Open the splat of a lifted run.
+
+    Args:
+        run_dir: folder of the lifted run.
+        data: current folder of the images, if they were moved.
+        load_step: step of the checkpoint; None: the last.
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing or damaged; the message names it.
+    """
+    path = run_dir / SPLAT_FILE
+    try:
+        saved = msgspec.convert(read_json_file(path, _EXPECTED), _Saved)
+        if any(text.strip() == "" or "\0" in text for text in (saved.name, saved.photographs)):
+            raise msgspec.ValidationError("name or photographs is empty")
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
+    checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
+    parameters = {name: checkpoint.model[f"gauss_params.{name}"] for name in GAUSSIAN_PARAMETERS}
+    if data is not None and not data.is_dir():
+        raise FileNotFoundError(
+            f"There is no folder {data}, given with --data. Expected the new location of {saved.photographs}."
+        )
+    cameras = read_transforms(
+        run_dir / TRANSFORMS_FILE,
+        None if data is None else data.absolute(),
+        base=Path(saved.photographs),
+        advice="give their folder with --data",
+    )
+    check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
+    background = BACKGROUND_COLORS[saved.background]
+    train, held_out = (
+        ImageViews([frame for frame in cameras.frames if (frame.name in cameras.held_out) == is_held_out], background)
+        for is_held_out in (False, True)
+    )
+    return SplatScene(
+        splat_from_parameters(parameters, checkpoint.path),
+        train,
+        held_out,
+        saved.name,
+        checkpoint.path,
+        checkpoint.step,
+        run_dir.parents[2] if len(run_dir.parents) > 2 else run_dir.parent,
+        Path(saved.photographs) if data is None else data.absolute(),
+        saved.identity,
+        saved.rasterize_mode,
+        saved.background,
+        train.check_files(),
+    )

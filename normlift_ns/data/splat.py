@@ -1,0 +1,324 @@
+"""Raw parameters of a trained splat, and the validation of splat files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from plyfile import PlyData, PlyParseError
+from torch import Tensor
+
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.errors import InputError
+from normlift_ns.options import RasterizeMode
+
+SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
+"""Degree of the spherical harmonics by the number of coefficients beyond the constant one."""
+_MAX_MEDIAN_WIDTH = 0.02
+"""Largest plausible width of the median Gaussian, as a fraction of the scene. If a file has no negative log scales and
+exceeds it, its scales are linear."""
+
+_DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_SAMPLE_SIZE, _BLOCK_ROWS = 2**20, 2**18
+_MIN_LOGITS = 100
+"""Number of Gaussians from which logits that all lie in 0..1 cannot be a coincidence."""
+
+
+@dataclass(frozen=True)
+class SplatParameters:
+    """Raw parameters of N Gaussians, as trainers store them."""
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    """Rotations as (w, x, y, z)."""
+    scales: Float[Tensor, "n 3"]
+    """Logarithms of the standard deviations."""
+    opacities: Float[Tensor, "n 1"]
+    """Logits."""
+    features_dc: Float[Tensor, "n 3"]
+    """Constant spherical harmonic of the colors."""
+    features_rest: Float[Tensor, "n k 3"]
+    """Remaining spherical harmonics: K = 0, 3, 8, 15 or 24."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """The tensors by splatfacto's names."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return SH_DEGREES[self.features_rest.shape[1]]
+
+    @cached_property
+    def activated(self) -> GaussianScene:
+        """The Gaussians with activated scales and opacities, as a rasterizer takes them."""
+        return GaussianScene(self.means, self.quats, self.scales.exp(), self.opacities.sigmoid().squeeze(-1))
+
+
+def validate_splat(splat: SplatParameters, file: Path) -> None:
+    """Raise if the Gaussians cannot be drawn.
+
+    Raises:
+        ValueError: if there are no Gaussians, values are not finite, all rotations are zero, scales are not logarithms,
+            or opacities are not logits.
+    """
+    if len(splat) == 0:
+        raise InputError(f"{file} holds no Gaussians. Export the scene again.")
+    for name, values in _activated_values(splat):
+        blocks = values.reshape(len(splat), -1).split(_BLOCK_ROWS)
+        invalid = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
+        if len(invalid) > 0:
+            raise InputError(
+                f"{file} has {len(invalid):,} of {len(splat):,} Gaussians whose {name} are NaN or infinite, the first "
+                f"in row {int(invalid[0])}. Expected finite numbers. Remove those Gaussians; for a PLY file, for "
+                f"example, with: splat-transform {file.name} --filter-nan clean.ply"
+            )
+    lengths = splat.quats.abs().amax(dim=1)
+    if bool((lengths == 0).all()):
+        raise InputError(f"{file} has only zero quaternions, so no Gaussian can be drawn. Export the scene again.")
+    low, high = float(splat.opacities.min()), float(splat.opacities.max())
+    if len(splat) >= _MIN_LOGITS and low >= 0 and high <= 1:
+        raise InputError(
+            f"{file} seems to hold opacities, between {low:.3g} and {high:.3g}, instead of their logits. Expected "
+            "logits, as all splat trainers write them; store log(opacity / (1 - opacity))."
+        )
+    sample = splat.means[:: max(1, len(splat) // _SAMPLE_SIZE)]
+    left, right = sample.quantile(0.05, dim=0), sample.quantile(0.95, dim=0)
+    extent, width = float((right - left).amax()), float(splat.scales.median().exp())
+    if bool((splat.scales >= 0).all()) and extent > 0 and width > _MAX_MEDIAN_WIDTH * extent:
+        raise InputError(
+            f"{file} seems to hold linear scales, between {float(splat.scales.min()):.3g} and "
+            f"{float(splat.scales.max()):.3g}: read as logarithms, they make the median Gaussian {width:.3g} wide in "
+            f"a scene of {extent:.3g}. Expected natural logarithms, as all splat trainers write them; store log(scale)."
+        )
+
+
+def _activated_values(splat: SplatParameters) -> Iterator[tuple[str, Tensor]]:
+    """Yield the values that must be finite; logits and logarithms themselves may be infinite."""
+    yield "means", splat.means
+    yield "rotations", splat.quats
+    yield "scales", splat.activated.scales
+    yield "opacities", splat.activated.opacities
+    yield "colors", splat.features_dc
+    yield "colors", splat.features_rest
+
+
+def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> SplatParameters:
+    """Return a float32 splat from a trainer's tensors, after checking their types and shapes.
+
+    Args:
+        parameters: tensors by splatfacto's names.
+        file: their file, for messages.
+    Raises:
+        ValueError: if there are no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
+            float64.
+    """
+    n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0
+    if parameters["means"].ndim == 2 and n == 0:
+        raise InputError(f"{file} holds no Gaussians. Give the file of a training run that kept some.")
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (1,), "features_dc": (3,)}
+    for name, shape in shapes.items():
+        value = parameters[name]
+        if tuple(value.shape) != (n, *shape) or value.dtype not in _DTYPES:
+            raise InputError(
+                f"{file}: {name} is {value.dtype} {tuple(value.shape)}, expected floating-point numbers of shape "
+                f"{(n, *shape)}, one row per Gaussian. Copy the file again, or give that of another training run."
+            )
+    rest = parameters["features_rest"]
+    if (
+        rest.ndim != 3
+        or len(rest) != n
+        or rest.shape[2] != 3
+        or rest.shape[1] not in SH_DEGREES
+        or rest.dtype not in _DTYPES
+    ):
+        raise InputError(
+            f"{file}: its spherical harmonics have shape {tuple(rest.shape)} and type {rest.dtype}, expected "
+            f"floating-point numbers of shape ({n}, K, 3) with K = {', '.join(map(str, SH_DEGREES))} for degrees "
+            f"{', '.join(map(str, SH_DEGREES.values()))}. Copy the file again, or give that of another training run."
+        )
+    return SplatParameters(**{name: parameters[name].detach().float() for name in (*shapes, "features_rest")})
+
+
+# Splats in PLY files written by Inria's trainer, gsplat, ns-export or this package.
+
+
+_MAX_HEADER_BYTES = 2**20
+_PLY_BLOCK_ROWS = 2**18
+"""Number of Gaussians read at a time."""
+_REQUIRED = (
+    *"xyz",
+    *(f"f_dc_{i}" for i in range(3)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+_MODES: dict[str, RasterizeMode] = {
+    "mip": "antialiased", "antialiased": "antialiased", "classic": "classic", "default": "classic",
+}  # fmt: skip
+
+
+class PlySplat(NamedTuple):
+    """Contents of a PLY file."""
+
+    splat: SplatParameters
+    rasterize_mode: RasterizeMode | None
+    """Value of the comment SplatRenderMode; None if there is no such comment or its value is unknown."""
+
+
+def read_ply(path: Path) -> PlySplat:
+    """Read a splat. Its properties may be in any order; other properties are ignored.
+
+    Peak memory is a little more than one copy of the Gaussians.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not a PLY file, is truncated, does not hold a splat or has Gaussians that cannot be
+            drawn. The number of spherical harmonics must match a degree.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of the splat with --load-ply.")
+    check_ply_header(path)
+    try:
+        data = PlyData.read(str(path), mmap="c")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"The header of {path} has non-ASCII characters, perhaps in a comment ({error}). Remove them, or rewrite "
+            f"the file, for example with: splat-transform {path.name} clean.ply"
+        ) from error
+    except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
+        if path.open("rb").read(3) == b"ply":
+            raise InputError(
+                f"{path} is truncated or damaged ({' '.join(str(error).split())}): its {path.stat().st_size:,} bytes "
+                "do not match its header. Copy it again."
+            ) from error
+        raise InputError(
+            f"{path} cannot be read as a PLY file ({' '.join(str(error).split())}). Expected a splat in PLY format; "
+            "splat-transform converts other formats, for example: splat-transform scene.sog scene.ply"
+        ) from error
+    elements = {element.name: element for element in data.elements}
+    vertex = elements.get("vertex")
+    if vertex is None or vertex.count == 0:
+        raise InputError(f"{path} has no vertices, so it is not a splat. Give the PLY file of a trained splat.")
+    names = {item.name for item in vertex.properties}
+    if "packed_position" in names:
+        raise InputError(
+            f"{path} is a compressed PLY file. Expand it with: splat-transform {path.name} scene.ply, and give that."
+        )
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing:
+        raise InputError(
+            f"{path} is not a splat: its {vertex.count:,} vertices lack {', '.join(missing)}. Expected the properties "
+            f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
+            f"{', '.join([item for item in sorted(names) if not item.startswith('f_rest_')][:16])}. {_advice(missing)}"
+        )
+    lists = [item.name for item in vertex.properties if item.name in _REQUIRED and hasattr(item, "len_dtype")]
+    if lists:
+        raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+    splat = _read_columns(path, vertex.data, _rest_names(path, names))
+    validate_splat(splat, path)
+    return PlySplat(splat, _mode([*data.comments, *vertex.comments]))
+
+
+def check_ply_header(path: Path) -> None:
+    """Raise if the file is too small for the rows that its header declares, which are allocated before reading.
+
+    Raises:
+        ValueError: if the header is invalid or declares more data than the file holds.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0]
+    lines = [line.split() for line in header.replace(b"\r", b"\n").split(b"\n")]
+    declared = 0
+    for i, words in enumerate(lines):
+        if words[:1] != [b"element"]:
+            continue
+        rest = lines[i + 1 :]
+        end = next((j for j, other in enumerate(rest) if other[:1] == [b"element"]), len(rest))
+        properties = sum(other[:1] == [b"property"] for other in rest[:end])
+        count = words[2] if len(words) == 3 else b""
+        if not count.isdigit() or len(count) > 18 or (properties == 0 and int(count) > 0):
+            raise InputError(
+                f"{path} is truncated or damaged: its header has the line {b' '.join(words)[:80]!r} with {properties} "
+                "properties. Expected a splat in PLY format; copy it again."
+            )
+        declared += int(count) * properties  # a property takes at least one byte
+    if declared > size:
+        raise InputError(
+            f"{path} is truncated or damaged: its header declares {declared:,} numbers, but the file has only "
+            f"{size:,} bytes. Copy it again."
+        )
+
+
+def _advice(missing: list[str]) -> str:
+    if missing == ["scale_2"]:
+        return "2D Gaussians, which have two scales, are not supported; train the scene with 3D Gaussians."
+    if all(name.startswith("f_dc_") for name in missing):
+        return "Its colors are not spherical harmonics; export it again with f_dc_*."
+    return "Give the PLY file that its trainer or ns-export gaussian-splat wrote, not the initial point cloud."
+
+
+def _rest_names(path: Path, names: set[str]) -> list[str]:
+    """Return f_rest_0, f_rest_1, … in order."""
+    count = sum(name.startswith("f_rest_") for name in names)
+    expected = [f"f_rest_{i}" for i in range(count)]
+    if count % 3 != 0 or count // 3 not in SH_DEGREES or not set(expected) <= names:
+        counts = ", ".join(f"{3 * k} (degree {degree})" for k, degree in SH_DEGREES.items())
+        raise InputError(
+            f"{path} has {count} properties f_rest_*, which matches no degree of spherical harmonics. Expected "
+            f"f_rest_0, f_rest_1, … with one of the counts {counts}. Export the scene again."
+        )
+    return expected
+
+
+def _read_columns(path: Path, table: np.ndarray, rest: list[str]) -> SplatParameters:
+    n, k = len(table), len(rest) // 3
+    groups = {
+        "means": ["x", "y", "z"],
+        "quats": [f"rot_{i}" for i in range(4)],
+        "scales": [f"scale_{i}" for i in range(3)],
+        "opacities": ["opacity"],
+        "features_dc": [f"f_dc_{i}" for i in range(3)],
+    }
+    columns = {name: torch.empty(n, len(group)) for name, group in groups.items()}
+    harmonics = torch.empty(n, k, 3)
+    for start, rows in _blocks(path, table):
+        for name, group in groups.items():
+            for i, column in enumerate(group):
+                columns[name].numpy()[start : start + len(rows), i] = rows[column]
+        for i, column in enumerate(rest):  # all of red, then green, then blue
+            harmonics.numpy()[start : start + len(rows), i % k, i // k] = rows[column]
+    return SplatParameters(**columns, features_rest=harmonics)
+
+
+def _blocks(path: Path, table: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield blocks of rows, each with the index of its first row.
+
+    Blocks are read rather than mapped, because mapped pages count as memory of the process.
+    """
+    with path.open("rb") as file:
+        is_mapped = isinstance(table, np.memmap)
+        if isinstance(table, np.memmap):
+            file.seek(table.offset)
+        for start in range(0, len(table), _PLY_BLOCK_ROWS):
+            count = min(_PLY_BLOCK_ROWS, len(table) - start)
+            yield start, np.fromfile(file, table.dtype, count) if is_mapped else table[start : start + count]
+
+
+def _mode(comments: list[str]) -> RasterizeMode | None:
+    for comment in comments:
+        key, _, value = comment.partition(":")
+        if key.strip().lower() == "splatrendermode":
+            return _MODES.get(value.strip().lower())
+    return None

@@ -1,0 +1,329 @@
+"""Communication between processes with torch.distributed: NCCL for GPUs, gloo for CPUs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import uuid4
+
+import torch
+import torch.distributed as dist
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.lift import Lifted
+from normlift_ns.core.neighbors import Neighbors
+from normlift_ns.core.partition import VIEW_STAGES, Communicator, Partition, ProgressCallback
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.errors import InputError
+from normlift_ns.io.file_lock import try_claim
+
+_STALE_SECONDS = 7 * 86400
+"""Age at which a shared directory of killed processes is deleted."""
+
+
+@dataclass(kw_only=True)
+class TorchCommunicator(Communicator):
+    """Communication of this process with the others.
+
+    Arrays can have any type and device; results are on the same device.
+    """
+
+    rank: int
+    size: int
+    device: torch.device
+    """Device on which arrays are exchanged."""
+    store: Any
+    """Shared store for progress counters."""
+    _folder: Path = field(default_factory=Path)
+    """Directory shared by all processes, in which they claim work items."""
+    _num_divisions: int = 0
+    """Number of calls of `chunks` so far."""
+
+    def join(self, rows: Tensor) -> Tensor:
+        """See the base class."""
+        counts = self._counts(len(rows))
+        data = self._bytes(rows)
+        width = data.shape[1:]
+        parts = [data if r == self.rank else data.new_empty(count, *width) for r, count in enumerate(counts)]
+        for r, part in enumerate(parts):
+            if part.numel() > 0:
+                dist.broadcast(part, r)
+        return _like(torch.cat(parts), rows)
+
+    def deliver(self, rows: Tensor) -> list[Tensor] | None:
+        """See the base class."""
+        counts, data = self._counts(len(rows)), self._bytes(rows)
+        if self.rank > 0:
+            if data.numel() > 0:
+                dist.send(data, 0)
+            return None
+        parts = [rows]
+        for r in range(1, self.size):
+            part = data.new_empty(counts[r], *data.shape[1:])
+            if part.numel() > 0:
+                dist.recv(part, r)
+            parts.append(_like(part, rows))
+        return parts
+
+    def exchange(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        """See the base class."""
+        sent_counts = torch.tensor([len(part) for part in parts], device=self.device)
+        counts = torch.empty_like(sent_counts)
+        dist.all_to_all_single(counts, sent_counts)
+        sent = self._bytes(torch.cat(list(parts)))
+        received = sent.new_empty(int(counts.sum()), *sent.shape[1:])
+        dist.all_to_all_single(received, sent, counts.tolist(), sent_counts.tolist())
+        return list(_like(received, parts[0]).split(counts.tolist()))
+
+    def add(self, values: Tensor) -> Tensor:
+        """See the base class."""
+        total = values.to(self.device, copy=True)
+        dist.all_reduce(total)
+        return total.to(values.device)
+
+    def spread(self, values: Tensor) -> Tensor:
+        """See the base class."""
+        data = self._bytes(values)
+        if data.numel() > 0:
+            dist.broadcast(data, 0)
+        return _like(data, values).reshape(values.shape)
+
+    def tell(self, value: Any) -> Any:
+        """See the base class."""
+        return self.tell_all(value if self.rank == 0 else None)[0]
+
+    def tell_all(self, value: Any) -> list[Any]:
+        """See the base class."""
+        encoded = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+        text = bytes(self.join(encoded).numpy())
+        result = []
+        for count in self._counts(len(encoded)):
+            result.append(json.loads(text[:count]))
+            text = text[count:]
+        return result
+
+    def chunks(self, count: int) -> Iterator[int]:
+        """Yield the items of this process's part, then those of others that nobody has claimed in the directory."""
+        key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
+        first = count * self.rank // self.size
+        for index in [*range(first, count), *range(first)]:
+            if try_claim(self._folder, f"{key}{index}", after=0) is not None:
+                yield index
+
+    def counted(self, report: ProgressCallback) -> ProgressCallback:
+        """See the base class."""
+        previous: dict[str, int] = {}
+
+        def report_total(stage: str, done: int, total: int) -> None:
+            if stage in VIEW_STAGES:
+                new, previous[stage] = done - previous.get(stage, 0), done
+                done = min(total, self.store.add(stage, new))
+            if self.rank == 0:
+                report(stage, done, total)
+
+        return report_total
+
+    @contextmanager
+    def shares(self, folder: Path) -> Iterator[None]:
+        """Provide a context in which `chunks` can be called.
+
+        Args:
+            folder: directory that all processes share.
+        Raises:
+            InputError: if the processes do not share it, or two of them can create the same file in it.
+        """
+        if self.rank == 0:
+            for leftover in folder.glob("team-*"):  # from processes that were killed
+                if time.time() - leftover.stat().st_mtime > _STALE_SECONDS:
+                    shutil.rmtree(leftover, ignore_errors=True)
+        self._folder = folder / f"team-{self.tell(uuid4().hex)}"
+        creators = sum(self.tell_all(try_claim(self._folder, "start", after=0) is not None))
+        if creators != 1:
+            raise InputError(
+                f"{creators} of {self.size} processes created the same file in {folder}, expected 1. Either they do "
+                "not share that folder, or its file system does not support exclusive creation. Give all of them the "
+                "same --output-dir, on a disk that they share"
+            )
+        try:
+            yield
+        finally:
+            if self.rank == 0:
+                shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _counts(self, count: int) -> list[int]:
+        counts = [torch.zeros(1, dtype=torch.int64, device=self.device) for _ in range(self.size)]
+        dist.all_gather(counts, torch.tensor([count], device=self.device))
+        return torch.cat(counts).tolist()
+
+    def _bytes(self, rows: Tensor) -> Tensor:
+        flat = rows.to(self.device).reshape(len(rows), prod(rows.shape[1:]))
+        return flat.contiguous().view(torch.uint8)
+
+
+def _like(data: Tensor, rows: Tensor) -> Tensor:
+    """Convert bytes to rows with the shape, type and device of others."""
+    return data.flatten().view(rows.dtype).reshape(-1, *rows.shape[1:]).to(rows.device)
+
+
+# Exchange between processes: evidence from view owners to Gaussian owners, and neighbors for the vote.
+
+
+_RENUMBER_BLOCK = 2**20
+"""Number of rows of neighbors that are renumbered at a time."""
+
+
+class CooEntries(NamedTuple):
+    """Entries of a sparse matrix as coordinates, sorted by row; each takes 12 bytes, and empty rows take none."""
+
+    row: Int32[Tensor, " nnz"]
+    column: Int32[Tensor, " nnz"]
+    weight: Float[Tensor, " nnz"]
+
+
+@dataclass(frozen=True)
+class EvidenceShard:
+    """Evidence of a few views, split by the process that owns the Gaussians; rows are those of the owner's portion."""
+
+    rows: list[CooEntries]
+    """Labeled entries for every process."""
+    unlabeled: list[CooEntries]
+    """Unlabeled entries for every process."""
+    facts: tuple[list[int], int, int, int]
+    """Number of regions of every view, `weight_power`, `num_excluded`, and bytes per weight."""
+
+    @staticmethod
+    def of(evidence: Evidence, portion: Partition) -> EvidenceShard:
+        """Split the evidence of all Gaussians by owner."""
+        regions = torch.bincount(evidence.region_view, minlength=evidence.num_views).tolist()
+        facts = (regions, evidence.weight_power, evidence.num_excluded, evidence.rows.weight.element_size())
+        return EvidenceShard(
+            _split_by_owner(evidence.rows, portion), _split_by_owner(evidence.unlabeled, portion), facts
+        )
+
+
+def _split_by_owner(rows: SparseRows, portion: Partition) -> list[CooEntries]:
+    owner, row = portion.place
+    gaussian = rows.row_index()
+    owner_of, row_of, parts = owner[gaussian], row[gaussian], []
+    for rank in range(portion.team.size):
+        entries = (owner_of == rank).nonzero().squeeze(1)
+        parts.append(CooEntries(row_of[entries], rows.column[entries], rows.weight[entries]))
+    return parts
+
+
+def redistribute_evidence(pieces: Mapping[int, EvidenceShard], portion: Partition, chunks: int) -> Evidence:
+    """Redistribute evidence: return that of all views for the Gaussians of this process.
+
+    Args:
+        pieces: evidence collected by this process, by chunk index; together, the processes have all chunks.
+        chunks: number of chunks of all processes.
+    """
+    device, local_chunks = portion.order.device, sorted(pieces)
+    matrices = ([pieces[chunk].rows for chunk in local_chunks], [pieces[chunk].unlabeled for chunk in local_chunks])
+    counts = [[[len(parts[rank].row) for parts in matrix] for matrix in matrices] for rank in range(portion.team.size)]
+    gathered = portion.team.tell_all([local_chunks, [pieces[chunk].facts for chunk in local_chunks], counts])
+    metadata = {chunk: item for rank_chunks, items, _ in gathered for chunk, item in zip(rank_chunks, items)}
+    regions = [count for chunk in range(chunks) for count in metadata[chunk][0]]
+    widths = [(sum(metadata[chunk][0]), len(metadata[chunk][0])) for chunk in range(chunks)]  # columns of both matrices
+    _, weight_power, num_excluded, weight_bytes = metadata[0]
+    dtype = torch.float64 if weight_bytes == 8 else torch.float32
+    chunks_by_rank = [rank_chunks for rank_chunks, _, _ in gathered]
+    result = []
+    for i, matrix in enumerate(matrices):
+        first_column = [0, *accumulate(width[i] for width in widths)]
+        received = [counts[portion.team.rank][i] for _, _, counts in gathered]
+        result.append(_exchange_rows(matrix, chunks_by_rank, received, first_column, portion, dtype))
+    region_view = torch.repeat_interleave(torch.arange(len(regions), dtype=torch.int32), torch.tensor(regions))
+    return Evidence(result[0], region_view.to(device), result[1], len(regions), weight_power, num_excluded)
+
+
+def _exchange_rows(
+    entries: Sequence[Sequence[CooEntries]],
+    chunks_by_rank: Sequence[Sequence[int]],
+    counts: Sequence[Sequence[int]],
+    first_column: Sequence[int],
+    portion: Partition,
+    dtype: torch.dtype,
+) -> SparseRows:
+    """Exchange the entries of a matrix, and return the rows of this process's Gaussians.
+
+    Args:
+        entries: entries of this process, by chunk and receiving process.
+        chunks_by_rank: chunks of every process.
+        counts: number of entries that every process sends to this one, by chunk.
+        first_column: first column of every chunk in the whole matrix.
+        dtype: type of the weights.
+    """
+    team, device = portion.team, portion.order.device
+    empty = CooEntries(*(torch.zeros(0, dtype=x, device=device) for x in (torch.int32, torch.int32, dtype)))
+    arrays = []
+    for name in CooEntries._fields:
+        sent = [[getattr(empty, name), *(getattr(chunk[rank], name) for chunk in entries)] for rank in range(team.size)]
+        arrays.append(team.exchange([torch.cat(parts) for parts in sent]))
+    received: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    for rank, chunks in enumerate(chunks_by_rank):
+        parts = [array[rank].split(list(counts[rank])) for array in arrays]
+        for chunk, row, column, weight in zip(chunks, *parts):
+            received[chunk] = row.long(), column + first_column[chunk], weight
+    return SparseRows.stack([received[chunk] for chunk in sorted(received)], len(portion), device)
+
+
+class Halo(NamedTuple):
+    """Gaussians of a portion, followed by their neighbors in other processes."""
+
+    lifted: Lifted
+    """Directions of all these Gaussians; of the scalars, only the norm is valid."""
+    neighbors: Neighbors
+    """Neighbors of the portion's Gaussians, as rows of this object."""
+    gaussians: Int64[Tensor, " all"]
+    """Index of each of these Gaussians in the scene."""
+
+
+def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Halo:
+    """Gather the directions and neighbors that a vote of the portion's Gaussians reads.
+
+    Args:
+        lifted: lift of the portion.
+        neighbors: neighbors of the portion's Gaussians, as indices in the scene.
+    """
+    team, local, device = portion.team, portion.gaussians, portion.order.device
+    _, row = portion.place
+    wanted = torch.zeros(len(portion.order) + 1, dtype=torch.bool, device=device)  # the last element is for -1
+    for index in neighbors.index.split(_RENUMBER_BLOCK):
+        wanted[index.long()] = True
+    wanted[local] = False
+    halo = [gaussians[wanted[gaussians]] for gaussians in portion.by_owner]
+    requested = team.exchange([row[gaussians] for gaussians in halo])
+    evidence, norm = lifted.evidence, lifted.scalars.norm
+    sent = [evidence.rows.select_rows(rows.long()) for rows in requested]
+    lengths, column, weight, halo_norm = (
+        torch.cat(team.exchange(parts))
+        for parts in (
+            [x.offsets.diff() for x in sent],
+            [x.column for x in sent],
+            [x.weight for x in sent],
+            [norm[rows.long()] for rows in requested],
+        )
+    )
+    lengths = torch.cat([evidence.rows.offsets.diff(), lengths])
+    offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    rows = SparseRows(offsets, torch.cat([evidence.rows.column, column]), torch.cat([evidence.rows.weight, weight]))
+    blank = SparseRows(torch.zeros_like(offsets), evidence.unlabeled.column[:0], evidence.unlabeled.weight[:0])
+    scalars = lifted.scalars.map(lambda x: torch.cat([x, x.new_zeros(len(halo_norm))]))
+    scalars = replace(scalars, norm=torch.cat([norm, halo_norm]))
+    extended = Lifted(scalars, replace(evidence, rows=rows, unlabeled=blank), lifted.features)
+    gaussians = torch.cat([local, *halo])
+    row_of = torch.full((len(portion.order) + 1,), -1, dtype=torch.int32, device=device)
+    row_of[gaussians] = torch.arange(len(gaussians), dtype=torch.int32, device=device)
+    index = torch.cat([row_of[block.long()] for block in neighbors.index.split(_RENUMBER_BLOCK)])
+    return Halo(extended, neighbors._replace(index=index), gaussians)

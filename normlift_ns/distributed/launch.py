@@ -1,0 +1,416 @@
+"""Heartbeats that reveal a lost process and tolerate a slow one.
+
+A thread of every process increments a counter in the shared store, even while an image takes hours. A process whose
+counter stops is lost, and the others report that and exit. A process that fails reports its own error first.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import timedelta
+from functools import partial
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from normlift_ns.errors import InputError
+
+if TYPE_CHECKING:
+    from normlift_ns.core.partition import Communicator
+
+
+HEARTBEAT_INTERVAL = 2.0
+"""Seconds between heartbeats."""
+HEARTBEAT_TIMEOUT = 30.0
+"""Seconds without a heartbeat after which a process counts as lost."""
+_GRACE = 10.0
+"""Seconds between SIGTERM and a forced exit of this process, which may be waiting for the lost one."""
+
+
+class PeerFailure(NamedTuple):
+    """Loss or failure of another process, after which this one has to exit."""
+
+    rank: int
+    """Rank of the lost or failed process."""
+    failed: bool
+    """True if the process failed and reported the error itself; False if its heartbeat stopped."""
+    place: str
+    """Host name and process id."""
+
+
+@dataclass
+class Heartbeat:
+    """Heartbeat of this process, and monitor of the others."""
+
+    store: Any
+    """Client of the shared store, for this object only."""
+    rank: int
+    size: int
+    last_words: Callable[[PeerFailure], None]
+    """Callback invoked before a forced exit; it must return quickly."""
+    lost: PeerFailure | None = None
+    _waiting: bool = False
+    _stop: Event = field(default_factory=Event)
+    _loss_detected: Event = field(default_factory=Event)
+
+    def start(self) -> None:
+        """Start the thread that sends the heartbeat and monitors the others."""
+        self.store.set(f"place/{self.rank}", f"{socket.gethostname()}, process {os.getpid()}")
+        Thread(target=self._run, name="heartbeat", daemon=True).start()
+
+    def stop(self, well: bool) -> bool:
+        """Stop the heartbeat, and announce to the others that this process exits.
+
+        If the store is unreachable, process 0, which hosts it, has exited: it has reported its own error, unless this
+        process has detected the loss.
+
+        Args:
+            well: True if the process succeeded. Otherwise, the others have to exit too.
+        Returns:
+            Whether this process is the first to fail, and should report its error.
+        """
+        self._stop.set()
+        with suppress(Exception):  # a lost store raises various errors, and the other processes are lost too
+            first = not well and self.store.add("failures", 1) == 1
+            self.store.set(f"end/{self.rank}", "well" if well else "failed")
+            if well and self.rank == 0:  # the store may live in this process
+                self.store.wait([f"end/{r}" for r in range(self.size)], timedelta(seconds=2 * HEARTBEAT_INTERVAL))
+            return first
+        return self.rank == 0 or self.lost is not None
+
+    def wait_for_a_loss(self) -> PeerFailure | None:
+        """Wait for the cause of a communication error; return the lost process, or None if all processes are alive."""
+        self._waiting = True
+        self._loss_detected.wait(HEARTBEAT_TIMEOUT + 5 * HEARTBEAT_INTERVAL)
+        return self.lost
+
+    def _run(self) -> None:
+        beats: dict[int, tuple[bytes, float]] = {}
+        places = {r: "host unknown" for r in range(self.size)}
+        count = 0
+        while self.lost is None and not self._stop.wait(HEARTBEAT_INTERVAL):
+            count += 1
+            try:
+                self.store.set(f"beat/{self.rank}", str(count))
+                for r in range(self.size):
+                    if r != self.rank:
+                        self._check(r, beats, places)
+            except Exception:  # a store whose process is lost raises various errors
+                self.lost = self.lost or PeerFailure(0, False, places[0])
+        if self.lost is not None and not self._stop.is_set():
+            self._exit()
+
+    def _check(self, r: int, beats: dict[int, tuple[bytes, float]], places: dict[int, str]) -> None:
+        if self.store.check([f"place/{r}"]):
+            places[r] = self.store.get(f"place/{r}").decode()
+        if self.store.check([f"end/{r}"]):
+            if self.store.get(f"end/{r}") == b"failed":
+                self.lost = PeerFailure(r, True, places[r])
+            return
+        beat = self.store.get(f"beat/{r}") if self.store.check([f"beat/{r}"]) else b""
+        now = time.monotonic()
+        if r not in beats or beats[r][0] != beat:
+            beats[r] = beat, now
+        elif now - beats[r][1] > HEARTBEAT_TIMEOUT:
+            self.lost = PeerFailure(r, False, places[r])
+
+    def _exit(self) -> None:
+        self._loss_detected.set()
+        if self._waiting:
+            return
+        os.kill(os.getpid(), signal.SIGTERM)  # lets the process remove half-written files
+        if not self._stop.wait(_GRACE):
+            assert self.lost is not None
+            self.last_words(self.lost)
+            os._exit(1)
+
+
+# Start of distributed lifts: launch processes on this machine, or join those of torchrun on any number of machines.
+
+
+TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+"""Environment variables that torchrun sets for distributed processes."""
+LAUNCHED_VARIABLE = "NORMLIFT_TEAM"
+"""Environment variable that marks processes launched by `launch_processes`, which reports if one is killed."""
+_RESUME_HINT = "2D features and evidence of finished views are saved; run the command again to continue."
+_COLLECTIVE_TIMEOUT = timedelta(days=7)
+"""Longest wait for another process in a collective; heartbeats show whether it is alive."""
+_JOIN_TIMEOUT = timedelta(minutes=10)
+"""Time limit for all processes to connect."""
+_QUIET_WAIT = 15.0
+"""Seconds of waiting before a message is printed."""
+_PR_SET_PDEATHSIG = 1
+"""Option of Linux's prctl."""
+_LOOPBACK = {"linux": "lo", "darwin": "lo0"}
+
+
+class PeerFailureError(RuntimeError):
+    """Loss or failure of another process."""
+
+    def __init__(self, lost: PeerFailure) -> None:
+        super().__init__(f"process {lost.rank} ({lost.place}) {'failed' if lost.failed else 'was lost'}")
+        self.lost = lost
+
+
+def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
+    """Return rank and world size from the variables that torchrun and `launch_processes` set, or None for a single process.
+
+    Raises:
+        InputError: if the values are not valid numbers.
+
+    >>> rank_and_world_size({"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}), rank_and_world_size({})
+    ((1, 2), None)
+    """
+    if any(name not in environment for name in TORCHRUN_VARIABLES):
+        return None
+    values = {name: environment[name] for name in TORCHRUN_VARIABLES if name != "MASTER_ADDR"}
+    if not all(value.isdecimal() for value in values.values()) or int(values["RANK"]) >= int(values["WORLD_SIZE"]):
+        raise InputError(
+            "the environment variables of torchrun are invalid: "
+            + ", ".join(f"{name}={value!r}" for name, value in values.items())
+            + ". Start ns-normlift with torchrun or --num-devices, or unset these variables"
+        )
+    rank, size = int(values["RANK"]), int(values["WORLD_SIZE"])
+    return (rank, size) if size > 1 else None
+
+
+def launch_processes(command: Sequence[str], count: int, log: Callable[[str], None]) -> int:
+    """Run a command in several processes on this machine, and return the exit code.
+
+    If one process fails, the others are terminated.
+
+    Args:
+        command: command line.
+        count: number of processes.
+        log: callback for a message that names a process killed by a signal. Other failures are reported by the
+            process itself.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    env = os.environ | {
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "WORLD_SIZE": str(count),
+        LAUNCHED_VARIABLE: "1",
+    }
+    env.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // count)))
+    env.setdefault("NCCL_NVLS_ENABLE", "0")  # multicast is not faster here, and can fail
+    if sys.platform in _LOOPBACK:  # do not listen on the network
+        env |= {name: _LOOPBACK[sys.platform] for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")}
+    processes = [
+        subprocess.Popen(
+            command if r == 0 else _without_log_file(command),
+            env=env | {"RANK": str(r), "LOCAL_RANK": str(r)},
+            stdin=subprocess.DEVNULL,
+            preexec_fn=exit_with_parent(),  # noqa: PLW1509 (the launcher has no threads)
+        )
+        for r in range(count)
+    ]
+    try:
+        return _watch(processes, log)
+    except BaseException:  # Ctrl-C or SIGTERM
+        _end(processes)
+        raise
+
+
+def _without_log_file(command: Sequence[str]) -> list[str]:
+    """Remove --log-file from a command line, because only the first process writes that file.
+
+    >>> _without_log_file(["ns-normlift", "--log-file", "a.txt", "--quiet"])
+    ['ns-normlift', '--quiet']
+    >>> _without_log_file(["ns-normlift", "--log_file=a.txt"])
+    ['ns-normlift']
+    """
+    result, skip = [], False
+    for word in command:
+        flag, equals, _ = word.replace("_", "-").partition("=")
+        is_log_file = not skip and flag == "--log-file"
+        if not skip and not is_log_file:
+            result.append(word)
+        skip = is_log_file and not equals
+    return result
+
+
+def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], None]) -> int:
+    while True:
+        codes = [process.poll() for process in processes]
+        failed = [(r, code) for r, code in enumerate(codes) if code]
+        if len(failed) > 0:
+            rank, code = failed[0]
+            if code < 0:
+                name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+                hint = ", possibly because the machine ran out of memory" if name == "SIGKILL" else ""
+                log(f"Process {rank} of 0..{len(processes) - 1} was killed by {name}{hint}. {_RESUME_HINT}")
+            _end(processes)
+            return code if code > 0 else 1
+        if all(code == 0 for code in codes):
+            return 0
+        time.sleep(0.1)
+
+
+def _end(processes: Sequence[subprocess.Popen[bytes]], grace: float = 8.0) -> None:
+    for process in processes:
+        process.terminate()
+    deadline = time.monotonic() + grace
+    for process in processes:
+        try:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def exit_with_parent() -> Callable[[], None] | None:
+    """Return a `preexec_fn` that makes a new process exit with this one, or None on systems other than Linux."""
+    if sys.platform != "linux":
+        return None
+    return partial(_die_with_parent, ctypes.CDLL(None).prctl, os.getpid())
+
+
+def _die_with_parent(prctl: Callable[..., int], parent: int) -> None:
+    prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:  # the parent has exited already
+        os._exit(128 + signal.SIGTERM)
+
+
+def _use_single_gpu(local_rank: int, device: str) -> None:
+    """Make only the GPU with the process's local rank visible, before torch initializes CUDA.
+
+    Raises:
+        InputError: if the machine has fewer GPUs.
+    """
+    import torch  # noqa: PLC0415 (not needed by the launcher)
+
+    count = torch.cuda.device_count() if device != "cpu" else 0
+    if count == 0 and device in ("cpu", "auto"):
+        return
+    if local_rank >= count:
+        raise InputError(
+            f"process {local_rank} on this machine needs its own GPU; start at most one per GPU ({count} found)"
+        )
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    os.environ["CUDA_VISIBLE_DEVICES"] = visible[local_rank] if local_rank < len(visible) > 1 else str(local_rank)
+
+
+@contextmanager
+def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Communicator]:
+    """Provide a context with the team of this process, or `SINGLE_PROCESS` if the environment describes none.
+
+    Args:
+        device: cpu, cuda or auto.
+        log: callback for a message that names a lost process, if no other process reports it.
+    Raises:
+        InputError: if the processes cannot connect, or there are too few GPUs.
+        LostError: if another process fails or is lost.
+    """
+    ranks = rank_and_world_size(os.environ)
+    if ranks is not None:  # hide torch's warnings for developers; torch reads the variable when it is imported
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
+    from normlift_ns.core.partition import SINGLE_PROCESS  # noqa: PLC0415 (torch, as above)
+
+    if ranks is None:
+        yield SINGLE_PROCESS
+        return
+    rank, size = ranks
+    _use_single_gpu(int(os.environ.get("LOCAL_RANK", "0")), device)
+    import torch  # noqa: PLC0415 (as above)
+    import torch.distributed as dist  # noqa: PLC0415
+
+    from normlift_ns.distributed.communicator import TorchCommunicator  # noqa: PLC0415
+
+    on_gpu = device != "cpu" and torch.cuda.is_available()
+    store, heart = _connect(rank, size, "nccl" if on_gpu else "gloo", log)
+    team = TorchCommunicator(rank=rank, size=size, device=torch.device("cuda" if on_gpu else "cpu"), store=store)
+    try:
+        yield team
+        team.add(torch.zeros(1))  # wait until process 0 has written its files
+    except BaseException as error:
+        lost = heart.lost
+        if lost is None and isinstance(error, RuntimeError) and _is_network_error(error):
+            lost = heart.wait_for_a_loss()
+        if not heart.stop(well=False):  # another process has reported its error
+            lost = PeerFailure(rank, True, "this one") if lost is None else lost._replace(failed=True)
+        if lost is None:
+            raise
+        raise PeerFailureError(lost) from error
+    heart.stop(well=True)
+    dist.destroy_process_group()
+
+
+def describe_failure(lost: PeerFailure) -> str:
+    """Return a message for the user about a lost process."""
+    return f"Process {lost.rank} ({lost.place}) was lost, so the others exit. {_RESUME_HINT}"
+
+
+def _is_network_error(error: Exception) -> bool:
+    keywords = ("gloo", "nccl", "connection", "peer", "socket", "timed out", "timeout")
+    return any(word in str(error).lower() for word in keywords)
+
+
+def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> tuple[Any, Heartbeat]:
+    """Connect to the other processes; return a store for counters, and the running heartbeat of this process."""
+    import torch.distributed as dist  # noqa: PLC0415 (as above)
+    from torch.distributed import PrefixStore, TCPStore  # noqa: PLC0415 # pyright: ignore[reportPrivateImportUsage]
+
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    is_host = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+    report = (lambda text: None) if LAUNCHED_VARIABLE in os.environ else log
+    try:
+        fd = None
+        if is_host and LAUNCHED_VARIABLE in os.environ:  # listen on this machine only, not on the network
+            fd = socket.create_server((host, port)).detach()
+        if not is_host:
+            _wait(lambda: _is_listening(host, port), f"process 0 at {host}:{port}", report)
+        options = {"timeout": _JOIN_TIMEOUT, "wait_for_workers": False}
+        store = TCPStore(host, port, size, is_host, master_listen_fd=fd, **options)
+        ready = PrefixStore("ready", store)
+        ready.set(str(rank), "")
+        _wait(lambda: ready.check([str(r) for r in range(size)]), f"all {size} processes at {host}:{port}", report)
+        group_store = PrefixStore("group", store)
+        dist.init_process_group(backend, timeout=_COLLECTIVE_TIMEOUT, store=group_store, rank=rank, world_size=size)
+        heart_store = PrefixStore("heartbeat", TCPStore(host, port, size, False, **options))
+        heart = Heartbeat(heart_store, rank, size, lambda lost: log(describe_failure(lost)))
+    except TimeoutError as error:
+        raise InputError(
+            f"process {rank} of {size} waited {_JOIN_TIMEOUT} for {error}; check that all processes were started"
+        ) from error
+    except (RuntimeError, OSError) as error:
+        raise InputError(
+            f"process {rank} of {size} cannot connect to the others at {host}:{port} ({str(error).splitlines()[0]}); "
+            "check that all processes were started and that no firewall blocks them"
+        ) from error
+    heart.start()
+    return PrefixStore("counts", store), heart
+
+
+def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) -> None:
+    """Wait in Python, which signals can interrupt; raise TimeoutError at the time limit."""
+    start_time, warned = time.monotonic(), False
+    while not ready():
+        waited = time.monotonic() - start_time
+        if waited > _JOIN_TIMEOUT.total_seconds():
+            raise TimeoutError(target)
+        if waited > _QUIET_WAIT and not warned:
+            warned = True
+            log(
+                f"Waiting for {target}. If this command should not wait for other processes, unset {', '.join(TORCHRUN_VARIABLES)}."
+            )
+        time.sleep(0.1)
+
+
+def _is_listening(host: str, port: int) -> bool:
+    """Return whether a server accepts connections at this address."""
+    try:
+        socket.create_connection((host, port), timeout=5).close()
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,422 @@
+"""Sources of 2D features: an image becomes labeled regions with one unit feature each, a prompt becomes a unit vector.
+
+The two steps are separate. `Regions` segments an image, an `Encoder` embeds regions and prompts in one space, and
+`RegionFeatures` combines the two into a `FeatureSource`. The rest of the package uses `FeatureSource` only. Code that
+gets labels and features together, such as an importer of preprocessed data, implements `FeatureSource` directly.
+
+An image may be segmented at several levels. Evidence is rasterized once, on the cells that all levels share
+(`joint_partition`), and then summed over the regions of the selected level.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int32, Int64, UInt8
+from torch import Tensor
+
+from normlift_ns.encoders.batching import AdaptiveBatches, prefetch_map
+from normlift_ns.encoders.prompts import UNIT_TOLERANCE
+from normlift_ns.errors import InputError
+from normlift_ns.segmentation.regions import resample_nearest
+
+
+@dataclass(frozen=True)
+class ViewFeatures:
+    """2D features of one image, on the CPU. The rasterizer sums weights over cells; a region is a set of cells that
+    share one feature.
+
+    Cells depend on all levels of an image, not on the selected one. Another level of the same source has the same
+    cells, so its evidence is already computed.
+
+    Raises:
+        ValueError: If a type or shape is wrong, a label has no cell, a cell no feature row, or a row not unit length.
+    """
+
+    labels: Int32[Tensor, "h w"]
+    """Cell of every pixel, in -1..C-1; -1: none."""
+    features: Float32[Tensor, "r d"]
+    """One unit row per region."""
+    regions: Int32[Tensor, "levels c"] | None = None
+    """Region of every cell in each selected level, in -1..R-1; -1: none, as if the pixels were unlabeled. With several
+    levels, every pixel counts once in each. None: every cell is a region."""
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
+            value: Tensor | None = getattr(self, name)
+            if value is not None and (value.ndim != 2 or value.dtype != dtype or value.device.type != "cpu"):
+                raise InputError(
+                    f"ViewFeatures.{name} must be a {dtype} matrix on the CPU, got {value.dtype} "
+                    f"{tuple(value.shape)} on {value.device}"
+                )
+        cells = len(self.features) if self.regions is None else self.regions.shape[1]
+        _check_range("labels", self.labels, cells, "cell")
+        if self.regions is not None:
+            _check_range("regions", self.regions, len(self.features), "feature row")
+        length = torch.linalg.vector_norm(self.features.double(), dim=1)
+        bad = (~((length - 1).abs() < UNIT_TOLERANCE)).nonzero().squeeze(1)
+        if bad.numel() > 0:
+            first = int(bad[0])
+            raise InputError(
+                f"{bad.numel()} of {len(self.features)} rows of ViewFeatures.features are not unit vectors (row "
+                f"{first} has length {length[first]:.3g}); normalize them, and label regions without a feature -1"
+            )
+
+    @property
+    def region_of_cell(self) -> Int32[Tensor, "levels c"]:
+        """Return `regions`, or the identity mapping if `regions` is None."""
+        return torch.arange(len(self.features), dtype=torch.int32)[None] if self.regions is None else self.regions
+
+
+def _check_range(name: str, values: Tensor, count: int, unit: str) -> None:
+    """Raise InputError if a value is not in -1..count-1."""
+    if values.numel() > 0 and not -1 <= int(values.min()) <= int(values.max()) < count:
+        raise InputError(
+            f"ViewFeatures.{name} must be in -1..{count - 1} (there are {count} {unit}s), found "
+            f"{int(values.min())}..{int(values.max())}"
+        )
+
+
+class FeatureSource(Protocol):
+    """A source of 2D image features and of text embeddings in the same space."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Every setting that changes the result, as JSON-serializable values; the manifest stores it.
+
+        Device and precision are left out: they change rounding only.
+        """
+        ...
+
+    def available(self, names: Sequence[str]) -> list[str]:
+        """Return the given images that have features. A lift skips the others, as if they had never been taken.
+
+        Raises:
+            ValueError, FileNotFoundError: As `view`, for errors that can be detected without reading an image.
+        """
+        ...
+
+    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
+        """Return the regions and features of one image.
+
+        Args:
+            image: RGB, 0..255.
+            name: Path of the image relative to its dataset, such as "images/0001.jpg".
+        Raises:
+            ValueError, FileNotFoundError: With what was found, what was expected and what to do.
+        """
+        ...
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return one unit row per prompt, on the CPU.
+
+        Raises:
+            ValueError: If `prompts` or a prompt is empty, or the encoder does not understand one.
+        """
+        ...
+
+
+class Regions(Protocol):
+    """A method that segments images into regions."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Every setting that changes `labels`, as JSON-serializable values; `chosen` is not part of it."""
+        ...
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """Indices of the selected levels of `labels`; (): the only one."""
+        ...
+
+    @property
+    def at_once(self) -> int:
+        """Number of images to pass to `labels` concurrently, one per thread; 1 for a network, which uses its device
+        fully."""
+        ...
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """Return the files that `labels` reads for an image, other than the image itself.
+
+        Raises:
+            ValueError, FileNotFoundError: As `labels`.
+        """
+        ...
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
+        """Return the region of every pixel in every level, selected or not, on any device. Region ids in a level are
+        0..R-1 without gaps; -1: none. A method without levels returns one.
+
+        If regions overlap, depth 0 holds the one that counts for the lift; only the encoder uses deeper ones. A method
+        without overlaps returns depth 1.
+        """
+        ...
+
+
+class TextEncoder(Protocol):
+    """The part of an encoder that queries need."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """See `FeatureSource.identity`."""
+        ...
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """See `FeatureSource.text`."""
+        ...
+
+
+class Encoder(TextEncoder, Protocol):
+    """A joint embedding space of image regions and text."""
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        """Return one unit row per region, on the CPU. `labels` is one level of `Regions.labels`; a region consists of
+        all pixels that have its id at any depth."""
+        ...
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        """Yield `encode` of several views in order; results may differ from `encode` by rounding. The iterator takes a
+        view from `views` only when all earlier features have been yielded, or when batching that view with earlier ones
+        is faster."""
+        ...
+
+
+@dataclass(frozen=True)
+class RegionFeatures:
+    """A `FeatureSource` that combines a segmentation method and an encoder."""
+
+    regions: Regions
+    encoder: Encoder
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        chosen = {"levels": list(self.regions.chosen)}
+        return {"regions": self.regions.identity, **chosen, "encoder": self.encoder.identity}
+
+    def available(self, names: Sequence[str]) -> list[str]:
+        files = ((name, file) for name in names for file in self.regions.files(name))
+        check_files_distinct(files, "label map", "in folders named like those of the images")
+        return list(names)
+
+    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
+        return next(self.views([(image, name)]))
+
+    def views(self, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
+        """Yield the features of several images; see `iterate_view_features`."""
+        pending: deque[tuple[Tensor, Tensor]] = deque()  # cells, and their regions in the selected levels
+
+        def selected_levels() -> Iterator[tuple[Tensor, Tensor]]:
+            chosen = list(self.regions.chosen or (0,))
+            for image, maps in prefetch_map(self._segment, images, self.regions.at_once):
+                cells, regions = joint_partition(maps[:, 0])
+                pending.append((cells.cpu(), regions[chosen].cpu()))
+                for level in chosen:
+                    yield image, maps[level]
+
+        encoded = self.encoder.encode_each(selected_levels())
+        for rows in encoded:
+            cells, regions = pending.popleft()
+            features = [rows, *islice(encoded, len(regions) - 1)]
+            offsets = torch.tensor([0, *map(len, features)]).cumsum(0)[:-1, None].int()
+            yield ViewFeatures(cells, torch.cat(features), torch.where(regions >= 0, regions + offsets, -1))
+
+    def _segment(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
+        """Return the image, on the CPU, and its label maps; check that they contain the selected levels."""
+        image, name = view
+        check_image(image, name)
+        image = image.cpu()
+        maps = self.regions.labels(image, name)
+        chosen = self.regions.chosen or (0,) * (len(maps) == 1)
+        if len(chosen) == 0 or max(chosen) >= len(maps):
+            origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
+            raise InputError(f"{origin} has {len(maps)} levels of regions, 0..{len(maps) - 1}; choose one with --level")
+        return image, maps
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        return self.encoder.text(prompts)
+
+
+def segmentation_workers(source: FeatureSource) -> int:
+    """Return the number of images that a source segments concurrently."""
+    return source.regions.at_once if isinstance(source, RegionFeatures) else 1
+
+
+def iterate_view_features(
+    source: FeatureSource, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]
+) -> Iterator[ViewFeatures]:
+    """Yield `source.view` of several images in order; results may differ from `view` by rounding. Images are requested
+    as needed; an encoder that batches regions of several images requests several of them ahead."""
+    if isinstance(source, RegionFeatures):
+        return source.views(images)
+    return (source.view(image, name) for image, name in images)
+
+
+def check_image(image: Tensor, name: str) -> None:
+    """Raise ValueError unless `image` is a non-empty uint8 RGB image [H, W, 3]."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
+        raise InputError(
+            f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
+        )
+
+
+def check_files_distinct(files: Iterable[tuple[str, Path]], what: str, how: str) -> None:
+    """Check that no two images use the same file, with symbolic links resolved.
+
+    Args:
+        files: Pairs of an image name and one of its files.
+        what: Kind of file, for the message.
+        how: How to give each image its own file, for the message.
+    Raises:
+        ValueError: If two images share a file.
+    """
+    owner: dict[str, str] = {}
+    for name, file in files:
+        other = owner.setdefault(os.path.realpath(file), name)
+        if other != name:
+            raise InputError(f"images {other} and {name} would share the {what} {file}; give each its own, {how}")
+
+
+def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:
+    """Partition an image into cells: the sets of pixels that have the same label in every level.
+
+    Args:
+        maps: Region of every pixel in every level; -1: none.
+    Returns:
+        The cell of every pixel, with ids 0..C-1 without gaps; -1 marks pixels without a label in any level. Then the
+        region of every cell in every level; -1: none. With one level without gaps in its ids, cells equal regions.
+    """
+    key = torch.zeros_like(maps[0], dtype=torch.int64)
+    key_count = 1
+    for labels in maps:
+        count = int(labels.max()) + 2
+        key, key_count = key * count + labels + 1, key_count * count
+        if len(maps) > 2:  # keep the product of the region counts within 64 bits
+            key, key_count = _renumber(key, key_count)
+    cells, count = _renumber(key, key_count)
+    unlabeled = int((maps == -1).all(dim=0).any())  # key 0, the smallest
+    cells = cells - unlabeled
+    regions = torch.empty(len(maps), count - unlabeled, dtype=torch.int32, device=maps.device)
+    labeled = cells >= 0
+    for level, labels in enumerate(maps):
+        regions[level, cells[labeled]] = labels[labeled]
+    return cells.int(), regions
+
+
+def _renumber(key: Int64[Tensor, "h w"], key_count: int) -> tuple[Int64[Tensor, "h w"], int]:
+    """Map keys in 0..key_count-1 to 0..C-1 in ascending order; return the mapped keys and C."""
+    if key_count > 8 * key.numel():
+        values, number = key.unique(return_inverse=True)
+        return number, len(values)
+    present = torch.zeros(key_count, dtype=torch.bool, device=key.device)
+    present[key] = True
+    number = present.cumsum(0)
+    return number[key] - 1, int(number[-1])
+
+
+# Dense features without masks: every patch of a vision transformer is a region with its own feature.
+
+
+class DenseEncoder(Encoder, Protocol):
+    """An encoder that also has features of patches."""
+
+    @property
+    def why_not_dense(self) -> str | None:
+        """The reason that this network has no features of patches, and what to do; None if it has them."""
+        ...
+
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        """Return one unit row per patch of a grid over the image, row by row, on the CPU.
+
+        Raises:
+            FileNotFoundError, ValueError: As `Encoder.encode`.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PatchFeatures:
+    """A `FeatureSource` of patches.
+
+    Raises:
+        ValueError: If the network has no features of patches, or the count is below 1.
+    """
+
+    encoder: DenseEncoder
+    """Encodes the patches and the prompts."""
+    count: int = 1024
+    """Approximate number of patches per image, at least 1."""
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise InputError(f"number of regions per image must be at least 1, got {self.count}")
+        reason = self.encoder.why_not_dense
+        if reason is not None:
+            raise InputError(reason)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return {"kind": "patches", "count": self.count, "encoder": self.encoder.identity}
+
+    def available(self, names: Sequence[str]) -> list[str]:
+        return list(names)
+
+    def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
+        """Return the regions and features of one image; raises as `features`."""
+        return ViewFeatures(self.labels(image), self.features(image, name))
+
+    def labels(self, image: UInt8[Tensor, "h w 3"]) -> Int32[Tensor, "h w"]:
+        """Return the nearest patch of every pixel, numbered row by row."""
+        height, width = image.shape[:2]
+        rows, columns = patch_grid(height, width, self.count)
+        patches = np.arange(rows * columns, dtype=np.int32).reshape(1, rows, columns)
+        return torch.from_numpy(resample_nearest(patches, height, width)[0])
+
+    def features(self, image: UInt8[Tensor, "h w 3"], name: str) -> Float32[Tensor, "r d"]:
+        """Return one unit row per patch.
+
+        Raises:
+            FileNotFoundError: If the weights cannot be downloaded.
+            ValueError: If the image is invalid, or the weight file is damaged or of another architecture.
+            MemoryError: If the image does not fit into the memory of the device.
+        """
+        check_image(image, name)
+        rows, columns = patch_grid(image.shape[0], image.shape[1], self.count)
+        return next(self._batches(lambda batch: self.encoder.patches(batch[0], rows, columns), image[None]))
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        return self.encoder.text(prompts)
+
+    @cached_property
+    def _batches(self) -> AdaptiveBatches:
+        return AdaptiveBatches(1)
+
+
+def patch_grid(height: int, width: int, count: int) -> tuple[int, int]:
+    """Return rows and columns of about `count` squares in an image, none smaller than a pixel.
+
+    >>> patch_grid(960, 540, 1024)
+    (43, 24)
+    """
+    side = max(1.0, math.sqrt(height * width / count))
+    return max(1, round(height / side)), max(1, round(width / side))
+
+
+def resize_image(image: UInt8[Tensor, "h w 3"], height: int, width: int) -> Float32[Tensor, "1 3 y x"]:
+    """Return the image at another size, in 0..255: bicubic interpolation, with antialiasing when it shrinks."""
+    pixels = image.permute(2, 0, 1)[None].float()
+    size = height, width
+    return torch.nn.functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False).clamp(
+        0, 255
+    )

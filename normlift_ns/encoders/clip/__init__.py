@@ -1,1 +1,0 @@
-"""OpenCLIP: features of masked crops and of patches."""

@@ -1,0 +1,489 @@
+"""Model families: their identifiers in configurations, and their text preprocessing. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import os
+import re
+import string
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from normlift_ns.encoders import registry
+from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
+
+_PUNCTUATION = str.maketrans("", "", string.punctuation)
+
+
+def _lowercase(text: str) -> str:
+    """Convert to lower case, which SigLIP 2 was trained on. Not every tokenizer that is published with it does so."""
+    return text.lower()
+
+
+def _canonicalize(text: str) -> str:
+    """Convert to lower case without punctuation, which SigLIP was trained on, like `SiglipTokenizer.canonicalize_text`.
+
+    >>> _canonicalize("A red mug,  on the table!")
+    'a red mug on the table'
+    """
+    return re.sub(r"\s+", " ", text.lower().translate(_PUNCTUATION)).strip()
+
+
+def _unchanged(text: str) -> str:
+    """Return the text unchanged, as MetaCLIP 2 expects it."""
+    return text
+
+
+@dataclass(frozen=True)
+class ModelFamily:
+    """Networks with the same training and preprocessing."""
+
+    name: str
+    """Value of `--encoder`."""
+    title: str
+    """Name in messages."""
+    model_types: tuple[str, ...]
+    """Values of "model_type" in config.json. Fixed-resolution SigLIP 2 models have the architecture of SigLIP and use
+    its name."""
+    default: str
+    """Hub name of the default model."""
+    read: Callable[[str], str]
+    """Prepares a text for the tokenizer."""
+    pad: str
+    """Token that pads texts to full length, if the tokenizer's configuration names none."""
+    tokenizers: tuple[str, ...]
+    """Substrings of the class names of its tokenizers."""
+    mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    """Mean of pixels in 0..1, if the configuration names none."""
+    std: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    """Standard deviation of pixels in 0..1, if the configuration names none."""
+
+
+MODEL_FAMILIES = {
+    family.name: family
+    for family in (
+        ModelFamily(
+            "siglip", "SigLIP", ("siglip",), "google/siglip-base-patch16-224", _canonicalize, "</s>", ("Siglip", "T5")
+        ),
+        ModelFamily(
+            "siglip2",
+            "SigLIP 2",
+            ("siglip", "siglip2"),
+            "google/siglip2-base-patch16-224",
+            _lowercase,
+            "<pad>",
+            ("Siglip2", "Gemma"),
+        ),
+        ModelFamily(
+            "metaclip2",
+            "MetaCLIP 2",
+            ("metaclip_2",),
+            "facebook/metaclip-2-worldwide-huge-quickgelu",
+            _unchanged,
+            "<pad>",
+            ("XLMRoberta",),
+            (0.48145466, 0.4578275, 0.40821073),
+            (0.26862954, 0.26130258, 0.27577711),
+        ),
+    )
+}
+"""Families by name."""
+
+
+def family_of_tokenizer(name: str) -> ModelFamily | None:
+    """Return the family of a tokenizer class; None if it may belong to any family.
+
+    >>> family_of_tokenizer("GemmaTokenizerFast").title, family_of_tokenizer("SiglipTokenizer").title
+    ('SigLIP 2', 'SigLIP')
+    """
+    for family in (MODEL_FAMILIES["siglip2"], MODEL_FAMILIES["siglip"], MODEL_FAMILIES["metaclip2"]):
+        if any(part in name for part in family.tokenizers):
+            return family
+    return None
+
+
+# Model folders of transformers: config.json, safetensors weights, tokenizer.json and image preprocessing.
+#
+# Files are untrusted until checked. Of a configuration, only the sizes of the network are used, each within bounds,
+# because configurations may name code, kernels to download and quantized formats. Needs no torch.
+
+
+CONFIG_FILE, WEIGHTS_FILE, WEIGHTS_INDEX_FILE, TOKENIZER_FILE = (
+    "config.json",
+    "model.safetensors",
+    "model.safetensors.index.json",
+    "tokenizer.json",
+)
+_TOKENIZER_CONFIG, _SPECIAL_TOKENS = "tokenizer_config.json", "special_tokens_map.json"
+_PREPROCESSING_FILES = ("preprocessor_config.json", "processor_config.json")
+"""The second file holds the contents of the first under "image_processor", among other entries."""
+METADATA_FILES = (
+    CONFIG_FILE,
+    WEIGHTS_INDEX_FILE,
+    TOKENIZER_FILE,
+    _TOKENIZER_CONFIG,
+    _SPECIAL_TOKENS,
+    *_PREPROCESSING_FILES,
+)
+_MAX_JSON_BYTES, _MAX_SHARDS = 2**27, 256
+_MAX_SIZES = {
+    "vocab_size": 2**21, "hidden_size": 2**14, "intermediate_size": 2**17, "num_hidden_layers": 256,
+    "num_attention_heads": 256, "max_position_embeddings": 2**12, "projection_size": 2**14, "projection_dim": 2**14,
+    "image_size": 2**12, "patch_size": 2**8, "num_patches": 2**16, "eos_token_id": 2**21, "num_channels": 3,
+}  # fmt: skip
+"""Configuration entries that are used, and their largest accepted values."""
+_ACTIVATIONS = ("gelu", "gelu_fast", "gelu_new", "gelu_pytorch_tanh", "quick_gelu", "relu", "silu")
+
+
+@dataclass(frozen=True)
+class PixelNormalization:
+    """Normalization of pixels, 0..255, for the network: (factor x - mean) / std."""
+
+    factor: float
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    side: int | None
+    """Height and width of input images; None: unknown, or not equal."""
+    patches: int | None
+    """Largest number of patches of an image, if images keep their aspect ratio; else None."""
+
+
+@dataclass(frozen=True)
+class TokenPadding:
+    """Padding of tokenized texts."""
+
+    pad: str
+    """Padding token."""
+    side: str
+    """left or right."""
+    masked: bool
+    """True if an attention mask hides padding from the network; SigLIP was trained without one."""
+
+
+@dataclass(frozen=True)
+class ModelFolder:
+    """The checked contents of a model folder."""
+
+    path: Path
+    model_type: str
+    text: dict[str, Any]
+    vision: dict[str, Any]
+    whole: dict[str, Any]
+    """Network sizes, by their names in the configurations of transformers: of the text part, the vision part, and the
+    whole network."""
+    pixels: PixelNormalization
+    tokens: TokenPadding
+    weights: tuple[Path, ...]
+    """safetensors files."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files that change the embeddings, in a fixed order."""
+        small = (self.path / name for name in METADATA_FILES)
+        return (*(file for file in small if file.is_file()), *self.weights)
+
+
+def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
+    """Read and check a model folder; weights and vocabulary are not read.
+
+    Raises:
+        InputError: If the folder is of another architecture, incomplete or damaged.
+    """
+    remedy = f"give --encoder-model the folder of a {family.title} network, or a name such as {family.default}"
+    try:
+        return _read(path, family)
+    except InputError as error:
+        raise InputError(f"{path}: {error}; {remedy}, or use --encoder open_clip") from None
+
+
+def _read(path: Path, family: ModelFamily) -> ModelFolder:
+    """Read a model folder; error messages do not name it."""
+    config = read_json(path / CONFIG_FILE)
+    kind = config.get("model_type")
+    if kind not in family.model_types:
+        expected = " or ".join(map(repr, family.model_types))
+        raise InputError(
+            f"{CONFIG_FILE} has the architecture {kind!r:.60}, expected that of {family.title}, {expected}"
+        )
+    text, vision = (_sizes(config.get(f"{part}_config"), f"{part}_config") for part in ("text", "vision"))
+    whole = {key: value for key, value in _sizes(config, CONFIG_FILE).items() if key == "projection_dim"}
+    if vision.pop("vision_use_head", True) is not True:
+        raise InputError(f"the network has no pooling head according to {CONFIG_FILE}, and thus no joint space")
+    tokens = _tokens(path, family)
+    return ModelFolder(path, kind, text, vision, whole, _pixels(path, family, kind), tokens, _weights(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        InputError: If the file does not exist, is not JSON, or holds anything but an object.
+    """
+    if not path.is_file():
+        raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, more than {_MAX_JSON_BYTES:,}")
+    try:
+        content = json.loads(path.read_text("utf8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path.name} holds {type(content).__name__}, expected an object")
+    return content
+
+
+def _sizes(values: object, where: str) -> dict[str, Any]:
+    """Return the checked sizes of a configuration that are present and not null."""
+    if values is None:
+        return {}
+    if not isinstance(values, Mapping):
+        raise InputError(f"{where} of {CONFIG_FILE} is {type(values).__name__}, expected an object")
+    sizes = {}
+    for key, maximum in _MAX_SIZES.items():
+        value = values.get(key)
+        if value is None:
+            continue
+        if type(value) is not int or not (0 if key.endswith("_id") else 1) <= value <= maximum:
+            raise InputError(f"{key} of {where} is {value!r:.40}, expected an integer, at most {maximum:,}")
+        sizes[key] = value
+    if (activation := values.get("hidden_act")) is not None:
+        if activation not in _ACTIVATIONS:
+            raise InputError(f"hidden_act of {where} is {activation!r:.40}, expected one of {', '.join(_ACTIVATIONS)}")
+        sizes["hidden_act"] = activation
+    if (epsilon := values.get("layer_norm_eps")) is not None:
+        sizes["layer_norm_eps"] = _number(epsilon, f"layer_norm_eps of {where}", 1e-12, 1.0)
+    if "vision_use_head" in values:
+        sizes["vision_use_head"] = values["vision_use_head"]
+    return sizes
+
+
+def _number(value: object, name: str, minimum: float, maximum: float) -> float:
+    """Return a number as float; raise InputError unless it is in minimum..maximum."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not minimum <= value <= maximum:
+        raise InputError(f"{name} is {value!r:.40}, expected a number in {minimum:g}..{maximum:g}")
+    return float(value)
+
+
+def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
+    """Read the normalization of pixels."""
+    names = [name for name in _PREPROCESSING_FILES if (path / name).is_file()]
+    if len(names) == 0:
+        raise InputError(f"{_PREPROCESSING_FILES[0]}, which describes image preprocessing, is missing")
+    file = names[0]
+    settings = read_json(path / file)
+    settings = settings.get("image_processor", settings)
+    if not isinstance(settings, Mapping):
+        raise InputError(f"image_processor of {file} is {type(settings).__name__}, expected an object")
+
+    def three(key: str, default: tuple[float, ...], minimum: float) -> tuple[float, ...]:
+        values = settings.get(key, list(default))
+        if not isinstance(values, list) or len(values) != 3:
+            raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
+        return tuple(_number(value, f"{key} of {file}", minimum, 1e3) for value in values)
+
+    normalize = settings.get("do_normalize", True) is not False
+    factor = _number(settings.get("rescale_factor", 1 / 255), f"rescale_factor of {file}", 1e-6, 1e3)
+    patches = settings.get("max_num_patches", 256)
+    if kind == "siglip2" and (type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]):
+        raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected an integer")
+    return PixelNormalization(
+        factor if settings.get("do_rescale", True) is not False else 1.0,
+        three("image_mean", family.mean, -1e3) if normalize else (0.0, 0.0, 0.0),
+        three("image_std", family.std, 1e-6) if normalize else (1.0, 1.0, 1.0),
+        None if kind == "siglip2" else _side(settings),
+        patches if kind == "siglip2" else None,
+    )
+
+
+def _side(settings: Mapping[str, Any]) -> int | None:
+    """Return the side of square input images; None if unknown or not square."""
+    cropped = settings.get("do_center_crop", "crop_size" in settings) is True
+    size = settings.get("crop_size" if cropped else "size")
+    if isinstance(size, Mapping):
+        size = size.get("height", size.get("shortest_edge")) if size.get("height") == size.get("width") else None
+    return size if type(size) is int else None
+
+
+def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
+    """Read the padding of texts; raise InputError if the tokenizer is missing or of another family."""
+    if not (path / TOKENIZER_FILE).is_file():
+        older = "; there is only an older spiece.model" if (path / "spiece.model").is_file() else ""
+        raise InputError(f"{TOKENIZER_FILE}, which encodes texts, is missing{older}")
+    files = [path / name for name in (_SPECIAL_TOKENS, _TOKENIZER_CONFIG) if (path / name).is_file()]
+    settings = {key: value for file in files for key, value in read_json(file).items()}
+    name = settings.get("tokenizer_class")
+    owner = family_of_tokenizer(name) if isinstance(name, str) else None
+    if owner is not None and owner != family:
+        raise InputError(
+            f"its tokenizer {truncate_text(str(name))} belongs to {owner.title}, not {family.title}: use "
+            f"--encoder {owner.name}"
+        )
+    pad = settings.get("pad_token") or family.pad
+    pad = pad.get("content") if isinstance(pad, Mapping) else pad
+    side = settings.get("padding_side", "right")
+    if not isinstance(pad, str) or side not in ("left", "right"):
+        raise InputError(f"{_TOKENIZER_CONFIG} has the unknown pad_token {pad!r:.40} or padding_side {side!r:.40}")
+    inputs = settings.get("model_input_names", ["input_ids"])
+    return TokenPadding(pad, side, isinstance(inputs, list) and "attention_mask" in inputs)
+
+
+def _weights(path: Path) -> tuple[Path, ...]:
+    """Return the weight files: one, or the shards that the index names."""
+    if (path / WEIGHTS_FILE).is_file():
+        return (path / WEIGHTS_FILE,)
+    if not (path / WEIGHTS_INDEX_FILE).is_file():
+        pickled = "; pickles such as pytorch_model.bin are not read" if any(path.glob("*.bin")) else ""
+        raise InputError(f"{WEIGHTS_FILE} is missing{pickled}")
+    shards = read_json(path / WEIGHTS_INDEX_FILE).get("weight_map")
+    names = sorted({*shards.values()} if isinstance(shards, Mapping) and all(map(_is_shard, shards.values())) else ())
+    if not 0 < len(names) <= _MAX_SHARDS:
+        raise InputError(
+            f"weight_map of {WEIGHTS_INDEX_FILE} is invalid, expected file names like model-00001-of-00002.safetensors"
+        )
+    missing = [name for name in names if not (path / name).is_file()]
+    if len(missing) > 0:
+        raise InputError(f"{missing[0]}, which {WEIGHTS_INDEX_FILE} names, is missing")
+    return tuple(path / name for name in names)
+
+
+def _is_shard(name: object) -> bool:
+    """Return whether a name is that of a safetensors file in the same folder."""
+    return isinstance(name, str) and name.endswith(".safetensors") and name == os.path.basename(name)
+
+
+def patches_per_side(count: int) -> int:
+    """Return the number of patches along the side of a square image that has at most `count` patches.
+
+    >>> patches_per_side(256), patches_per_side(300)
+    (16, 17)
+    """
+    return max(1, math.isqrt(count))
+
+
+# Location of a network: a local folder, the Hugging Face hub cache, or a download. Needs no torch.
+
+
+_MIN_VERSIONS = {"torch": (2, 6), "transformers": (4, 56)}
+
+
+def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
+    """Return the hub name or folder that the options select. The default of `--encoder-model` is an OpenCLIP model and
+    stands for the family's own default."""
+    return family.default if options.encoder_model == DEFAULT_MODEL else options.encoder_model
+
+
+def check_transformers_version(family: ModelFamily) -> None:
+    """Raise InputError if installed packages are missing or too old."""
+    for package, minimum in _MIN_VERSIONS.items():
+        required = ".".join(map(str, minimum))
+        try:
+            installed = version(package)
+        except PackageNotFoundError:
+            installed = "none"
+        numbers = tuple(int(part) for part in installed.split(".")[:2] if part.isdigit())
+        if numbers < minimum:
+            raise InputError(
+                f"--encoder {family.name} needs {package} {required} or later, found {installed} (pip install -U "
+                f'"{package}>={required}"); --encoder open_clip does not'
+            )
+
+
+def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> None:
+    """Check the options as far as possible without torch.
+
+    Raises:
+        InputError: If packages are missing or too old, an option belongs to another encoder, or the folder has another
+            architecture.
+        FileNotFoundError: If the folder does not exist, or the network cannot be downloaded.
+    """
+    check_transformers_version(family)
+    if options.encoder_pretrained != DEFAULT_PRETRAINED:
+        raise InputError(
+            f"--encoder-pretrained {options.encoder_pretrained} is for --encoder open_clip; give the folder of a "
+            f"{family.title} network with --encoder-model"
+        )
+    model = resolve_model_name(options, family)
+    check_model_name(model, family)
+    folder = find_local_model(model)
+    if folder is not None:
+        read_model_folder(folder, family)
+        return
+    try:
+        registry.check_hub_access()
+    except OSError as error:
+        raise _unreachable(model, family, error) from None
+
+
+def check_model_name(model: str, family: ModelFamily) -> None:
+    """Check that a name is a folder or can be a hub name.
+
+    Raises:
+        InputError, FileNotFoundError: If it cannot.
+    """
+    example = f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default}"
+    if os.path.isdir(model):
+        return
+    if os.path.lexists(model):
+        raise InputError(f"{model}, given with --encoder-model, is not a folder; {example}")
+    if registry.is_local_path(model, 2):
+        raise FileNotFoundError(f"{model}, given with --encoder-model, does not exist; {example}")
+    if len(Path(model).parts) != 2:
+        raise InputError(f"--encoder-model {model!r} is neither a folder nor a hub name; {example}")
+
+
+def find_local_model(model: str) -> Path | None:
+    """Return the folder of a network on this machine, which may be in the hub cache; None if it is missing or
+    incomplete."""
+    if os.path.isdir(model):
+        return Path(model).resolve()
+    if not registry.is_in_hub_cache(model, CONFIG_FILE):
+        return None
+    hub = importlib.import_module("huggingface_hub")
+    config, *weight_files = (
+        hub.try_to_load_from_cache(model, name) for name in (CONFIG_FILE, WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
+    )
+    complete = isinstance(config, str) and any(isinstance(file, str) for file in weight_files)
+    return Path(config).parent if complete else None
+
+
+def fetch_model(model: str, family: ModelFamily) -> Path:
+    """Return the folder of a network. If necessary, download it: only JSON and safetensors files.
+
+    Raises:
+        FileNotFoundError: If the network is not on this machine and cannot be downloaded.
+        InputError: If it has another architecture.
+    """
+    check_model_name(model, family)
+    local = find_local_model(model)
+    if local is not None:
+        return local
+    hub = importlib.import_module("huggingface_hub")
+    try:
+        registry.check_hub_access()
+        folder = Path(hub.snapshot_download(model, allow_patterns=[CONFIG_FILE]))
+    except Exception as error:  # download clients raise exceptions without a common base class
+        raise _unreachable(model, family, error) from None
+    kind = read_json(folder / CONFIG_FILE).get("model_type")
+    if kind not in family.model_types:
+        raise InputError(
+            f"{model} has the architecture {kind!r:.60}, expected that of {family.title}, "
+            f"{' or '.join(map(repr, family.model_types))}; give --encoder-model a name such as {family.default}"
+        )
+    try:
+        return Path(hub.snapshot_download(model, allow_patterns=[*METADATA_FILES, WEIGHTS_FILE, "model-*.safetensors"]))
+    except Exception as error:  # likewise
+        raise _unreachable(model, family, error) from None
+
+
+def _unreachable(model: str, family: ModelFamily, error: Exception) -> FileNotFoundError:
+    return FileNotFoundError(
+        f"the {family.title} network {model} is not on this machine and cannot be downloaded "
+        f"({registry.summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder that "
+        "needs no weights: --encoder colour"
+    )

@@ -1,0 +1,353 @@
+"""Networks of transformers with their weights on a device: embeddings of images, patches and texts in a joint space.
+
+SigLIP pools the tokens of all patches by attention with one learned query. As MaskCLIP (Zhou, Loy and Dai, ECCV 2022)
+does for the attention pooling of CLIP's ResNets, patch features replace that pooling by its value path. After the final
+norm, every token passes through the pooling's value and output projections as if the query attended to it alone. The
+rest of the head follows.
+
+MetaCLIP 2 has CLIP's class token instead. Of the last layer, only the first norm and the value and output projections
+are used (MaskCLIP's rule for vision transformers). The final norm and the projection into the joint space follow.
+Position embeddings are interpolated as in transformers.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast, get_args
+
+import torch
+from jaxtyping import Float, Float32, Int32, UInt8
+from safetensors.torch import load_file
+from torch import Tensor
+from torch.nn.functional import linear, normalize
+
+from normlift_ns.encoders.base import resize_image
+from normlift_ns.encoders.batching import AdaptiveBatches, CropNetwork, encode_crops
+from normlift_ns.encoders.huggingface import (
+    MODEL_FAMILIES,
+    TOKENIZER_FILE,
+    ModelFamily,
+    ModelFolder,
+    check_model_name,
+    fetch_model,
+    patches_per_side,
+    read_model_folder,
+)
+from normlift_ns.encoders.prompts import check_prompts
+from normlift_ns.encoders.registry import summarize_error
+from normlift_ns.encoders.text_files import check_template, prompt_templates
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import file_digest
+from normlift_ns.options import CropFill
+
+_CLASSES = {"siglip": "Siglip", "siglip2": "Siglip2", "metaclip_2": "MetaClip2"}
+"""Prefixes of class names in transformers, by architecture."""
+
+
+@dataclass
+class HuggingFaceNetwork:
+    """A network in half precision on a GPU, in float32 elsewhere. If values overflow in half precision, the network
+    switches to float32."""
+
+    model: Any
+    tokenizer: Any
+    folder: ModelFolder
+    mean: Float[Tensor, "3 1 1"]
+    std: Float[Tensor, "3 1 1"]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the training images."""
+        count = self.folder.pixels.patches
+        side = self.model.config.vision_config.image_size if count is None else patches_per_side(count) * self.patch
+        return side, side
+
+    @property
+    def patch(self) -> int:
+        """Side of a patch, in pixels."""
+        return self.model.config.vision_config.patch_size
+
+    @property
+    def width(self) -> int:
+        """Embedding dimension D."""
+        config = self.model.config
+        return config.projection_dim if self._is_clip else config.vision_config.hidden_size
+
+    @property
+    def _is_clip(self) -> bool:
+        return self.folder.model_type == "metaclip_2"
+
+    def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Return pixels, 0..255, on the device, normalized for the model."""
+        normalized = (pixels.to(self.mean.dtype) * self.folder.pixels.factor - self.mean) / self.std
+        return normalized.to(self.model.logit_scale.dtype)
+
+    def images(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
+        """Return unnormalized embeddings of images, 0..255, of `size`, on the device."""
+        return self._finite(lambda: self._pooled(pixels))
+
+    def patches(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
+        """Return unnormalized embeddings of all patches, row by row; see the module docstring.
+
+        Args:
+            pixels: Images, 0..255, of a whole number of patches, on the device.
+        """
+        return self._finite(lambda: self._value_path(pixels))
+
+    def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
+        """Return unnormalized embeddings of texts that the family has preprocessed."""
+        encoded = self.tokenizer.encode_batch(list(texts))
+        vocab_size, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
+        if largest >= vocab_size:
+            raise InputError(
+                f"{TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network only has {vocab_size} tokens"
+            )
+        inputs = {"input_ids": torch.tensor([text.ids for text in encoded], device=self.mean.device)}
+        if self.folder.tokens.masked:
+            inputs["attention_mask"] = torch.tensor([x.attention_mask for x in encoded], device=self.mean.device)
+        return self._finite(lambda: _pooled_output(self.model.get_text_features(**inputs)))
+
+    def _pooled(self, pixels: Tensor) -> Tensor:
+        return _pooled_output(self.model.get_image_features(**self._vision_inputs(pixels)))
+
+    def _vision_inputs(self, pixels: Tensor) -> dict[str, Any]:
+        """Return the inputs of the vision transformer."""
+        pixels, side = self.normalized(pixels), self.patch
+        if self.folder.model_type != "siglip2":
+            return {"pixel_values": pixels, "interpolate_pos_encoding": pixels.shape[2:] != self.size}
+        rows, columns = pixels.shape[2] // side, pixels.shape[3] // side
+        parts = pixels.unflatten(3, (columns, side)).unflatten(2, (rows, side))  # b 3 rows side columns side
+        shape = torch.tensor([[rows, columns]], device=pixels.device).expand(len(pixels), 2)
+        return {
+            "pixel_values": parts.permute(0, 2, 4, 3, 5, 1).flatten(3).flatten(1, 2),
+            "pixel_attention_mask": torch.ones(len(pixels), rows * columns, dtype=torch.int32, device=pixels.device),
+            "spatial_shapes": shape,
+        }
+
+    def _value_path(self, pixels: Tensor) -> Tensor:
+        """Return patch embeddings by the value path; see the module docstring."""
+        vision = self.model.vision_model
+        if self._is_clip:
+            last = vision.encoder.layers[-1]
+            tokens = last.layer_norm1(self._input_of(last, pixels)[:, 1:])
+            mixed = last.self_attn.out_proj(last.self_attn.v_proj(tokens))
+            return self.model.visual_projection(vision.post_layernorm(mixed))
+        head = vision.head
+        tokens = self._input_of(head, pixels)
+        weight, bias = (x.chunk(3)[2] for x in (head.attention.in_proj_weight, head.attention.in_proj_bias))
+        mixed = head.attention.out_proj(linear(tokens, weight, bias))
+        return mixed + head.mlp(head.layernorm(mixed))
+
+    def _input_of(self, module: Any, pixels: Tensor) -> Tensor:
+        """Return the input of a module while the network processes images."""
+        with _record_inputs(module) as recorded:
+            self._pooled(pixels)
+        return recorded[0]
+
+    @torch.no_grad()
+    def _finite(self, compute: Callable[[], Tensor]) -> Tensor:
+        """Compute embeddings, in float32 if half precision overflows; raise InputError if they are not finite."""
+        rows = compute()
+        if rows.dtype == torch.float16 and not bool(rows.isfinite().all()):
+            self.model.float()
+            rows = compute()
+        if not bool(rows.isfinite().all()):
+            raise InputError(
+                f"the network in {self.folder.path} returns vectors that are not finite; download it again"
+            )
+        return rows
+
+
+@contextmanager
+def _record_inputs(module: Any) -> Iterator[list[Tensor]]:
+    """Collect the first argument of every call of a module."""
+    recorded: list[Tensor] = []
+    hook = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0]))
+    try:
+        yield recorded
+    finally:
+        hook.remove()
+
+
+def _pooled_output(output: Any) -> Tensor:
+    """Return the embeddings: transformers 4 returns them directly, transformers 5 inside an output object."""
+    return output if isinstance(output, Tensor) else output.pooler_output
+
+
+def load_huggingface_network(folder: ModelFolder, family: ModelFamily, device: str) -> HuggingFaceNetwork:
+    """Load the network of a model folder.
+
+    Raises:
+        InputError: If the folder is damaged or does not match its configuration, or transformers does not know the
+            network.
+    """
+    remedy = f"give another folder with --encoder-model, or a name such as {family.default}; or use --encoder open_clip"
+    try:
+        model = _build_model(folder)
+        tokenizer = _load_tokenizer(folder, model.config.text_config)
+    except MemoryError:
+        raise
+    except Exception as error:  # transformers and tokenizers define their own exceptions
+        raise InputError(
+            f"{folder.path} is damaged or not a {family.title} network ({summarize_error(error)}); {remedy}"
+        ) from None
+    half = torch.device(device).type == "cuda"
+    model = model.to(device, torch.float16 if half else torch.float32).eval().requires_grad_(False)
+    mean, std = (torch.tensor(x, device=device)[:, None, None] for x in (folder.pixels.mean, folder.pixels.std))
+    return HuggingFaceNetwork(model, tokenizer, folder, mean, std)
+
+
+def _build_model(folder: ModelFolder) -> Any:
+    """Build the model from the checked sizes and load its weights in float32."""
+    transformers = importlib.import_module("transformers")
+    name = _CLASSES[folder.model_type]
+    config = getattr(transformers, f"{name}Config")(
+        text_config=folder.text, vision_config=folder.vision, **folder.whole
+    )
+    vision, pixels = config.vision_config, folder.pixels
+    if pixels.side is not None and pixels.side != vision.image_size:
+        raise InputError(
+            f"images are preprocessed to {pixels.side} pixels, but the network expects {vision.image_size}"
+        )
+    with torch.device("meta"):
+        model = getattr(transformers, f"{name}Model")(config)
+    state = {name: value for file in folder.weights for name, value in load_file(file).items()}
+    state = {name: value for name, value in state.items() if not name.endswith(".position_ids")}
+    integers = [name for name, value in state.items() if not value.is_floating_point()]
+    if len(integers) > 0:
+        raise InputError(f"the weight {integers[0]} is of type {state[integers[0]].dtype}, expected floats")
+    model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
+    for name, buffer in [*model.named_buffers()]:  # position_ids, which weight files do not contain
+        owner = model.get_submodule(name.rpartition(".")[0])
+        setattr(owner, name.rpartition(".")[2], torch.arange(buffer.shape[-1])[None])
+    return model
+
+
+def _load_tokenizer(folder: ModelFolder, config: Any) -> Any:
+    """Load the tokenizer; it pads texts to the length used in training, and truncates longer ones."""
+    tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / TOKENIZER_FILE))
+    length, tokens = cast(int, config.max_position_embeddings), folder.tokens
+    pad_id = tokenizer.token_to_id(tokens.pad)
+    if pad_id is None:
+        raise InputError(f"{TOKENIZER_FILE} does not contain the padding token {tokens.pad!r:.40}")
+    tokenizer.enable_truncation(length)
+    tokenizer.enable_padding(direction=tokens.side, pad_id=pad_id, pad_token=tokens.pad, length=length)
+    return tokenizer
+
+
+# Encoder with networks of transformers: masked square crops of regions, or patches, compared with text.
+
+
+_BATCH_SIZE = {"cuda": 128, "cpu": 8}
+
+
+@dataclass(frozen=True)
+class HuggingFaceEncoder:
+    """SigLIP, SigLIP 2 or MetaCLIP 2 features of masked crops. The weights are loaded at their first use, in half
+    precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
+
+    Raises:
+        ValueError: If the model is neither a folder nor a hub name, the fill is unknown, or the template has no
+            placeholder for the text.
+        FileNotFoundError: If the folder does not exist.
+    """
+
+    kind: str
+    """siglip, siglip2 or metaclip2."""
+    model: str
+    """Folder, or name on the hub."""
+    fill: CropFill = "black"
+    """Color of the pixels outside of a region."""
+    device: str = "cpu"
+    """Device of the network; results are always on the CPU."""
+    template: str = "{}"
+    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
+
+    def __post_init__(self) -> None:
+        if self.fill not in get_args(CropFill):
+            raise InputError(f"crop fill must be one of {', '.join(get_args(CropFill))}; got {self.fill!r}")
+        check_template(self.template)
+        check_model_name(self.model, self.family)
+
+    @property
+    def family(self) -> ModelFamily:
+        """The family of the network."""
+        return MODEL_FAMILIES[self.kind]
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Settings of the image features. The network is identified by the content of its files, which are downloaded
+        if missing."""
+        return {"kind": self.kind, "weights": self._digest, "fill": self.fill}
+
+    @property
+    def why_not_dense(self) -> None:
+        """None, because all networks of these families have patches."""
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        """Return one unit row per region; see `Encoder.encode`.
+
+        Raises:
+            FileNotFoundError: If the network cannot be downloaded.
+            ValueError: If the folder is damaged or of another architecture.
+            MemoryError: If not even one crop fits into the memory of the device.
+        """
+        return next(self.encode_each([(image, labels)]))
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        """Yield the features of several views; their crops share batches. Raises as `encode`."""
+        network = CropNetwork(lambda: self.network.size, self._image_rows, lambda: self.network.width)
+        return encode_crops(views, network, self._crops, self.fill, self.device)
+
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        """Return one unit row per patch, see `DenseEncoder.patches`; formulas in `hub.network`."""
+        side = self.network.patch
+        pixels = resize_image(image.to(self.device), rows * side, columns * side)
+        return normalize(self.network.patches(pixels)[0].float(), dim=1).cpu()
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
+        check_prompts(prompts)
+        templates = prompt_templates(self.template)
+        texts = [self.family.read(template(prompt)) for prompt in prompts for template in templates]
+        empty = [i for i, text in enumerate(texts) if not text.strip()]
+        if len(empty) > 0:
+            raise InputError(
+                f"text {prompts[empty[0] // len(templates)]!r} has no letters or digits, and {self.family.title} "
+                "ignores everything else; use words"
+            )
+        rows = torch.cat(list(self._texts(self._text_rows, texts)))
+        return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
+
+    def _image_rows(self, crops: Float[Tensor, "b 3 y x"]) -> Float32[Tensor, "b d"]:
+        return normalize(self.network.images(crops).float(), dim=1).cpu()
+
+    def _text_rows(self, texts: Sequence[str]) -> Float32[Tensor, "b d"]:
+        return normalize(self.network.texts(texts).float(), dim=1).cpu()
+
+    @cached_property
+    def _folder(self) -> ModelFolder:
+        return read_model_folder(fetch_model(self.model, self.family), self.family)
+
+    @cached_property
+    def _digest(self) -> str:
+        return file_digest(*self._folder.files)
+
+    @cached_property
+    def network(self) -> HuggingFaceNetwork:
+        """The network with its weights, loaded at its first use; raises as `encode`."""
+        return load_huggingface_network(self._folder, self.family, self.device)
+
+    @cached_property
+    def _crops(self) -> AdaptiveBatches:
+        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])
+
+    @cached_property
+    def _texts(self) -> AdaptiveBatches:
+        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])

@@ -1,0 +1,160 @@
+"""Parts of open_clip without importing the whole package. That import takes ten seconds, mostly for torchvision and
+transformers, and only networks need it."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import json
+import os
+import sys
+import warnings
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from normlift_ns.encoders.registry import check_server, find_in_hub_cache, summarize_error
+from normlift_ns.errors import InputError
+from normlift_ns.options import DEFAULT_MODEL
+
+_PARTIAL_PACKAGE = "_normlift_ns_open_clip"
+_REQUIRED_KEYS = {"embed_dim", "vision_cfg", "text_cfg"}
+
+
+def import_open_clip_module(name: str) -> ModuleType:
+    """Import a module of open_clip without the rest of the package, unless that has been imported already.
+
+    Raises:
+        ImportError: If the module does not exist, or needs the rest of the package.
+        ValueError: If open_clip is not installed.
+    """
+    if "open_clip" in sys.modules:
+        return importlib.import_module(f"open_clip.{name}")
+    if _PARTIAL_PACKAGE not in sys.modules:
+        package = ModuleType(_PARTIAL_PACKAGE)
+        package.__path__ = [str(_folder())]
+        sys.modules[_PARTIAL_PACKAGE] = package
+    return importlib.import_module(f"{_PARTIAL_PACKAGE}.{name}")
+
+
+def open_clip_model_names() -> list[str]:
+    """Return the architectures that open_clip can build."""
+    if "open_clip" in sys.modules:  # it also lists architectures added by the user
+        return importlib.import_module("open_clip").list_models()
+    return sorted(path.stem for path in (_folder() / "model_configs").glob("*.json"))
+
+
+def open_clip_model_config(model: str) -> dict[str, Any] | None:
+    """Return the configuration of an architecture; None if open_clip does not know it."""
+    if "open_clip" in sys.modules:
+        return importlib.import_module("open_clip").get_model_config(model)
+    if model not in open_clip_model_names():
+        return None
+    config = json.loads((_folder() / "model_configs" / f"{model}.json").read_text("utf8"))
+    return config if set(config) >= _REQUIRED_KEYS else None
+
+
+def _folder() -> Path:
+    """Return the folder of the open_clip package."""
+    spec = find_spec("open_clip")
+    if spec is None or spec.origin is None:
+        raise InputError("open_clip is not installed (pip install open_clip_torch); --encoder colour works without it")
+    return Path(spec.origin).parent
+
+
+# Lookup of OpenCLIP weights: a local file, the local cache, or a download.
+
+
+OPEN_CLIP_REMEDY = (
+    "give a local weight file with --encoder-pretrained FILE (.safetensors, .bin or .pt of that architecture), or use "
+    "the encoder that needs no weights: --encoder colour"
+)
+_WEIGHT_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
+
+
+def import_open_clip() -> Any:
+    """Import open_clip, which takes seconds, at its first use.
+
+    Suppress the warnings of the old timm that nerfstudio pins. Block wandb, which timm would import to log training and
+    which takes a quarter of the time.
+    """
+    blocked = "wandb" not in sys.modules
+    if blocked:
+        sys.modules["wandb"] = None  # type: ignore[assignment]  # importing it raises ImportError, which timm expects
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return importlib.import_module("open_clip")
+    finally:
+        if blocked:
+            sys.modules.pop("wandb", None)
+
+
+def check_open_clip_names(model: str, pretrained: str) -> None:
+    """Check an architecture and its weights by name, without loading or downloading anything.
+
+    Raises:
+        ValueError: If open_clip does not know the model or the weights tag, or the installed timm does not know the
+            model.
+        FileNotFoundError: If the name looks like a weight file that does not exist.
+    """
+    config, tags = open_clip_model_config(model), import_open_clip_module("pretrained")
+    if config is None:
+        near = ", ".join(difflib.get_close_matches(model, open_clip_model_names()) or [DEFAULT_MODEL])
+        raise InputError(
+            f"unknown OpenCLIP model {model!r} (--encoder-model); similar names: {near}. List all: "
+            'python -c "import open_clip; print(open_clip.list_models())"'
+        )
+    tower = config["vision_cfg"].get("timm_model_name")
+    if tower is not None and not (timm := importlib.import_module("timm")).is_model(tower):
+        raise InputError(
+            f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, which the installed timm "
+            f"{timm.__version__} does not have (nerfstudio pins an old version); use a model that open_clip builds "
+            f"itself, such as {DEFAULT_MODEL} or ViT-L-14, or install another timm at your own risk"
+        )
+    path = Path(pretrained)
+    if os.path.isfile(path) or tags.is_pretrained_cfg(model, pretrained):
+        return
+    if os.path.lexists(path):
+        raise InputError(
+            f"{pretrained} is not a weight file of an OpenCLIP model (--encoder-pretrained); {OPEN_CLIP_REMEDY}"
+        )
+    if path.suffix in _WEIGHT_SUFFIXES or len(path.parts) > 1:
+        raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {OPEN_CLIP_REMEDY}")
+    known = ", ".join(tags.list_pretrained_tags_by_model(model)) or "none"
+    raise InputError(
+        f"unknown weights {pretrained!r} of OpenCLIP model {model}; known tags: {known}. Otherwise, {OPEN_CLIP_REMEDY}"
+    )
+
+
+def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
+    """Return the weight file, downloaded if necessary, and open_clip's description of its training: "mean" and "std" of
+    the images, and "quick_gelu".
+
+    A local file has no such description. It gets the mean and standard deviation of the architecture's published
+    weights, if there are any, and the activation that the architecture specifies.
+
+    Raises:
+        FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.
+    """
+    table, local = import_open_clip_module("pretrained"), Path(pretrained)
+    if os.path.isfile(local):
+        tags = table.list_pretrained_tags_by_model(model)
+        published = table.get_pretrained_cfg(model, tags[0]) if len(tags) > 0 else {}
+        return local.resolve(), {key: published[key] for key in ("mean", "std") if key in published}
+    published = table.get_pretrained_cfg(model, pretrained)
+    try:
+        return find_in_hub_cache(published, import_open_clip_module("constants")) or _download(published), published
+    except Exception as error:  # download clients raise exceptions without a common base class
+        origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
+        raise FileNotFoundError(
+            f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache and cannot be "
+            f"downloaded ({summarize_error(error)}); go online once, {OPEN_CLIP_REMEDY}"
+        ) from None
+
+
+def _download(published: dict[str, Any]) -> Path:
+    if published.get("hf_hub"):
+        check_server(importlib.import_module("huggingface_hub").constants.ENDPOINT)
+    return Path(import_open_clip_module("pretrained").download_pretrained(published))

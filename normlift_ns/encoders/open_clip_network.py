@@ -1,0 +1,383 @@
+"""OpenCLIP models with their weights on a device."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, cast, get_args
+
+import torch
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from safetensors import safe_open
+from torch import Tensor
+from torch.nn.functional import gelu, interpolate, layer_norm, linear, normalize, scaled_dot_product_attention
+
+from normlift_ns.encoders.base import resize_image
+from normlift_ns.encoders.batching import AdaptiveBatches, CropNetwork, encode_crops
+from normlift_ns.encoders.open_clip import (
+    OPEN_CLIP_REMEDY,
+    check_open_clip_names,
+    find_open_clip_weights,
+    import_open_clip,
+    import_open_clip_module,
+    open_clip_model_config,
+)
+from normlift_ns.encoders.prompts import check_prompts
+from normlift_ns.encoders.registry import THIRD_PARTY_ERRORS, find_in_hub_cache, summarize_error
+from normlift_ns.encoders.text_files import check_template, prompt_templates
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import file_digest
+from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
+
+
+class OpenClipNetwork(NamedTuple):
+    """A model, in half precision on a GPU and in float32 elsewhere, with its tokenizer and preprocessing."""
+
+    model: Any
+    tokenizer: Any
+    size: tuple[int, int]
+    """Height and width of the training images."""
+    mean: Float[Tensor, "3 1 1"]
+    std: Float[Tensor, "3 1 1"]
+
+    def normalized(self, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Return pixels, 0..255, on the device, normalized for the model."""
+        return ((pixels / 255 - self.mean) / self.std).to(torch.float16 if pixels.is_cuda else torch.float32)
+
+
+def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
+    """Load the network of an architecture and weights that have passed `check_open_clip_names`.
+
+    Raises:
+        FileNotFoundError: If the weights or the tokenizer cannot be downloaded.
+        ValueError: If the installed packages cannot build the architecture, or the weight file is damaged or of another
+            architecture.
+    """
+    open_clip = import_open_clip()
+    path, training = find_open_clip_weights(model, pretrained)
+    try:
+        network = open_clip.create_model(
+            model,
+            pretrained_hf=False,
+            precision="fp16" if torch.device(device).type == "cuda" else "fp32",
+            force_quick_gelu=training.get("quick_gelu", False),
+            force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
+        )
+    except THIRD_PARTY_ERRORS as error:
+        raise InputError(
+            f"OpenCLIP model {model} cannot be built with the packages installed here ({summarize_error(error)}); choose "
+            f"another with --encoder-model, such as {DEFAULT_MODEL}"
+        ) from None
+    try:
+        open_clip.load_checkpoint(network, str(path), weights_only=True)
+    except THIRD_PARTY_ERRORS as error:
+        raise InputError(
+            f"weight file {path} is damaged or not of OpenCLIP model {model} ({summarize_error(error)}); give its "
+            f"architecture with --encoder-model, or {OPEN_CLIP_REMEDY}"
+        ) from None
+    try:
+        tokenizer = open_clip.get_tokenizer(model)
+    except Exception as error:  # download clients raise exceptions without a common base class
+        raise FileNotFoundError(
+            f"the tokenizer of OpenCLIP model {model} cannot be loaded ({summarize_error(error)}); go online once, "
+            f"use a model with OpenCLIP's own tokenizer such as {DEFAULT_MODEL}, or use the encoder that needs "
+            "none: --encoder colour"
+        ) from None
+    settings = open_clip.get_model_preprocess_cfg(network)
+    size = settings["size"]
+    mean, std = (torch.tensor(settings[key], device=device)[:, None, None] for key in ("mean", "std"))
+    size = (size, size) if isinstance(size, int) else tuple(size)
+    return OpenClipNetwork(network.to(device).eval().requires_grad_(False), tokenizer, size, mean, std)
+
+
+# Patch features of OpenCLIP's vision transformers.
+#
+# The last layer of CLIP mixes all patches into one vector. As in MaskCLIP (Zhou, Loy and Dai, ECCV 2022), only the
+# value path of that layer is used. Patch tokens of the preceding layer pass through the last layer's first norm, its
+# value and output projections, the final norm, and the joint-space projection. The image is scaled to a whole number
+# of patches, preserving its aspect ratio, and position embeddings are interpolated to that grid.
+
+
+def missing_patches_reason(model: str) -> str | None:
+    """Return why an OpenCLIP architecture has no value path to follow; None if it has one."""
+    vision = (open_clip_model_config(model) or {"vision_cfg": {}})["vision_cfg"]
+    if "timm_model_name" in vision:
+        return "its image encoder is timm's"
+    if not isinstance(vision.get("layers"), int):
+        return "its image encoder is a convolutional network"
+    return "it pools by attention" if vision.get("attentional_pool") else None
+
+
+@torch.no_grad()
+def patch_embeddings(visual: Any, pixels: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b r d"]:
+    """Return patch tokens in the joint space, row by row, not normalized.
+
+    Args:
+        visual: open_clip's VisionTransformer.
+        pixels: Normalized images of a whole number of patches.
+    """
+    tokens = visual.conv1(pixels)
+    rows, columns = tokens.shape[2:]
+    tokens = tokens.flatten(2).transpose(1, 2)
+    first = visual.class_embedding.to(tokens.dtype).expand(len(tokens), 1, -1)
+    positions = _positions(visual, rows, columns).to(tokens.dtype)
+    tokens = visual.ln_pre(torch.cat([first, tokens], dim=1) + positions)
+    *before, last = visual.transformer.resblocks
+    for block in before:
+        tokens = block(tokens)
+    tokens = last.ln_1(tokens[:, 1:])
+    values = linear(tokens, last.attn.in_proj_weight.chunk(3)[2], last.attn.in_proj_bias.chunk(3)[2])
+    return visual.ln_post(last.ls_1(last.attn.out_proj(values))) @ visual.proj
+
+
+def _positions(visual: Any, rows: int, columns: int) -> Float[Tensor, "n d"]:
+    """Return position embeddings of the class token and of a grid of patches, interpolated bicubically."""
+    learned = visual.positional_embedding.float()
+    grid = learned[1:].reshape(*visual.grid_size, -1).permute(2, 0, 1)[None]
+    grid = interpolate(grid, (rows, columns), mode="bicubic", antialias=True, align_corners=False)
+    return torch.cat([learned[:1], grid[0].flatten(1).T])
+
+
+# OpenCLIP encoder: masked square crops of regions, compared with text.
+
+
+_BATCH_SIZE = {"cuda": 128, "cpu": 8}
+
+
+@dataclass(frozen=True)
+class OpenClipEncoder:
+    """CLIP features of masked crops, computed with open_clip. The weights are loaded at their first use, in half
+    precision on a GPU and in float32 elsewhere. Vectors are normalized in float32.
+
+    Raises:
+        ValueError: If open_clip or the installed timm does not know the model, or open_clip does not know the weights
+            tag. Also if the fill is unknown, or the template has no placeholder for the text.
+        FileNotFoundError: If a weight file does not exist.
+    """
+
+    model: str = DEFAULT_MODEL
+    """Architecture, a name in open_clip.list_models()."""
+    pretrained: str = DEFAULT_PRETRAINED
+    """Tag of weights to download, or a weight file of that architecture. Pickles are read with weights_only=True."""
+    fill: CropFill = "black"
+    """Color of the pixels outside of a region."""
+    device: str = "cpu"
+    """Device of the network; results are always on the CPU."""
+    template: str = "{}"
+    """Prompt template, with {} in place of the text; "ensemble": the mean over open_clip's seven templates."""
+
+    def __post_init__(self) -> None:
+        if self.fill not in get_args(CropFill):
+            raise InputError(f"crop fill must be one of {', '.join(get_args(CropFill))}; got {self.fill!r}")
+        check_template(self.template)
+        check_open_clip_names(self.model, self.pretrained)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Settings of the image features. A weight file is identified by its content, independent of its path."""
+        return {"kind": "open_clip", "model": self.model, "pretrained": self._weights_identity, "fill": self.fill}
+
+    def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        """Return one unit row per region; see `Encoder.encode`.
+
+        Raises:
+            FileNotFoundError: If the weights cannot be downloaded.
+            ValueError: If the weight file is damaged or of another architecture.
+            MemoryError: If not even one crop fits into the memory of the device.
+        """
+        return next(self.encode_each([(image, labels)]))
+
+    def encode_each(
+        self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
+    ) -> Iterator[Float32[Tensor, "r d"]]:
+        """Yield the features of several views; their crops share batches. Raises as `encode`."""
+        network = CropNetwork(lambda: self.network.size, self._image_rows, self._width)
+        return encode_crops(views, network, self._crops, self.fill, self.device)
+
+    @property
+    def why_not_dense(self) -> str | None:
+        reason = missing_patches_reason(self.model)
+        if reason is None:
+            return None
+        return (
+            f"--regions patches needs a vision transformer of open_clip, which {self.model} is not: {reason}. "
+            f"Use --encoder-model {DEFAULT_MODEL}, or other regions"
+        )
+
+    def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
+        visual = self.network.model.visual
+        patch_height, patch_width = visual.patch_size
+        pixels = self.network.normalized(
+            resize_image(image.to(self.device), rows * patch_height, columns * patch_width)
+        )
+        return normalize(patch_embeddings(visual, pixels)[0].float(), dim=1).cpu()
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return one unit row per prompt; raises as `encode`, and ValueError if `prompts` or a prompt is empty."""
+        check_prompts(prompts)
+        templates = prompt_templates(self.template)
+        tokens = self.network.tokenizer([template(prompt) for prompt in prompts for template in templates])
+        rows = torch.cat(list(self._texts(self._text_rows, tokens.to(self.device))))
+        return normalize(rows.unflatten(0, (len(prompts), len(templates))).mean(dim=1), dim=1)
+
+    def _width(self) -> int:
+        return cast(Any, open_clip_model_config(self.model))["embed_dim"]
+
+    @torch.no_grad()
+    def _image_rows(self, crops: Float[Tensor, "b 3 y x"]) -> Float32[Tensor, "b d"]:
+        return normalize(self.network.model.encode_image(self.network.normalized(crops)).float(), dim=1).cpu()
+
+    @torch.no_grad()
+    def _text_rows(self, tokens: Tensor) -> Float32[Tensor, "b d"]:
+        return normalize(self.network.model.encode_text(tokens).float(), dim=1).cpu()
+
+    @cached_property
+    def _weights_identity(self) -> str:
+        path = Path(self.pretrained)
+        return file_digest(path) if path.is_file() else self.pretrained
+
+    @cached_property
+    def network(self) -> OpenClipNetwork:
+        """The model with its weights, loaded at its first use; raises as `encode`."""
+        return load_open_clip(self.model, self.pretrained, self.device)
+
+    @cached_property
+    def _crops(self) -> AdaptiveBatches:
+        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])
+
+    @cached_property
+    def _texts(self) -> AdaptiveBatches:
+        return AdaptiveBatches(_BATCH_SIZE[torch.device(self.device).type])
+
+
+# The CLIP text tower in plain torch, for prompts that are not cached.
+#
+# Most architectures of open_clip share one kind of text tower: a causal transformer over byte pairs, read out at the
+# end of the text. This module computes those from the same weights with open_clip's own tokenizer, which avoids
+# importing the rest of open_clip. Other kinds are left to open_clip.
+
+
+_PLAIN_KEYS = {"context_length", "vocab_size", "width", "heads", "layers"}
+"""Configuration keys of a plain text tower; any other key indicates another kind."""
+_TEXT_BATCH_SIZE = 64
+
+
+@dataclass(frozen=True)
+class TextTower:
+    """A text tower with its weights in float32; formulas as in open_clip's transformer.py."""
+
+    tokenizer: Callable[[Sequence[str]], Int64[Tensor, "b length"]]
+    templates: Sequence[Callable[[str], str]]
+    """Functions that fill the prompt templates; the embedding of a text is the mean over them."""
+    weights: Mapping[str, Float32[Tensor, ...]]
+    """Weights by their names in the model's state dict."""
+    heads: int
+    layers: int
+    quick_gelu: bool
+    device: str
+
+    def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
+        """Return one unit row per prompt, on the CPU.
+
+        Raises:
+            ValueError: If `prompts` or a prompt is empty.
+        """
+        check_prompts(prompts)
+        tokens = self.tokenizer([template(prompt) for prompt in prompts for template in self.templates])
+        rows = torch.cat([self._rows(part.to(self.device)) for part in tokens.split(_TEXT_BATCH_SIZE)])
+        return normalize(rows.unflatten(0, (len(prompts), len(self.templates))).mean(dim=1), dim=1).cpu()
+
+    @torch.no_grad()
+    def _rows(self, tokens: Int64[Tensor, "b length"]) -> Float32[Tensor, "b d"]:
+        end = tokens.argmax(dim=1)  # the end-of-text token has the largest id
+        tokens = tokens[:, : int(end.max()) + 1]  # causal attention ignores later tokens
+        x = self.weights["token_embedding.weight"][tokens] + self.weights["positional_embedding"][: tokens.shape[1]]
+        for i in range(self.layers):
+            block = f"transformer.resblocks.{i}."
+            qkv = self._linear(self._norm(x, f"{block}ln_1"), f"{block}attn.in_proj_")
+            q, k, v = qkv.unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+            attended = scaled_dot_product_attention(q, k, v, is_causal=True)
+            x = x + self._linear(attended.transpose(1, 2).flatten(2), f"{block}attn.out_proj.")
+            hidden = self._linear(self._norm(x, f"{block}ln_2"), f"{block}mlp.c_fc.")
+            hidden = hidden * torch.sigmoid(1.702 * hidden) if self.quick_gelu else gelu(hidden)
+            x = x + self._linear(hidden, f"{block}mlp.c_proj.")
+        last = x[torch.arange(len(x), device=x.device), end]
+        return normalize(self._norm(last, "ln_final") @ self.weights["text_projection"], dim=1)
+
+    def _norm(self, x: Tensor, name: str) -> Tensor:
+        return layer_norm(x, x.shape[-1:], self.weights[f"{name}.weight"], self.weights[f"{name}.bias"])
+
+    def _linear(self, x: Tensor, name: str) -> Tensor:
+        return linear(x, self.weights[f"{name}weight"], self.weights[f"{name}bias"])
+
+
+def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
+    """Load the text tower of an OpenCLIP model.
+
+    Return None if it is not of the plain kind, its weights are not on this machine, or anything is unexpected.
+    `OpenClipEncoder` then handles the model, or reports what is wrong.
+    """
+    try:
+        config = open_clip_model_config(model) or {}
+        sizes = config["text_cfg"]
+        local = _find_local_weights(model, pretrained)
+        if local is None or not set(sizes) <= _PLAIN_KEYS or config.get("custom_text"):
+            return None
+        path, published = local
+        shapes = _shapes(config["embed_dim"], **sizes)
+        weights = _read(path, shapes)
+        check_template(template)
+        templates = prompt_templates(template)
+        tokenizer = import_open_clip_module("tokenizer").SimpleTokenizer(context_length=sizes["context_length"])
+    except THIRD_PARTY_ERRORS:
+        return None
+    if {name: weight.shape for name, weight in weights.items()} != shapes:
+        return None
+    quick_gelu = config.get("quick_gelu", False) or published.get("quick_gelu", False)
+    weights = {name: weight.to(device, torch.float32) for name, weight in weights.items()}
+    return TextTower(tokenizer, templates, weights, sizes["heads"], sizes["layers"], quick_gelu, device)
+
+
+def _find_local_weights(model: str, pretrained: str) -> tuple[Path, Mapping[str, Any]] | None:
+    """Return the weight file and open_clip's description of its training; None if it is not on this machine."""
+    if os.path.isfile(pretrained):
+        return Path(pretrained), {}
+    published = import_open_clip_module("pretrained").get_pretrained_cfg(model, pretrained)
+    path = find_in_hub_cache(published, import_open_clip_module("constants")) if published else None
+    return None if path is None else (path, published)
+
+
+def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Read the named tensors of a weight file and nothing else. Raises exceptions in `THIRD_PARTY_ERRORS`."""
+    if path.suffix == ".safetensors":
+        with safe_open(path, "pt") as file:
+            return {name: file.get_tensor(name) for name in names}
+    state = torch.load(str(path), map_location="cpu", weights_only=True, mmap=True)
+    state = state.get("state_dict", state)
+    prefix = "module." if next(iter(state)).startswith("module.") else ""
+    return {name: state[prefix + name] for name in names}
+
+
+def _shapes(
+    embed_dim: int, context_length: int, vocab_size: int, width: int, heads: int, layers: int
+) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of all weights of a plain text tower."""
+    block = {
+        "ln_1.weight": (width,), "ln_1.bias": (width,), "ln_2.weight": (width,), "ln_2.bias": (width,),
+        "attn.in_proj_weight": (3 * width, width), "attn.in_proj_bias": (3 * width,),
+        "attn.out_proj.weight": (width, width), "attn.out_proj.bias": (width,),
+        "mlp.c_fc.weight": (4 * width, width), "mlp.c_fc.bias": (4 * width,),
+        "mlp.c_proj.weight": (width, 4 * width), "mlp.c_proj.bias": (width,),
+    }  # fmt: skip
+    blocks = {f"transformer.resblocks.{i}.{name}": shape for i in range(layers) for name, shape in block.items()}
+    shapes = {
+        "token_embedding.weight": (vocab_size, width),
+        "positional_embedding": (context_length, width),
+        "ln_final.weight": (width,),
+        "ln_final.bias": (width,),
+        "text_projection": (width, embed_dim),
+    }
+    return {**shapes, **blocks}

@@ -1,0 +1,899 @@
+"""Coverage study: regions without reliable evidence, unused images that would help, and new poses."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+import torch
+from jaxtyping import Bool, Float, Float64, Int, Int64, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from normlift_ns.analysis.objects import connected_components
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.lift import Scalars
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.core.refine import unsupported
+from normlift_ns.core.scene import Scene
+from normlift_ns.core.sparse import SparseRows
+from normlift_ns.errors import InputError
+from normlift_ns.evaluation.options import MAX_SUGGESTED_POSES, pose_output_paths
+from normlift_ns.evaluation.studies import recorded_vote, voting_scalars
+from normlift_ns.evidence_collection import sample_evenly
+from normlift_ns.io.atomic import atomic_files, refuse_run_files
+from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.options import OBJECT_MAX_GAP, RasterizeMode, check_number, check_path
+from normlift_ns.rasterization.rasterize import rasterize_evidence, render, render_image
+from normlift_ns.rasterization.settings import RasterSettings
+
+# Images of a scene: which were lifted, and why others were not.
+
+
+LeftOutReason = Literal["max_views", "no features", "held out"]
+MAX_IMAGES = 256
+"""Maximum number of lifted images, and of other images, that are examined."""
+
+
+class _Counts(msgspec.Struct):
+    views: int | None = None
+    left_out: int | None = None
+
+
+class _Options(msgspec.Struct):
+    max_views: Annotated[int, msgspec.Meta(ge=1)] | None = None
+
+
+class _LiftRecord(msgspec.Struct):
+    """Record of the images of a lift in a manifest."""
+
+    views_lifted: list[str] | None = None
+    views_without_features: list[str] = []
+    statistics: _Counts = msgspec.field(default_factory=_Counts)
+    options: _Options = msgspec.field(default_factory=_Options)
+
+
+class StudyImages(NamedTuple):
+    """Images to examine, the lifted ones first."""
+
+    lifted: int
+    names: list[str]
+    cameras: list[Camera]
+    why: list[LeftOutReason]
+    """Reasons for the images that were not lifted."""
+    left_out: dict[LeftOutReason, int]
+
+
+def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], set[str]]:
+    """Return the names of the images that were lifted, and of those without features.
+
+    Raises:
+        ValueError: the manifest does not record them, or the scene no longer has some of them.
+    """
+    names = list(scene.train.names)
+    try:
+        record = msgspec.convert(
+            {key: manifest[key] for key in _LiftRecord.__struct_fields__ if key in manifest}, _LiftRecord
+        )
+    except msgspec.ValidationError as error:
+        raise InputError(f"the run's record of its images is damaged ({error}); lift again") from None
+    used, counts = record.views_lifted, record.statistics
+    if used is None and counts.left_out == 0:  # version 0.1 has only counts
+        indices = sample_evenly(len(names), record.options.max_views)
+        used = [names[i] for i in indices] if len(indices) == counts.views else None
+    if used is None:
+        raise InputError(
+            "the run does not record which images were lifted: it is from an older version, and some images had no "
+            "features; lift again with: ns-normlift --load-config ..."
+        )
+    if not set(used) <= set(names):
+        raise InputError(
+            f"the run was lifted from images that {scene.name} no longer has; restore the dataset, give its path with "
+            "--data, or lift again"
+        )
+    return set(used), set(record.views_without_features)
+
+
+def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
+    """Return the images of a scene according to the manifest of the lift; of very many, an evenly spaced selection.
+
+    Raises:
+        ValueError: as `lifted_names`.
+    """
+    used, unusable = lifted_names(scene, manifest)
+    lifted: list[tuple[str, Camera]] = []
+    others: list[tuple[str, Camera, LeftOutReason]] = []
+    for name, camera in zip(scene.train.names, scene.train.cameras):
+        if name in used:
+            lifted.append((name, camera))
+        else:
+            why: LeftOutReason = "no features" if name in unusable else "max_views"
+            others.append((name, camera, why))
+    for name, camera in zip(scene.held_out.names, scene.held_out.cameras):
+        others.append((name, camera, "held out"))
+    reasons: list[LeftOutReason] = [why for *_, why in others]
+    lifted = [lifted[i] for i in sample_evenly(len(lifted), MAX_IMAGES)]
+    others = [others[i] for i in sample_evenly(len(others), MAX_IMAGES)]
+    return StudyImages(
+        len(lifted),
+        [name for name, *_ in (*lifted, *others)],
+        [camera for _, camera, *_ in (*lifted, *others)],
+        [why for *_, why in others],
+        {why: reasons.count(why) for why in dict.fromkeys(reasons)},
+    )
+
+
+# Regions without reliable evidence: spatially connected parts of what the images show.
+
+
+_HIDDEN_SHARE = 0.01
+"""Total share of the surface of all Gaussians that are too small or too transparent to matter."""
+_MIN_SHARE = 0.001
+"""Minimum share of the surface in a listed region."""
+_MAX_REGIONS = 20
+"""Maximum number of listed regions."""
+
+
+@dataclass(frozen=True)
+class WeakRegion:
+    """Connected Gaussians that images show, but with little reliable evidence. Means are weighted by surface."""
+
+    size: int
+    """Number of Gaussians."""
+    centre: list[float]
+    """Center in the scene's own units."""
+    box: dict[str, list[float]]
+    """Corners "min" and "max" of the box around the centers."""
+    share: float
+    """Share of the surface that the images show, in 0..1."""
+    reliability: float
+    """Mean R. A view that hardly shows a Gaussian does not count as a whole one (R_j(S) of `gain`)."""
+    lifted_reliability: float
+    """Mean R of the lift, in which every view with any weight counts."""
+    norm: float
+    """Mean ||f|| of Gaussians with evidence. It is low if views disagree, which more views of the same kind do not
+    fix."""
+    views: float
+    """Mean number of lifted views that show a Gaussian with at least a tenth of its weight in the best image."""
+    unsupported: float
+    """Share of Gaussians that no vote can repair, because neither they nor their neighbors have evidence."""
+
+
+class GaussianEvidence(NamedTuple):
+    """Evidence for every Gaussian."""
+
+    means: Float[Tensor, "n 3"]
+    scalars: Scalars
+    surface: Float64[Tensor, " n"]
+    """s_j"""
+    reliability: Float64[Tensor, " n"]
+    """R_j(S)"""
+    views: Int[Tensor, " n"]
+    """Lifted views that show it."""
+    unsupported: Bool[Tensor, " n"]
+
+
+def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Return the Gaussians that are large and opaque enough to matter, without the smallest that make up `HIDDEN` of
+    the surface.
+
+    >>> visible(torch.tensor([0.5, 0.001, 0.5, 0.0])).tolist()
+    [True, False, True, False]
+    """
+    order = surface.argsort()
+    mask = torch.zeros_like(surface, dtype=torch.bool)
+    mask[order] = surface[order].cumsum(0) > _HIDDEN_SHARE * surface.sum()
+    return mask
+
+
+def weak_regions(
+    evidence: GaussianEvidence, *, min_reliability: float, reach: float
+) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
+    """Return regions of visible Gaussians with R_j(S) below a bound, and their Gaussians, sorted by their lack of
+    evidence.
+
+    The lack of a region is sum_j s_j (min_reliability - R_j(S)).
+
+    Args:
+        reach: as in `connected_components`.
+    """
+    surface = evidence.surface
+    weak = visible(surface) & (evidence.reliability < min_reliability)
+    labels = connected_components(evidence.means, weak, reach=reach)
+    chosen = (labels >= 0).nonzero().squeeze(1)
+    number, lacking = labels[chosen].long(), surface * (min_reliability - evidence.reliability)
+    share, lack = (torch.bincount(number, x[chosen]) for x in (surface / surface.sum(), lacking))
+    listed = (share >= _MIN_SHARE).nonzero().squeeze(1)
+    listed = listed[lack[listed].argsort(descending=True, stable=True)][:_MAX_REGIONS]
+    parts = [chosen[number == i] for i in listed.tolist()]
+    return [_region(evidence, rows) for rows in parts], parts
+
+
+def _region(evidence: GaussianEvidence, rows: Int64[Tensor, " m"]) -> WeakRegion:
+    surface, means, norm = evidence.surface[rows], evidence.means[rows].double(), evidence.scalars.norm[rows]
+    weight = surface / surface.sum()
+
+    def mean(values: Tensor, weight: Tensor = weight) -> float:
+        return float((weight * values.double()).sum())
+
+    evidenced = weight * (norm > 0)
+    return WeakRegion(
+        size=len(rows),
+        centre=(weight[:, None] * means).sum(0).tolist(),
+        box={"min": means.amin(0).tolist(), "max": means.amax(0).tolist()},
+        share=float(surface.sum() / evidence.surface.sum()),
+        reliability=mean(evidence.reliability[rows]),
+        lifted_reliability=mean(evidence.scalars.reliability[rows]),
+        norm=mean(norm, evidenced / evidenced.sum()) if bool((evidenced > 0).any()) else 0.0,
+        views=mean(evidence.views[rows]),
+        unsupported=mean(evidence.unsupported[rows]),
+    )
+
+
+# Benefit of one more view for a lift, from rendering weights alone: no image is read and no feature is computed.
+#
+# W_jv is the weight of Gaussian j in view v, as a share of the image, and S is the set of lifted views. Equation
+# numbers are those of the paper::
+#
+# s_j = max_v W_jv over all images, lifted or not: the surface that a Gaussian shows N_j(S) = (sum_v W_jv) ** 2 /
+# (sum_v W_jv ** 2 + (FAINT s_j) ** 2), the effective views of eq. 8; a view that hardly shows a Gaussian does not
+# count as a whole one R_j(S) = ||f_j|| N_j(S) / (N_j(S) + beta) eq. 8; for a Gaussian without evidence, ||f_j|| is
+# the mean of the others, weighted by surface gain(v) = sum_j s_j max(0, R_j(S + v) - R_j(S)) / sum_j s_j
+#
+# The gain is the expected increase of the mean reliability of everything that the images show. It assumes that the
+# new view agrees with the others as well as they agree with each other. Views are chosen one after the other, each by
+# its gain in addition to those chosen before. The second of two similar views thus gains little.
+
+
+PIXELS = 20_000
+"""Resolution at which weights are rasterized, in pixels per image."""
+FAINT = 0.1
+"""Share of a Gaussian's largest weight below which a view hardly shows it."""
+
+_CHUNK = 2**24
+"""Number of entries that are processed together."""
+
+
+class RasterInputs(NamedTuple):
+    """Settings to rasterize weights as in the lift."""
+
+    gaussians: GaussianScene
+    rasterize_mode: RasterizeMode
+    settings: RasterSettings
+    weight_power: int
+
+
+@dataclass(frozen=True)
+class ReliabilityModel:
+    """Evidence of the lifted views for every Gaussian, in float64."""
+
+    norm: Float64[Tensor, " n"]
+    """|f_j||, or its expected value."""
+    weight: Float64[Tensor, " n"]
+    """sum_v W_jv of the lifted views."""
+    squared: Float64[Tensor, " n"]
+    """sum_v W_jv ** 2 of the lifted views."""
+    surface: Float64[Tensor, " n"]
+    """s_j"""
+    beta: float
+
+    def expected(
+        self, weight: Float64[Tensor, " m"], squared: Float64[Tensor, " m"], rows: Tensor | slice = slice(None)
+    ) -> Float64[Tensor, " m"]:
+        """Return R_j of some Gaussians with these sums of weights."""
+        n_eff = _ratio(weight**2, squared + (FAINT * self.surface[rows]) ** 2)
+        return self.norm[rows] * _ratio(n_eff, n_eff + self.beta)
+
+    def seen_by(self, views: SparseRows, view: int) -> ReliabilityModel:
+        """Return the evidence after lifting one of the views, too."""
+        entries = views.column == view
+        rows, weight = views.row_index()[entries], views.weight[entries].double()
+        return replace(
+            self,
+            weight=self.weight.index_add(0, rows, weight),
+            squared=self.squared.index_add(0, rows, weight**2),
+        )
+
+
+def downscale_camera(camera: Camera, pixels: int = PIXELS) -> Camera:
+    """Return the camera with about `pixels` pixels, but never more than it has.
+
+    >>> camera = Camera(torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), torch.eye(4), width=160, height=120)
+    >>> small = downscale_camera(camera, 1200)
+    >>> small.width, small.height, small.K[0].tolist()
+    (40, 30, [25.0, 0.0, 20.0])
+    """
+    factor = min(1.0, (pixels / (camera.width * camera.height)) ** 0.5)
+    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
+    return Camera(camera.K * scale.to(camera.K.device), camera.world_to_camera, width, height)
+
+
+def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int = PIXELS) -> SparseRows:
+    """Return W_jv, [N, views]: the weight of Gaussian j in view v, as a share of the image."""
+    small = [downscale_camera(camera, pixels) for camera in cameras]
+    with warnings.catch_warnings():  # the lift has already warned of Gaussians that are not drawn
+        warnings.filterwarnings("ignore", message=".*are not drawn")
+        rows = rasterize_evidence(
+            drawn.gaussians,
+            small,
+            (torch.zeros(camera.height, camera.width, dtype=torch.int32) for camera in small),
+            num_regions=[1] * len(small),
+            rasterize_mode=drawn.rasterize_mode,
+            settings=drawn.settings,
+            weight_power=drawn.weight_power,
+        ).rows
+    area = torch.tensor([float(c.width * c.height) for c in small], dtype=torch.float64, device=rows.weight.device)
+    return SparseRows(rows.offsets, rows.column, rows.weight.double() / area[rows.column.long()])
+
+
+def max_weights(weights: SparseRows) -> Float64[Tensor, " n"]:
+    """Return s_j, the largest weight of every Gaussian in any view, 0 if no view shows it."""
+    maxima = weights.weight.new_zeros(len(weights))
+    return maxima.scatter_reduce_(0, weights.row_index(), weights.weight, "amax").double()
+
+
+def count_views(weights: SparseRows, surface: Float64[Tensor, " n"]) -> Int64[Tensor, " n"]:
+    """Count the views that show each Gaussian with at least `FAINT` of its largest weight."""
+    row = weights.row_index()
+    return torch.bincount(row[weights.weight >= FAINT * surface[row]], minlength=len(weights))
+
+
+def model_of_lift(
+    scalars: Scalars, lifted: SparseRows, surface: Float64[Tensor, " n"], *, beta: float
+) -> ReliabilityModel:
+    """Return the evidence of a lift.
+
+    N_eff and ||f_j|| are those of the lift. So is W_j, except for its scale, because a lift counts pixels at another
+    resolution, and several levels of regions.
+
+    Args:
+        lifted: weights of the lifted views.
+    """
+    sums, norm = lifted.row_sums(), scalars.norm.double()
+    valid = (norm > 0) & (sums > 0) & (scalars.n_eff > 0)
+    scale = (sums[valid] / scalars.weight[valid].double()).median() if bool(valid.any()) else sums.new_ones(())
+    weight = torch.where(valid, scale * scalars.weight.double(), 0.0)
+    mean = _ratio((surface * norm)[valid].sum(), surface[valid].sum()) if bool(valid.any()) else sums.new_ones(())
+    squared = _ratio(weight**2, scalars.n_eff.double())
+    return ReliabilityModel(torch.where(valid, norm, mean), weight, squared, surface, beta)
+
+
+def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
+    """Return gain(v) of every view, in addition to the lifted ones."""
+    before = model.expected(model.weight, model.squared)
+    rise = torch.zeros(count, dtype=torch.float64, device=before.device)
+    parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
+    for row, column, weight in zip(*parts):
+        added = weight.double()
+        after = model.expected(model.weight[row] + added, model.squared[row] + added**2, row)
+        rise.index_add_(0, column.long(), model.surface[row] * (after - before[row]).clamp(min=0))
+    return _ratio(rise, model.surface.sum())
+
+
+def choose_views(model: ReliabilityModel, views: SparseRows, count: int, most: int) -> list[tuple[int, float]]:
+    """Choose views greedily and return them with their gains. Each has the largest gain after those before it.
+
+    Views without any gain are not returned.
+
+    Args:
+        views: W_jv of the candidates, [N, count].
+    """
+    chosen: list[tuple[int, float]] = []
+    for _ in range(min(most, count)):
+        gain = gains(model, views, count)
+        gain[[view for view, _ in chosen]] = 0.0
+        best = int(gain.argmax())
+        if not float(gain[best]) > 0:
+            break
+        chosen.append((best, float(gain[best])))
+        model = model.seen_by(views, best)
+    return chosen
+
+
+def visible_shares(views: SparseRows, count: int, surface: Tensor, parts: Sequence[Tensor]) -> Float64[Tensor, "p v"]:
+    """Return how much of each part a view shows, [parts, views]: sum_j min(W_jv, s_j) / sum_j s_j.
+
+    It is 1 if the view shows everything as well as the image that shows it best.
+    """
+    shares = torch.zeros(len(parts), count, dtype=torch.float64)
+    for i, rows in enumerate(parts):
+        part = views.select_rows(rows)
+        shown = torch.minimum(part.weight.double(), surface[rows][part.row_index()])
+        sums = torch.zeros(count, dtype=torch.float64, device=shown.device).index_add_(0, part.column.long(), shown)
+        shares[i] = (sums / surface[rows].sum()).cpu()
+    return shares
+
+
+def _ratio(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Divide; 0 if the denominator is 0."""
+    return torch.where(denominator > 0, numerator / denominator, 0.0)
+
+
+# New poses that would show regions without evidence, at positions that cameras have or could have reached.
+#
+# A position is free if a camera was near it, or if rays of an image pass through it to something behind it.
+# Candidates look at a region from free positions of the images, and from a ring around the region at the height of
+# the cameras. Poses are chosen from them by their gain in the regions (`gain`), each in addition to those before it.
+
+
+_TARGET_REGIONS = 4
+"""Number of regions that candidates look at, those with the largest lack of evidence."""
+_CAMERA_POSITIONS, _RING_POSITIONS = 12, 12
+"""Number of camera positions, and of azimuths on the ring, for candidates of one region."""
+_MAX_CANDIDATES = 10
+"""Maximum number of candidates per region whose weights are rasterized."""
+MIN_SHOWN_SHARE = 0.3
+"""A view shows a region if it shows at least this share of it, compared with the best image."""
+_MIN_DEPTH = 0.15
+"""Minimum depth in front of a new camera, as a share of the median depth of the images."""
+_NEAR_SHARE = 0.05
+"""Share of the pixels that may be nearer."""
+_DEPTH_PIXELS = 5_000
+_DEPTH_VIEWS = 16
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A new camera in the coordinates of the scene."""
+
+    camera: Camera
+    gain: float
+    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the poses before it."""
+    regions: list[int]
+    """Numbers of the regions that it shows, from 1."""
+    shown: float
+    """Coverage of the region that it shows best; 1 is as good as the best image."""
+
+    @property
+    def field_of_view(self) -> float:
+        """Vertical field of view in degrees."""
+        return math.degrees(2 * math.atan(self.camera.height / 2 / float(self.camera.K[1, 1])))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the pose as JSON types."""
+        return {
+            "position": self.camera_to_world()[:3, 3].tolist(),
+            "camera_to_world": self.camera_to_world().tolist(),
+            "field_of_view": self.field_of_view,
+            "gain": self.gain,
+            "regions": self.regions,
+            "shown": self.shown,
+        }
+
+    def camera_to_world(self) -> Float64[Tensor, "4 4"]:
+        """Return camera to world in OpenGL's convention, as in nerfstudio: x right, y up, z backward."""
+        return self.camera.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Free space according to the images."""
+
+    eyes: Float64[Tensor, "v 3"]
+    up: Float64[Tensor, " 3"]
+    cameras: Sequence[Camera]
+    depths: Sequence[Float64[Tensor, "h w"]]
+    """Depths of the cameras; infinite for empty pixels."""
+
+    @property
+    def depth(self) -> float:
+        """Median depth of everything that the images show."""
+        finite = torch.cat([depth[depth.isfinite()] for depth in self.depths])
+        return float(finite.median()) if len(finite) > 0 else 1.0
+
+    @property
+    def spacing(self) -> float:
+        """Median distance between a camera and its nearest neighbor; 0 for a single camera."""
+        if len(self.eyes) < 2:
+            return 0.0
+        distance = torch.cdist(self.eyes, self.eyes).fill_diagonal_(torch.inf)
+        return float(distance.amin(1).median())
+
+    def free(self, positions: Float64[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
+        """Return whether a camera could be at each position."""
+        free = (torch.cdist(positions, self.eyes) <= self.spacing + 1e-9).any(1)
+        for camera, depth in zip(self.cameras, self.depths):
+            pose, K = camera.world_to_camera.double().cpu(), camera.K.double().cpu()
+            points = positions @ pose[:3, :3].T + pose[:3, 3]
+            z = points[:, 2]
+            pixel = (points @ K.T)[:, :2] / z[:, None].clamp(min=1e-9)
+            inside = (z > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
+            x, y = (pixel[:, i].long().clamp(0, size - 1) for i, size in ((0, camera.width), (1, camera.height)))
+            free |= inside & (depth[y, x] > (1 + _NEAR_SHARE) * z)
+        return free
+
+
+def free_space(drawn: RasterInputs, cameras: Sequence[Camera]) -> FreeSpace:
+    """Compute the depths of some of the images."""
+    chosen = [downscale_camera(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
+    to_world = torch.stack([camera.world_to_camera.double().cpu().inverse() for camera in cameras])
+    up = normalize(-to_world[:, :3, 1].mean(0), dim=0)
+    if not bool(up.norm() > 0):  # cameras with all kinds of roll
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return FreeSpace(to_world[:, :3, 3], up, chosen, [mean_depth(drawn, camera) for camera in chosen])
+
+
+def mean_depth(drawn: RasterInputs, camera: Camera) -> Float64[Tensor, "h w"]:
+    """Return the mean depth at each pixel of a camera; infinite if less than half of the pixel is covered."""
+    pose = camera.world_to_camera.to(drawn.gaussians.means)
+    z = (drawn.gaussians.means @ pose[2, :3] + pose[2, 3])[:, None]
+    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
+    values, alpha = render(drawn.gaussians, camera, torch.nan_to_num(z, 0.0, 0.0, 0.0), **kwargs)
+    return torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.inf).double().cpu()
+
+
+def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
+    """Return free positions that face a target: those of images, and two rings around it at the height of the
+    cameras."""
+    away = space.eyes - target
+    height = away @ space.up
+    radius = (away - height[:, None] * space.up).norm(dim=1).median()
+    axis = torch.eye(3, dtype=torch.float64)[space.up.abs().argmin()]
+    first = normalize(torch.linalg.cross(space.up, axis), dim=0)
+    second = torch.linalg.cross(space.up, first)
+    angle = torch.arange(_RING_POSITIONS, dtype=torch.float64) * (2 * math.pi / _RING_POSITIONS)
+    circle = angle.cos()[:, None] * first + angle.sin()[:, None] * second
+    rings = [target + height.median() * space.up + factor * radius * circle for factor in (1.0, 0.5)]
+    positions = torch.cat([space.eyes[sample_evenly(len(space.eyes), _CAMERA_POSITIONS)], *rings])
+    far = (positions - target).norm(dim=1) > _MIN_DEPTH * space.depth
+    return positions[space.free(positions) & far]
+
+
+def look_at(
+    eye: Float64[Tensor, " 3"], target: Float64[Tensor, " 3"], up: Float64[Tensor, " 3"], like: Camera
+) -> Camera:
+    """Return a camera with the size and focal length of another, and the principal point in the middle, as in
+    ns-render."""
+    forward = normalize(target - eye, dim=0)
+    right = torch.linalg.cross(forward, up)
+    if float(right.norm()) < 1e-6:  # straight up or down: choose any roll
+        right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[forward.abs().argmin()])
+    right = normalize(right, dim=0)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    width, height = (max(2, side - side % 2) for side in (like.width, like.height))  # videos need even sizes
+    focal = float(like.K[1, 1])
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(K, pose.float(), width, height)
+
+
+def suggest_poses(
+    drawn: RasterInputs,
+    cameras: Sequence[Camera],
+    model: ReliabilityModel,
+    targets: Sequence[Sequence[float]],
+    parts: Sequence[Tensor],
+) -> list[Pose]:
+    """Suggest the poses that show regions best, greedily.
+
+    Args:
+        targets: centers of the regions.
+        parts: Gaussians of the regions.
+    """
+    if len(parts) == 0:
+        return []
+    space = free_space(drawn, cameras)
+    candidates: list[Camera] = []
+    for target in targets[:_TARGET_REGIONS]:
+        center = torch.tensor(target, dtype=torch.float64)
+        positions = positions_around(space, center)
+        candidates += [
+            look_at(positions[i], center, space.up, cameras[0])
+            for i in sample_evenly(len(positions), _MAX_CANDIDATES)
+            if len(positions) > 0
+        ]
+    if len(candidates) == 0:
+        return []
+    weights = view_weights(drawn, candidates)
+    shown = visible_shares(weights, len(candidates), model.surface, parts)
+    inside = torch.zeros_like(model.surface)
+    inside[torch.cat(list(parts))] = 1
+    share = float((inside * model.surface).sum() / model.surface.sum())
+    lacking = replace(model, surface=inside * model.surface)
+    available = shown.amax(0) >= MIN_SHOWN_SHARE
+    poses: list[Pose] = []
+    while len(poses) < MAX_SUGGESTED_POSES and bool(available.any()):
+        gain = gains(lacking, weights, len(candidates)).cpu()
+        gain[~available] = 0.0
+        best = int(gain.argmax())
+        if not float(gain[best]) > 0:
+            break
+        available[best] = False
+        if _near_depth(drawn, candidates[best]) < _MIN_DEPTH * space.depth:
+            continue
+        numbers = [i for i, x in enumerate(shown[:, best].tolist(), 1) if x >= MIN_SHOWN_SHARE]
+        poses.append(Pose(candidates[best], share * float(gain[best]), numbers, float(shown[:, best].max())))
+        lacking = lacking.seen_by(weights, best)
+    return poses
+
+
+def _near_depth(drawn: RasterInputs, camera: Camera) -> float:
+    """Return the depth that all but a few pixels exceed."""
+    depth = mean_depth(drawn, downscale_camera(camera, _DEPTH_PIXELS))
+    return float(depth.flatten().sort().values[int(_NEAR_SHARE * depth.numel())])
+
+
+# Output files of the coverage study: renders of the new poses, and a camera path for ns-render.
+
+
+_MAX_RENDER_PIXELS = 300_000
+"""Maximum number of pixels in a render."""
+_INCHES, _DPI = 6.0, 100
+
+
+class PoseRender(NamedTuple):
+    """Render from a pose."""
+
+    image: UInt8[Tensor, "h w 3"]
+    reliability: Float[Tensor, "h w"]
+    """R in 0..1, NaN for empty pixels."""
+
+
+def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> PoseRender:
+    """Render the trained scene from a new pose, with the mean R at every pixel."""
+    camera = downscale_camera(pose.camera, _MAX_RENDER_PIXELS)
+    kwargs = {"rasterize_mode": drawn.rasterize_mode, "settings": drawn.settings}
+    image = render_image(scene, camera, settings=drawn.settings, gaussians=drawn.gaussians)
+    values, alpha = render(drawn.gaussians, camera, reliability[:, None].to(drawn.gaussians.means), **kwargs)
+    return PoseRender(image, torch.where(alpha > 0.5, values[:, :, 0] / alpha, torch.nan).cpu())
+
+
+def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
+    """Return a camera path for `ns-render camera-path`, one second per pose.
+
+    It applies to the run of the poses, because it uses the coordinates of that run.
+    """
+    width, height = (poses[0].camera.width, poses[0].camera.height)
+    cameras = [
+        {
+            "camera_to_world": pose.camera_to_world().flatten().tolist(),
+            "fov": pose.field_of_view,
+            "aspect": width / height,
+        }
+        for pose in poses
+    ]
+    size = {"render_width": width, "render_height": height}
+    return {"camera_type": "perspective", **size, "camera_path": cameras, "fps": 1, "seconds": len(poses)}
+
+
+def write_poses(
+    stem: Path,
+    poses: Sequence[Pose],
+    pictures: Sequence[PoseRender],
+    *,
+    documents: Mapping[Path, Mapping[str, Any]] | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write <stem>_camera_path.json and <stem>_pose_1.png …, either all or none; without poses, write none of them.
+
+    Args:
+        documents: more JSON files for the same folder.
+        overwrite: replace files of these names, and remove those of an earlier study.
+    Raises:
+        FileExistsError: a file exists and `overwrite` is False.
+        OSError: the files cannot be written.
+    """
+    path, *images = pose_output_paths(stem)
+    json_files = dict(documents or {})
+    if len(poses) > 0:
+        json_files[path] = camera_path(poses)
+    written = [*json_files, *images[: len(poses)]]
+    if len(written) == 0:
+        return []
+    old = [file for file in (path, *images) if overwrite and file not in written]
+    with atomic_files(*written, overwrite=overwrite, remove=old) as drafts:
+        for draft, content in zip(drafts, json_files.values()):
+            draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf8")
+        for i, (draft, pose, picture) in enumerate(zip(drafts[len(json_files) :], poses, pictures), 1):
+            save_pose_render(draft, f"pose {i}, shows region {', '.join(map(str, pose.regions))}", picture)
+    return written
+
+
+def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
+    """Save the scene next to its reliability, with a color scale."""
+    height, width = picture.reliability.shape
+    figure = Figure(figsize=(2 * _INCHES, _INCHES * height / width + 0.6), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    left.imshow(picture.image.numpy())
+    left.set_title(title, parse_math=False)
+    right.set_facecolor("black")
+    right.imshow(picture.image.float().mean(dim=2).numpy(), cmap="gray", vmin=0, vmax=255)
+    heat = right.imshow(picture.reliability.numpy(), cmap="inferno", vmin=0, vmax=1, alpha=0.75)
+    scale = figure.colorbar(heat, ax=right, fraction=0.05)
+    scale.solids.set_alpha(1.0)  # pyright: ignore[reportOptionalMemberAccess]
+    scale.set_label("R")
+    right.set_title("reliability")
+    for axes in (left, right):
+        axes.set_xticks([])
+        axes.set_yticks([])
+    figure.savefig(path)
+
+
+# Coverage study of a lifted run. Read this module first.
+
+
+RELIABLE = 0.5
+"""R above which a Gaussian is reliable; at beta 1, a single consistent view gives this value."""
+_MAX_IMAGES = 12
+"""Maximum number of suggested images."""
+
+
+@dataclass(frozen=True)
+class SuggestedImage:
+    """An image that was left out of the lift."""
+
+    name: str
+    why: LeftOutReason
+    """Reason for leaving it out."""
+    gain: float
+    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the images above it."""
+    regions: list[int]
+    """Numbers of the regions that it shows, from 1."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Gaps in the evidence of a lift, and views that would fill them.
+
+    >>> from normlift_ns import coverage, open_run
+    >>> result = coverage(open_run(config))
+    >>> [image.why for image in result.photographs]
+    ['held out', 'held out']
+    >>> 0 < result.reliability < 1
+    True
+    """
+
+    reliability: float
+    """Mean R_j(S) of `evaluation.coverage` over all surfaces that the images show, in 0..1."""
+    regions: list[WeakRegion]
+    """Regions that lack evidence, worst first."""
+    photographs: list[SuggestedImage]
+    """Images to add to the lift, in this order."""
+    poses: list[Pose]
+    """New poses for more images, in this order."""
+    pictures: list[PoseRender]
+    """Renders of the poses."""
+    left_out: dict[LeftOutReason, int]
+    """Number of images that are not in the lift, by reason."""
+    remarks: list[str]
+    """Remarks in whole sentences."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as JSON types, without the renders."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "pictures"}
+        rows = {name: [asdict(row) for row in plain[name]] for name in ("regions", "photographs")}
+        return {**plain, **rows, "poses": [pose.to_json() for pose in self.poses]}
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> list[Path]:
+        """Write a JSON file, and next to it <stem>_pose_1.png … and <stem>_camera_path.json; return the paths.
+
+        `ns-render camera-path` renders the camera path with the run.
+
+        Args:
+            overwrite: replace files of these names.
+        Raises:
+            FileExistsError: a file exists and `overwrite` is False.
+            ValueError: a file of the run has that name.
+            OSError: the files cannot be written.
+
+        >>> from normlift_ns import coverage, open_run
+        >>> [path.name for path in coverage(open_run(config)).save(folder / "next.json")][:2]
+        ['next.json', 'next_camera_path.json']
+        """
+        path = check_path("path", path)
+        if path.name in ("", ".."):
+            raise InputError(f"{path} is not a valid file name; give one such as next.json")
+        stem = path.with_suffix("")
+        refuse_run_files(path, *pose_output_paths(stem), instead="name")
+        documents = {path: self.to_json()}
+        return write_poses(stem, self.poses, self.pictures, documents=documents, overwrite=overwrite)
+
+
+def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str | None = None) -> Coverage:
+    """Find regions that lack reliable evidence, unused images that would help most, and new poses for the worst
+    regions.
+
+    Nothing is lifted and no image is read. Weights of views are rasterized at a low resolution. They determine the
+    reliability that one more view would give, by the formula in `evaluation.coverage`.
+
+    Args:
+        min_reliability: R below which a Gaussian is not reliable, in 0..1.
+        device: device for rasterizing, that of the run if None.
+    Raises:
+        ValueError: the run does not record which images were lifted, or the images show no Gaussian.
+
+    >>> from normlift_ns import coverage, open_run
+    >>> run = open_run(config)
+    >>> result = coverage(run, min_reliability=0.6)
+    >>> all(region.reliability < 0.6 for region in result.regions)
+    True
+    """
+    return coverage_of(run.scene, run.field, min_reliability=min_reliability, device=device or run.device)
+
+
+def coverage_of(
+    scene: Scene, field: SemanticField, *, min_reliability: float = RELIABLE, device: str = "cpu"
+) -> Coverage:
+    """Compute `coverage` of a scene and its semantics."""
+    check_number("min_reliability", min_reliability)
+    images = study_images(scene, field.manifest)
+    power, vote = field.manifest.get("options", {}).get("weight_power", 1), recorded_vote(field.manifest)
+    gaussians, scalars = scene.gaussians.to(device), voting_scalars(field).map(lambda x: x.to(device))
+    drawn = RasterInputs(gaussians, scene.rasterize_mode, RasterSettings.recorded(field.manifest), power)
+    weights, count = view_weights(drawn, images.cameras), len(images.cameras)
+    surface = max_weights(weights)
+    if not float(surface.sum()) > 0:
+        raise InputError("no image shows a Gaussian; check that cameras and Gaussians belong to the same scene")
+    split = images.lifted
+    lifted, unused = _columns(weights, range(split), count), _columns(weights, range(split, count), count)
+    model = model_of_lift(scalars, lifted, surface, beta=vote.beta)
+    reliability = model.expected(model.weight, model.squared)
+    lost = unsupported(nearest_neighbors(gaussians.means, vote.config.k), scalars.reliability)
+    evidenced = GaussianEvidence(gaussians.means, scalars, surface, reliability, count_views(lifted, surface), lost)
+    regions, parts = weak_regions(evidenced, min_reliability=min_reliability, reach=OBJECT_MAX_GAP)
+    targets = [region.centre for region in regions]
+    poses = suggest_poses(drawn, images.cameras, model, targets, parts)
+    return Coverage(
+        reliability=float((surface * reliability).sum() / surface.sum()),
+        regions=regions,
+        photographs=_suggest_images(images, model, unused, parts),
+        poses=poses,
+        pictures=[render_pose(drawn, scene, reliability, pose) for pose in poses],
+        left_out=images.left_out,
+        remarks=_remarks(images, regions, poses, min_reliability),
+    )
+
+
+def _suggest_images(
+    images: StudyImages, model: ReliabilityModel, unused: SparseRows, parts: Sequence[Tensor]
+) -> list[SuggestedImage]:
+    names, count = images.names[images.lifted :], len(images.why)
+    shown = visible_shares(unused, count, model.surface, parts)
+    return [
+        SuggestedImage(
+            names[view],
+            images.why[view],
+            gain,
+            [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE],
+        )
+        for view, gain in choose_views(model, unused, count, _MAX_IMAGES)
+    ]
+
+
+def _columns(weights: SparseRows, views: range, count: int) -> SparseRows:
+    return weights.select_columns(torch.tensor(list(views), dtype=torch.int64, device=weights.weight.device), count)
+
+
+def _remarks(
+    images: StudyImages, regions: Sequence[WeakRegion], poses: Sequence[Pose], min_reliability: float
+) -> list[str]:
+    remarks = []
+    if len(regions) == 0:
+        remarks.append(
+            f"No region lacks evidence: everything that the images show has R of at least {min_reliability:g}, except "
+            "for parts smaller than a thousandth of it."
+        )
+    elif len(poses) == 0:
+        remarks.append(
+            "No new pose shows a region better than the images do; it may be hidden from all possible positions."
+        )
+    if len(images.why) == 0:
+        remarks.append("No image was left out of the lift, so none can be suggested.")
+    total = sum(images.left_out.values())
+    if len(images.why) < total:
+        remarks.append(f"Of {total:,} images left out, only {len(images.why)}, evenly spaced, were examined.")
+    if len(images.cameras) == 1:
+        remarks.append("The scene has a single camera; the study cannot judge what this camera does not show.")
+    return remarks

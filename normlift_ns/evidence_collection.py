@@ -1,0 +1,424 @@
+"""Check that label maps match the undistorted images that the scene was trained on."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int32, Int64, UInt8
+from torch import Tensor
+from xxhash import xxh3_128
+
+from normlift_ns.core.evidence import MASKED, Evidence
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.partition import Communicator, Partition
+from normlift_ns.core.scene import Scene, View
+from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.encoders.base import FeatureSource, RegionFeatures, iterate_view_features
+from normlift_ns.encoders.batching import prefetch_map
+from normlift_ns.encoders.cache import CachedRegions, cached
+from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
+from normlift_ns.errors import InputError
+from normlift_ns.options import BackendName, LiftOptions, RasterizeMode
+from normlift_ns.progress import StageTimer
+from normlift_ns.rasterization.evidence_cache import CachedView, cache_views, find_cached_views, join_cached_views
+from normlift_ns.rasterization.rasterize import rasterize_evidence, render_image
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.segmentation.regions import LabelFiles
+
+
+def check_undistorted(source: FeatureSource, *views: View) -> None:
+    """Check that the label map of an undistorted image was not made from the original, distorted image.
+
+    Undistortion crops an image by a few pixels, but may move its content by many. A map of another size may therefore
+    show the distorted image, so only maps of exactly the undistorted size are accepted.
+
+    Args:
+        views: The same view at every size at which the source may have processed it.
+    Raises:
+        ValueError: If a map has another size, unless the source resamples maps; then the function warns.
+    """
+    original_size, name = views[0].original, views[0].name
+    maps = source.regions if isinstance(source, RegionFeatures) else source
+    maps = maps.regions if isinstance(maps, CachedRegions) else maps
+    if original_size is None or not isinstance(maps, LabelFiles | LangSplat):
+        return
+    file, width, height = maps.size(name)
+    sizes = [(view.camera.width, view.camera.height) for view in views]
+    reason = "training undistorted the image, which moves and crops its content"
+    if (width, height) not in sizes:
+        kind = "the size of the original image" if (width, height) == original_size else "another size"
+        mismatch = f"is {width}x{height} (width x height), {kind}; {reason}, to {sizes[0][0]}x{sizes[0][1]}"
+        if not maps.resample:
+            raise InputError(
+                f"label map {file} of {name} {mismatch}. Make the maps from the undistorted images, or accept an error "
+                "of some pixels: --regions-resample True"
+            )
+        warnings.warn(f"label map {file} {mismatch}; it is stretched, and may be some pixels off", stacklevel=2)
+    elif (width, height) == original_size:
+        warnings.warn(
+            f"{reason} without changing its size: make sure that the label maps in {file.parent} were made from the "
+            "undistorted images",
+            stacklevel=2,
+        )
+
+
+# Evidence and features of a scene's views, computed in blocks and cached.
+
+
+_MAX_CHUNK = 16
+_READERS = 8
+"""Images that are read in parallel while one is processed or a network loads."""
+_MIN_SIDE = 8
+"""Minimum side of a downscaled image, in pixels; smaller ones show too little."""
+_CACHE_VERSION = "normlift_ns.block/6"
+"""Version in every cache key; increase it when evidence changes for the same input."""
+
+
+def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
+    """Return the level of each of `count` regions: the first that contains it, 0 for a region without cells.
+
+    >>> region_levels(torch.tensor([[0, 0, -1], [1, 2, 2]], dtype=torch.int32), 3).tolist()
+    [0, 1, 1]
+    """
+    level = torch.zeros(count, dtype=torch.int64)
+    for number, of_cell in reversed(list(enumerate(regions))):
+        level[of_cell[of_cell >= 0].long()] = number
+    return level
+
+
+class ViewBatch(NamedTuple):
+    """Views in the form that the rasterizer and the lift need."""
+
+    cameras: list[Camera]
+    labels: list[Int32[Tensor, "h w"]]
+    """Cells; -1 is unlabeled, -2 masked."""
+    regions: list[Int32[Tensor, "levels c"]]
+    """Region of every cell, -1 for none."""
+    features: list[Float[Tensor, "r d"]]
+
+
+def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
+    """Split views into chunks. Each chunk has one evidence file, and is the most that an interrupted lift can lose.
+
+    Every process gets the same number of chunks. The evidence of a view does not depend on the other views in its
+    chunk.
+
+    >>> [[len(chunk) for chunk in chunk_views(range(45), processes)] for processes in (1, 2)]
+    [[15, 15, 15], [12, 12, 12, 9]]
+    """
+    chunks = -(-len(views) // _MAX_CHUNK)
+    chunks = processes * max(1, -(-chunks // processes))
+    size = max(1, -(-len(views) // chunks))
+    return [views[first : first + size] for first in range(0, len(views), size)]
+
+
+def sample_evenly(count: int, most: int | None) -> list[int]:
+    """Return at most `most` of `count` indices, evenly spaced, including the first and the last.
+
+    >>> sample_evenly(10, 4)
+    [0, 3, 6, 9]
+    """
+    if most is None or most >= count:
+        return list(range(count))
+    return torch.linspace(0, count - 1, most).round().long().tolist() if most > 1 else [0]
+
+
+def observe_views(
+    scene: Scene,
+    indices: Sequence[int],
+    source: FeatureSource,
+    *,
+    rendered: RasterSettings | None,
+    divisor: int,
+    done: Callable[[View], None],
+) -> ViewBatch:
+    """Compute labels and features of some training views.
+
+    Args:
+        rendered: rasterizer settings to render the trained scene from the cameras, as a substitute for the images. If
+            None, use the images.
+        divisor: factor by which to downscale images and cameras.
+        done: called after every view, with the view as the source received it.
+    Raises:
+        ValueError, FileNotFoundError: raised by `FeatureSource.view` and `check_undistorted`. Also if an image, a mask
+            or a label map differs in size from its camera.
+    """
+    waiting: deque[View] = deque()
+
+    def images() -> Iterator[tuple[Tensor, str]]:
+        for read in prefetch_map(scene.train.__getitem__, indices, _READERS):
+            view = (
+                read if rendered is None else read._replace(image=render_image(scene, read.camera, settings=rendered))
+            )
+            _check_sizes(view)
+            waiting.append(_downscaled(view, divisor) if divisor > 1 else view)
+            check_undistorted(source, view, waiting[-1])
+            yield waiting[-1].image, view.name
+
+    block = ViewBatch([], [], [], [])
+    for result in iterate_view_features(source, images()):
+        view, labels = waiting.popleft(), result.labels
+        if labels.shape != view.image.shape[:2]:
+            raise InputError(
+                f"labels of {view.name} are {tuple(labels.shape)}, but the image is {tuple(view.image.shape[:2])} "
+                "(height x width); a feature source must label every pixel"
+            )
+        block.cameras.append(view.camera)
+        block.labels.append(labels if view.mask is None else labels.where(view.mask, MASKED))
+        block.regions.append(result.region_of_cell)
+        block.features.append(result.features)
+        done(view)
+    return block
+
+
+def _check_sizes(view: View) -> None:
+    expected = (view.camera.height, view.camera.width)
+    for name, size in (("image", view.image.shape[:2]), ("mask", expected if view.mask is None else view.mask.shape)):
+        if tuple(size) != expected:
+            raise InputError(
+                f"the {name} of {view.name} is {tuple(size)}, but its camera is {expected} (height x width); undistort "
+                "both in the same way"
+            )
+
+
+def batch_evidence(
+    gaussians: GaussianScene,
+    block: ViewBatch,
+    folder: Path,
+    *,
+    rasterize_mode: RasterizeMode,
+    settings: RasterSettings,
+    backend: BackendName,
+    weight_power: int,
+    dtype: torch.dtype,
+    reuse: bool,
+    done: Callable[[], None],
+) -> Evidence:
+    """Return evidence of the regions in a block.
+
+    It is computed from the evidence of each view's cells, which the folder caches. A view is read from the cache if its
+    scene, camera and labels are the same. Its regions, features and the other views of its block may differ.
+    """
+    facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
+    keys = evidence_keys(gaussians, block, facts)
+    cached = find_cached_views(folder, keys) if reuse else {}
+    missing = [view for view in range(len(keys)) if view not in cached]
+    for _ in cached:
+        done()
+    if len(missing) > 0:
+        evidence = rasterize_evidence(
+            gaussians,
+            [block.cameras[view] for view in missing],
+            [block.labels[view] for view in missing],
+            num_regions=[block.regions[view].shape[1] for view in missing],
+            backend=backend,
+            rasterize_mode=rasterize_mode,
+            weight_power=weight_power,
+            settings=settings,
+            dtype=dtype,
+            progress=lambda *_: done(),
+        )
+        cache_views(evidence, folder, [keys[view] for view in missing])
+        cached.update((view, CachedView(evidence, index)) for index, view in enumerate(missing))
+    return cells_to_regions(join_cached_views(cached).to(gaussians.means.device), block)
+
+
+def cached_batch_evidence(
+    gaussians: GaussianScene,
+    block: ViewBatch,
+    folder: Path,
+    *,
+    rasterize_mode: RasterizeMode,
+    settings: RasterSettings,
+    backend: BackendName,
+    weight_power: int,
+    dtype: torch.dtype,
+) -> Evidence | None:
+    """Return the evidence of a block from the cache, or None if a view would have to be rasterized again."""
+    facts = [rasterize_mode, weight_power, str(dtype), asdict(settings), backend]
+    cached = find_cached_views(folder, evidence_keys(gaussians, block, facts))
+    return cells_to_regions(join_cached_views(cached), block) if len(cached) == len(block.cameras) else None
+
+
+def evidence_keys(gaussians: GaussianScene, block: ViewBatch, facts: Sequence[Any]) -> list[str]:
+    """Return the cache key of each view's cell evidence: a digest of everything it depends on.
+
+    Args:
+        facts: how it is rasterized, as JSON types.
+    """
+    scene = _digest([_CACHE_VERSION, *facts], [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities])
+    views = zip(block.cameras, block.labels, block.regions)
+    return [
+        _digest([scene, regions.shape[1]], [labels, camera.K, camera.world_to_camera])
+        for camera, labels, regions in views
+    ]
+
+
+def cells_to_regions(evidence: Evidence, block: ViewBatch) -> Evidence:
+    """Convert evidence of a block's cells to evidence of its regions."""
+    counts = torch.tensor([0, *(len(rows) for rows in block.features)])
+    first = counts.cumsum(0).tolist()
+    columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]
+    region_view = torch.repeat_interleave(torch.arange(len(block.features)), counts[1:])
+    return evidence.regroup(torch.cat(columns, dim=1), region_view.int())
+
+
+def _digest(facts: Any, tensors: Sequence[Tensor]) -> str:
+    key = xxh3_128(json.dumps(facts).encode())
+    for tensor in tensors:
+        key.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
+        key.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return key.hexdigest()
+
+
+def _downscaled(view: View, divisor: int) -> View:
+    """Downscale a view by averaging pixels; a mask keeps a pixel only if it keeps all of it."""
+    camera = view.camera
+    height, width = camera.height // divisor, camera.width // divisor
+    if min(height, width) < _MIN_SIDE:
+        raise InputError(
+            f"lift_downscale {divisor:,} reduces {view.name} from {camera.width} x {camera.height} to {width} x "
+            f"{height} pixels; give a factor that leaves at least {_MIN_SIDE} pixels on each side"
+        )
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
+    mask = None if view.mask is None else _averaged(view.mask[:, :, None], height, width)[:, :, 0] > 0.999
+    image: UInt8[Tensor, "h w 3"] = _averaged(view.image, height, width).round().to(torch.uint8)
+    smaller = Camera(camera.K * scale, camera.world_to_camera, width, height)
+    return view._replace(camera=smaller, image=image, mask=mask)
+
+
+def _averaged(image: Tensor, height: int, width: int) -> Tensor:
+    channels_first = image.permute(2, 0, 1)[None].float()
+    return torch.nn.functional.interpolate(channels_first, (height, width), mode="area")[0].permute(1, 2, 0)
+
+
+# Collection of 2D features and evidence from views, by one process or several.
+#
+# Views are processed in chunks whose results are cached, so an interrupted lift can resume.
+
+
+class FeatureExport(NamedTuple):
+    """Export of 2D features to files, in addition to the lift."""
+
+    folder: Path
+    overwrite: bool
+    """Replace files with other content."""
+
+
+class RasterConfig(NamedTuple):
+    """Rasterization settings of a lift."""
+
+    rules: str
+    """Version of gsplat whose rasterization rules apply."""
+    backend: BackendName
+    """Backend that rasterizes."""
+    dtype: torch.dtype
+
+    @property
+    def settings(self) -> RasterSettings:
+        """Constants of the rasterization rules."""
+        return RasterSettings.of_gsplat(self.rules)
+
+
+class ViewObservations(NamedTuple):
+    """Evidence, features and levels from some views, for the Gaussians of this process."""
+
+    evidence: Evidence
+    features: Float[Tensor, "s d"]
+    level: Int64[Tensor, " s"]
+
+
+def collect_evidence(
+    scene: Scene,
+    gaussians: GaussianScene,
+    used: Sequence[int],
+    source: FeatureSource,
+    options: LiftOptions,
+    drawing: RasterConfig,
+    cache: Path,
+    export: FeatureExport | None,
+    stages: StageTimer,
+    ready: Callable[[], None],
+    portion: Partition,
+) -> ViewObservations:
+    """Collect evidence, feature table and region levels from some training views.
+
+    Args:
+        used: indices of the views.
+        source: encoder or files that the features come from.
+        cache: directory of cached features and evidence.
+        export: destination of the 2D features; None: no export.
+        stages: progress of the lift.
+        ready: function that waits until kernels are compiled.
+        portion: Gaussians of this process; its team divides the chunks of views.
+    """
+    team, views = portion.team, len(used)
+    source = cached(source, cache) if options.reuse_evidence else source
+    rendered = drawing.settings if options.image_source == "render" else None
+    chunks = chunk_views(used, team.size)
+    tables: dict[int, tuple[Tensor, Tensor]] = {}
+    parts: list[Evidence] = []
+    pieces: dict[int, EvidenceShard] = {}
+    for index in team.chunks(len(chunks)):
+        with stages("features", views) as step:
+
+            def done(view: View, step: Callable[[], None] = step) -> None:
+                if export is not None:
+                    write_langsplat(source, view.image, view.name, *export)
+                step()
+
+            block = observe_views(
+                scene, chunks[index], source, rendered=rendered, divisor=options.lift_downscale, done=done
+            )
+            tables[index] = _table(block)
+        with stages("evidence", views) as step:
+            ready()
+            evidence = batch_evidence(
+                gaussians,
+                block,
+                cache / "evidence",
+                rasterize_mode=scene.rasterize_mode,
+                settings=drawing.settings,
+                backend=drawing.backend,
+                weight_power=options.weight_power,
+                dtype=drawing.dtype,
+                reuse=options.reuse_evidence,
+                done=step,
+            )
+            if team.size > 1:
+                pieces[index] = EvidenceShard.of(evidence, portion)
+            else:
+                parts.append(evidence)
+    with stages("exchange") if team.size > 1 else stages("evidence", views):
+        evidence = Evidence.merge(*parts) if team.size == 1 else redistribute_evidence(pieces, portion, len(chunks))
+        features, level = _all_tables(tables, team)
+    return ViewObservations(evidence, features.to(gaussians.means.device, drawing.dtype), level)
+
+
+def _table(block: ViewBatch) -> tuple[Tensor, Tensor]:
+    """Return features and levels of the regions of a block."""
+    levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
+    return torch.cat(block.features), torch.cat(levels)
+
+
+def _all_tables(tables: dict[int, tuple[Tensor, Tensor]], team: Communicator) -> tuple[Tensor, Tensor]:
+    """Return features and levels of the regions of all chunks, in order."""
+    if team.size == 1:
+        features, levels = zip(*tables.values())
+        return torch.cat(features), torch.cat(levels)
+    local_chunks = sorted(tables)
+    gathered = team.tell_all([[(chunk, *tables[chunk][0].shape) for chunk in local_chunks]])
+    widths = {width for (shapes,) in gathered for _, _, width in shapes}
+    counts = [(chunk, count) for (shapes,) in gathered for chunk, count, _ in shapes]
+    empty = torch.zeros(0, max(widths)), torch.zeros(0, dtype=torch.int64)
+    parts = (torch.cat([empty[i], *(tables[chunk][i] for chunk in local_chunks)]) for i in range(2))
+    features, levels = (team.join(part).split([count for _, count in counts]) for part in parts)
+    order = sorted(range(len(counts)), key=lambda i: counts[i][0])
+    return torch.cat([features[i] for i in order]), torch.cat([levels[i] for i in order])

@@ -1,0 +1,345 @@
+"""Export of Gaussians as PLY files in the layout of splat tools, with semantics as additional vertex properties."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from normlift_ns.analysis.objects import Instances, find_instances
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.data.splat import check_ply_header
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import atomic_file, atomic_files
+from normlift_ns.options import LABEL_ARRAY_FILES, OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS, RasterizeMode
+from normlift_ns.query.engine import Answer
+
+MIN_OPACITY_LOGIT = -5.5373
+"""logit(1 / 255): Gaussians with a lower opacity are never rendered, and ns-export leaves them out."""
+INSTANCE_PROPERTIES = ("class_id", "instance_id")
+_MAX_COMMENT_LENGTH = 60
+_SH_C0 = 0.28209479177387814
+"""sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
+
+
+def splat_columns(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> dict[str, np.ndarray]:
+    """Return the vertex properties of `ns-export gaussian-splat`, in its order.
+
+    Opacities are logits and scales are logarithms, as splatfacto stores them.
+
+    Args:
+        parameters: gauss_params of splatfacto by name.
+        spherical_harmonics: False if colors do not depend on the view (sh_degree 0) and are stored as logits.
+    """
+    values = {name: value.detach().float().cpu() for name, value in parameters.items()}
+    means, rest = values["means"], values["features_rest"]
+    constant = values["features_dc"] if spherical_harmonics else (torch.sigmoid(values["features_dc"]) - 0.5) / _SH_C0
+    columns = {name: means[:, i] for i, name in enumerate("xyz")}
+    columns |= {name: torch.zeros_like(means[:, 0]) for name in ("nx", "ny", "nz")}
+    columns |= {f"f_dc_{i}": constant[:, i] for i in range(3)}
+    if spherical_harmonics:
+        by_channel = rest.transpose(1, 2).reshape(len(rest), -1)  # all red coefficients, then green, then blue
+        columns |= {f"f_rest_{i}": by_channel[:, i] for i in range(by_channel.shape[1])}
+    columns["opacity"] = values["opacities"][:, 0]
+    columns |= {f"scale_{i}": values["scales"][:, i] for i in range(3)}
+    columns |= {f"rot_{i}": values["quats"][:, i] for i in range(4)}
+    return {name: value.numpy() for name, value in columns.items()}
+
+
+def semantic_columns(field: SemanticField, answer: Answer | None, instances: Instances | None) -> dict[str, np.ndarray]:
+    """Return reliability, n_eff, relevancy_0, … as float32, and class_id and instance_id as uint32.
+
+    Ids are unsigned because splat converters turn -1 into 4294967295.
+    """
+    scores = {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
+    if answer is not None:
+        scores |= {f"relevancy_{q}": answer.relevancy[:, q] for q in range(len(answer.texts))}
+    columns = {name: value.float().cpu().numpy() for name, value in scores.items()}
+    if instances is not None:
+        columns |= {name: getattr(instances, name).cpu().numpy().astype(np.uint32) for name in INSTANCE_PROPERTIES}
+    return columns
+
+
+def answer_instances(
+    answer: Answer, *, reach: float = OBJECT_MAX_GAP, min_size: int = OBJECT_MIN_GAUSSIANS
+) -> Instances:
+    """Return class and object of every Gaussian; see `find_instances`."""
+    return find_instances(answer.texts, answer.means, answer.relevancy, answer.selected, reach=reach, min_size=min_size)
+
+
+def exportable_rows(columns: Mapping[str, np.ndarray], keep: Bool[Tensor, " n"]) -> Int64[np.ndarray, " m"]:
+    """Return indices of the kept Gaussians that ns-export would write: parameters finite, opacity at least 1/255."""
+    finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
+    return np.flatnonzero(finite & (columns["opacity"] >= MIN_OPACITY_LOGIT) & keep.cpu().numpy())
+
+
+def visible_rows(parameters: Mapping[str, Tensor], *, spherical_harmonics: bool) -> Int64[np.ndarray, " m"]:
+    """Return indices of the Gaussians that ns-export would write."""
+    columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
+    return exportable_rows(columns, torch.ones(len(columns["x"]), dtype=torch.bool))
+
+
+def write_splat_ply(
+    path: Path,
+    parameters: Mapping[str, Tensor],
+    field: SemanticField,
+    answer: Answer | None,
+    *,
+    keep: Bool[Tensor, " n"],
+    spherical_harmonics: bool,
+    rasterize_mode: RasterizeMode,
+    instances: Instances | None = None,
+    objects: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> Int64[np.ndarray, " m"]:
+    """Write a PLY file and, next to it, the scene index of every vertex as <stem>_rows.npy.
+
+    With an answer, also write the names of its classes and objects as <stem>_names.json.
+
+    Args:
+        path: path of the PLY file.
+        parameters, spherical_harmonics: as in `splat_columns`.
+        rasterize_mode: mode that the scene was trained with. The file records "antialiased", because other tools
+            assume "classic" by default.
+        keep: Gaussians to write; those that ns-export would leave out are skipped, see `exportable_rows`.
+        instances: classes and objects of the answer (default: those of `answer_instances`).
+        objects: content of <stem>_objects.json. None: no such file, and `overwrite` removes that of an earlier export.
+        overwrite: replace existing files.
+    Returns:
+        The scene indices.
+    Raises:
+        FileExistsError: a file exists, and `overwrite` is False.
+        ValueError: there is no Gaussian to write, or `objects` cannot be encoded as JSON.
+        OSError: a file cannot be written, for instance because the disk is full.
+    """
+    from plyfile import PlyData, PlyElement  # noqa: PLC0415 (every ns-* command imports this module)
+
+    columns = splat_columns(parameters, spherical_harmonics=spherical_harmonics)
+    rows = exportable_rows(columns, keep)
+    if len(rows) == 0:
+        if not bool(keep.any()):
+            raise InputError(f"{path} is not written: no Gaussian is selected")
+        raise InputError(
+            f"{path} is not written: all {int(keep.sum()):,} selected Gaussians are invisible (opacity below 1/255, or "
+            "parameters that are not finite)"
+        )
+    if answer is not None and instances is None:
+        instances = answer_instances(answer)
+    columns |= semantic_columns(field, answer, instances)
+    table = np.empty(len(rows), [(name, "<u4" if name in INSTANCE_PROPERTIES else "<f4") for name in columns])
+    for name, column in columns.items():
+        table[name] = column[rows]
+    texts = () if answer is None else answer.texts
+    comments = ["Written by normlift_ns", "Vertical Axis: z"]
+    if rasterize_mode == "antialiased":
+        comments.append("SplatRenderMode: mip")
+    comments += [f"relevancy_{q}: {_comment(text)}" for q, text in enumerate(texts)]
+    ply, indices, *json_files = export_paths(path)
+    contents = (None if instances is None else instances.to_json(), objects)
+    try:
+        documents = {
+            file: json.dumps(content, indent=2, allow_nan=False) + "\n"
+            for file, content in zip(json_files, contents)
+            if content is not None
+        }
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"objects cannot be encoded as JSON: {error}") from None
+    stale = [file for file in json_files if file not in documents] if overwrite else []
+    with atomic_files(ply, indices, *documents, overwrite=overwrite, remove=stale) as drafts:
+        with drafts[0].open("wb") as file:
+            PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments).write(file)
+        np.save(drafts[1], rows)
+        for draft, text in zip(drafts[2:], documents.values()):
+            draft.write_text(text, "utf8")
+    return rows
+
+
+def export_paths(path: Path) -> tuple[Path, Path, Path, Path]:
+    """Return the paths of an export: PLY file, scene indices, names of classes and objects, and table of objects.
+
+    >>> [file.name for file in export_paths(Path("fox.ply"))]
+    ['fox.ply', 'fox_rows.npy', 'fox_names.json', 'fox_objects.json']
+    """
+    rows, names, objects = (path.with_name(f"{path.stem}_{end}") for end in ("rows.npy", "names.json", "objects.json"))
+    return path, rows, names, objects
+
+
+def _comment(text: str) -> str:
+    """Return the text as a single line of ASCII, as the header of a PLY file requires."""
+    return " ".join(text.encode("ascii", "replace").decode().split())[:_MAX_COMMENT_LENGTH]
+
+
+# Export of Gaussian labels as NPY arrays, in the layout of Pointcept and of SceneSplat's benchmark.
+
+
+def write_label_arrays(
+    folder: Path,
+    means: Float[Tensor, "n 3"],
+    instances: Instances,
+    rows: Int64[np.ndarray, " m"],
+    *,
+    overwrite: bool = False,
+) -> tuple[Path, ...]:
+    """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, all or none.
+
+    Classes and objects are numbered from 0 here, as class_id - 1 and instance_id - 1; evaluations ignore -1.
+
+    Args:
+        rows: indices of the Gaussians to write.
+        overwrite: replace existing files.
+    Returns:
+        Paths of the four files.
+    Raises:
+        FileExistsError: a file exists, and `overwrite` is False.
+        OSError: a file cannot be written.
+    """
+    files = tuple(folder / name for name in LABEL_ARRAY_FILES)
+    names = {
+        "ignored": -1,
+        "segment": {str(i): text for i, text in enumerate(instances.texts)},
+        "instance": {str(i): {"segment": class_id - 1} for i, class_id in enumerate(instances.classes)},
+    }
+    with atomic_files(*files, overwrite=overwrite) as drafts:
+        np.save(drafts[0], means.detach().cpu().numpy()[rows].astype(np.float32))
+        for draft, ids in zip(drafts[1:3], (instances.class_id, instances.instance_id)):
+            np.save(draft, ids.cpu().numpy()[rows].astype(np.int32) - 1)
+        drafts[3].write_text(json.dumps(names, indent=2) + "\n", "utf8")
+    return files
+
+
+# Transfer of labels from Gaussians to the points of a point cloud or mesh.
+
+
+class NearestGaussians(NamedTuple):
+    """The nearest Gaussian of every point."""
+
+    row: Int64[np.ndarray, " p"]
+    near: Bool[np.ndarray, " p"]
+    """Whether that Gaussian is within the maximum distance."""
+
+
+class LabelTransfer(NamedTuple):
+    """Summary of a label transfer."""
+
+    points: int
+    share: float
+    """Fraction of points with a Gaussian within `limit`, in 0..1."""
+    limit: float
+    """Maximum distance from a point to its Gaussian, in the coordinates of the cloud."""
+
+
+def nearest_gaussians(
+    points: Float64[np.ndarray, "p 3"], means: Float64[np.ndarray, "n 3"], most: float
+) -> NearestGaussians:
+    """Find the Gaussian whose center is nearest to each point, with a k-d tree.
+
+    Args:
+        means: centers of at least one Gaussian.
+        most: maximum distance, inclusive.
+
+    >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), most=2.0)
+    Nearest(row=array([1, 0]), near=array([ True, False]))
+    """
+    finite = np.asarray(np.isfinite(points).all(axis=1))
+    distance, row = (np.asarray(x) for x in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
+    has_row = np.isfinite(distance)  # the tree returns no row if the squared distance overflows
+    return NearestGaussians(np.where(has_row, row, 0), finite & (distance <= most))
+
+
+def read_cloud(path: Path) -> PlyData:
+    """Read a PLY file whose vertices have x, y and z.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is truncated or not a PLY file, or its vertices have no positions.
+    """
+    expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no point cloud at {path}, given with --transfer. {expected}")
+    check_ply_header(path)
+    try:
+        cloud = PlyData.read(str(path), mmap="c")
+    except (PlyParseError, ValueError, OSError, EOFError, MemoryError, OverflowError) as error:
+        raise InputError(f"{path} cannot be read ({' '.join(str(error).split())}). {expected}") from error
+    vertex = next((element for element in cloud.elements if element.name == "vertex"), None)
+    names = {} if vertex is None else {item.name: item for item in vertex.properties}
+    if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
+        raise InputError(f"{path} has {0 if vertex is None else vertex.count:,} vertices with "
+                         f"{', '.join(names) or 'no properties'}. {expected}")  # fmt: skip
+    lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
+    if len(lists) > 0:
+        raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")
+    return cloud
+
+
+def check_no_properties(cloud: PlyData, names: Iterable[str]) -> None:
+    """Raise ValueError if the vertices of a cloud already have properties of these names."""
+    existing = sorted(set(cloud["vertex"].data.dtype.names or ()) & set(names))
+    if len(existing) > 0:
+        raise InputError(f"the vertices of the cloud already have {', '.join(existing)}; remove these properties first")
+
+
+def vertex_positions(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
+    """Return x, y, z of the vertices of a cloud."""
+    return np.stack([np.asarray(cloud["vertex"][axis], np.float64) for axis in "xyz"], axis=1)
+
+
+def label_cloud(
+    cloud: PlyData,
+    path: Path,
+    means: Float64[np.ndarray, "m 3"],
+    columns: dict[str, np.ndarray],
+    most: float,
+    *,
+    overwrite: bool = False,
+) -> LabelTransfer:
+    """Write a cloud with the labels of the nearest Gaussians, and with zeros for points that are too far from any.
+
+    Args:
+        path: path of the new PLY file.
+        means: centers of the Gaussians to take labels from, in the coordinates of the cloud.
+        columns: labels of these Gaussians, by property name.
+        most: maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians.
+    Raises:
+        ValueError: there are no Gaussians, or as in `write_cloud`.
+        FileExistsError, OSError: as in `write_cloud`.
+    """
+    if len(means) == 0:
+        raise InputError("the cloud cannot be labeled: all Gaussians are invisible (opacity below 1/255)")
+    spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing
+    limit = most * float(spacing[spacing.isfinite()].median())
+    nearest = nearest_gaussians(vertex_positions(cloud), means, limit)
+    labels = {name: np.where(nearest.near, x[nearest.row], 0).astype(x.dtype) for name, x in columns.items()}
+    write_cloud(path, cloud, labels, overwrite=overwrite)
+    return LabelTransfer(len(nearest.near), float(nearest.near.mean()), limit)
+
+
+def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
+    """Write a cloud with additional vertex properties, appended to the existing ones; everything else is unchanged.
+
+    Raises:
+        ValueError: the vertices already have a property of one of these names.
+        FileExistsError: the file exists, and `overwrite` is False.
+        OSError: the file cannot be written.
+    """
+    check_no_properties(cloud, columns)
+    vertex = cloud["vertex"].data
+    existing = [(name, vertex.dtype[name].newbyteorder("<")) for name in vertex.dtype.names or ()]
+    table = np.empty(len(vertex), [*existing, *((name, column.dtype) for name, column in columns.items())])
+    for name, _ in existing:
+        table[name] = vertex[name]
+    for name, column in columns.items():
+        table[name] = column
+    elements = [PlyElement.describe(table, "vertex") if e.name == "vertex" else e for e in cloud.elements]
+    labeled = PlyData(elements, byte_order="<", comments=cloud.comments, obj_info=cloud.obj_info)
+    with atomic_file(path, overwrite=overwrite) as draft, draft.open("wb") as file:
+        labeled.write(file)

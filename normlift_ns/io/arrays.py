@@ -1,0 +1,378 @@
+"""Safetensors files with a digest of their whole content, which is checked before any of it is used.
+
+This module does not need torch. The digest is the 128-bit XXH3. It detects damaged and misplaced files, but it does not
+protect against forgery. One core of an AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b. For a field of
+44 MB, this is 1.5 ms instead of 50 ms.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+from safetensors.torch import save_file
+from torch import Tensor
+from xxhash import xxh3_128
+
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import atomic_file
+
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+"""Largest number allowed in a file."""
+DIGEST_KEY = "digest"
+"""Metadata key of the digest."""
+ArrayParts = Iterable[tuple[str, str, Sequence[int], Any]]
+"""Name, type in torch's notation, shape and bytes of each array."""
+
+
+class ArrayFile(NamedTuple):
+    """Content of a file."""
+
+    arrays: dict[str, np.ndarray]
+    facts: dict[str, str]
+    """Metadata, without the digest."""
+    digest: str | None
+    """None for files of version 0.1."""
+
+
+def content_digest(parts: ArrayParts, facts: Mapping[str, str], key: str) -> str:
+    """Return the digest of a key, metadata, and the names, types, shapes and values of arrays.
+
+    Args:
+        parts: the arrays, sorted by name.
+        facts: metadata.
+        key: cache key, or an empty string.
+    """
+    state = xxh3_128(json.dumps([key, sorted(facts.items())]).encode())
+    for name, dtype, shape, content in parts:
+        state.update(json.dumps([name, dtype, list(shape)]).encode())
+        state.update(content)
+    return f"xxh3_128:{state.hexdigest()}"
+
+
+def array_digest(arrays: Mapping[str, np.ndarray], facts: Mapping[str, str], key: str = "") -> str:
+    """Return the digest of arrays and metadata, which equals `tensors.tensor_digest` of the same content.
+
+    >>> array_digest({"a": np.eye(2)}, {}) == array_digest({"a": np.eye(2, dtype=np.float32)}, {})
+    False
+    """
+    parts = (
+        (name, f"torch.{array.dtype}", array.shape, np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+        for name, array in sorted(arrays.items())
+    )
+    return content_digest(parts, facts, key)
+
+
+def save_arrays(
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    facts: Mapping[str, str] | None = None,
+    *,
+    key: str = "",
+    overwrite: bool = False,
+) -> str:
+    """Write a safetensors file and return its digest; see `tensors.save_tensors`."""
+    metadata = dict(facts or {})
+    content = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    digest = array_digest(content, metadata, key)
+    with atomic_file(path, overwrite=overwrite) as draft:
+        save_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
+        sort_metadata(draft)
+    return digest
+
+
+def sort_metadata(path: Path) -> None:
+    """Sort the metadata in a file's header, so that equal content gives bit-for-bit equal files.
+
+    safetensors itself writes metadata in arbitrary order.
+    """
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        ordered = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode().ljust(size)
+        if len(ordered) == size:  # otherwise this release of safetensors formats its header differently
+            file.seek(8)
+            file.write(ordered)
+
+
+def load_arrays(
+    path: Path, *, key: str = "", undigested: Collection[str] | None = None, remedy: str = "write it again"
+) -> ArrayFile:
+    """Read a file and check its digest; see `tensors.load_tensors`."""
+    return ArrayFile(*read_safetensors(path, "np", array_digest, key, undigested, remedy))
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Read the metadata in a file's header without checking the digest, which covers the whole file.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged or not a safetensors file.
+    """
+    try:
+        with safe_open(path, framework="np") as file:
+            return dict(file.metadata() or {})
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path} is damaged or not a safetensors file ({error})") from error
+
+
+def read_safetensors(
+    path: Path,
+    framework: str,
+    digest: Callable[[Any, dict[str, str], str], str],
+    key: str,
+    undigested: Collection[str] | None,
+    remedy: str,
+) -> tuple[dict[str, Any], dict[str, str], str | None]:
+    """Read a file, check its digest, and return its arrays, metadata and digest.
+
+    Args:
+        framework: "np" or "pt", the type of the returned arrays.
+        digest: computes the digest of arrays, metadata and key.
+        key, undigested, remedy: as in `tensors.load_tensors`.
+    Raises:
+        FileNotFoundError, ValueError: as in `tensors.load_tensors`.
+    """
+    if path.exists() and not path.is_file():  # reading a pipe would never end
+        raise InputError(f"{path} is not a regular file; {remedy}")
+    try:
+        with safe_open(path, framework=framework) as file:
+            facts = dict(file.metadata() or {})
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (safe_open is not a mapping)
+        expected = facts.pop(DIGEST_KEY, None)
+        has_digest = expected is not None or undigested is None or set(facts) != set(undigested)
+        actual = digest(arrays, facts, key) if has_digest else None
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} is missing; {remedy}") from None
+    except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path} is damaged or not a safetensors file ({error}); {remedy}") from error
+    if actual != expected:
+        problem = f"expected {expected}" if expected else "but the file does not record one"
+        raise InputError(f"{path} is damaged: its content has digest {actual}, {problem}; {remedy}")
+    return arrays, facts, actual
+
+
+def check_array(
+    name: str, array: np.ndarray, dtype: str, shape: Sequence[int], low: float | int, high: float | int = FLOAT32_MAX
+) -> None:
+    """Raise if the type, shape or value range of an array is not as expected; see `tensors.check_tensor`.
+
+    >>> check_array("means", np.zeros((2, 3), np.float32), "float32", (2, 3), 0)
+    """
+    if array.dtype != dtype or array.shape != tuple(shape):
+        raise InputError(f"{name} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}")
+    least, most = (array.min().item(), array.max().item()) if array.size > 0 else (low, low)
+    if not low <= least <= most <= high:
+        raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
+
+
+# Safe reading of NPY files without NumPy's own parser: headers are checked before anything is allocated, and nothing
+# in a file is executed.
+
+
+_MAGIC = b"\x93NUMPY"
+_MAX_HEADER_BYTES = 4096
+"""In bytes; headers of numeric arrays have 118."""
+_NUMERIC_KINDS = "biuf"
+"""Booleans, integers and floats, of at most 64 bits."""
+
+
+class _Header(NamedTuple):
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    order: str
+
+
+def read_npy(path: Path, what: str) -> np.ndarray:
+    """Return the numeric array in an NPY file, memory-mapped and read-only.
+
+    Args:
+        what: Kind of file, for messages.
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is not an NPY file, holds anything but numbers, or is shorter or longer than its header
+            says.
+    """
+    if not os.path.isfile(path):
+        if os.path.lexists(path):
+            raise InputError(f"{what} {path} is not a file; expected an NPY file as written by numpy.save")
+        raise FileNotFoundError(f"{what} {path} does not exist; check the folder")
+    try:
+        with path.open("rb") as file:
+            header = read_npy_header(file)
+            start, end = file.tell(), file.seek(0, os.SEEK_END)
+        check_npy_size(header, end - start)
+        if 0 in header.shape:
+            return np.empty(header.shape, header.dtype)
+        return np.memmap(path, header.dtype, "r", start, header.shape, header.order)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{what} {path} is damaged or not an NPY file ({error}); write it again with numpy.save"
+        ) from None
+
+
+def read_npy_header(file: IO[bytes]) -> _Header:
+    """Read the header of an array, up to the first byte of its data.
+
+    Raises:
+        ValueError: If the header is not that of a numeric array.
+    """
+    start = file.read(8)
+    if start[:6] != _MAGIC or len(start) < 8 or start[6] not in (1, 2, 3):
+        raise InputError("it does not begin like an NPY file of version 1 to 3")
+    size = file.read(2 if start[6] == 1 else 4)
+    length = int.from_bytes(size, "little")
+    text = file.read(length) if length <= _MAX_HEADER_BYTES else b""
+    if len(size) < 2 or len(text) != length:
+        raise InputError(f"its header should have {length} bytes, of which {len(text)} can be read")
+    try:
+        fields = ast.literal_eval(text.decode("latin1").strip())
+        descr, fortran, shape = fields["descr"], fields["fortran_order"], fields["shape"]
+        if not isinstance(descr, str) or not isinstance(fortran, bool) or not isinstance(shape, tuple):
+            raise InputError("it holds objects or records, expected plain numbers")
+        dtype = np.dtype(descr)
+    except InputError:
+        raise
+    except (ValueError, TypeError, KeyError, IndexError, SyntaxError, MemoryError, RecursionError) as error:
+        raise InputError(f"its header cannot be read: {type(error).__name__}") from None
+    if dtype.kind not in _NUMERIC_KINDS or dtype.itemsize > 8:
+        kind = "objects" if dtype.hasobject else str(dtype)
+        raise InputError(f"it holds {kind}; expected integers or floats")
+    if not all(type(length) is int and length >= 0 for length in shape) or len(shape) > 8:
+        raise InputError(f"its header has the invalid shape {str(shape)[:80]}")
+    return _Header(dtype, shape, "F" if fortran else "C")
+
+
+def check_npy_size(header: _Header, size: int) -> None:
+    """Raise ValueError unless the data has as many bytes as the header says."""
+    expected = math.prod(header.shape) * header.dtype.itemsize
+    if expected != size:
+        shape = " x ".join(map(str, header.shape))
+        raise InputError(f"{shape[:80]} {header.dtype} needs {expected:,} bytes, found {size:,}")
+
+
+def read_npy_bytes(data: bytes) -> np.ndarray:
+    """Read an NPY file in memory; raises as `read_npy_header`, and ValueError if its size differs from its header."""
+    file = io.BytesIO(data)
+    header = read_npy_header(file)
+    check_npy_size(header, len(data) - file.tell())
+    values = np.frombuffer(data, header.dtype, offset=file.tell()).astype(header.dtype.newbyteorder("="))
+    return values.reshape(header.shape, order=header.order)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+# Safetensors files of torch tensors with a digest of their whole content; `disk.arrays` is the NumPy counterpart.
+
+
+class TensorFile(NamedTuple):
+    """Content of a file."""
+
+    tensors: dict[str, Tensor]
+    facts: dict[str, str]
+    """Metadata, without the digest."""
+    digest: str | None
+    """None for files of version 0.1."""
+
+
+def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: str = "") -> str:
+    """Return the digest of metadata, a key, and the names, types, shapes and values of tensors.
+
+    >>> table = {"a": torch.eye(2)}
+    >>> tensor_digest(table, {}) == tensor_digest({"a": torch.eye(2)}, {})
+    True
+    >>> tensor_digest(table, {}) == tensor_digest(table, {}, "key") or tensor_digest(table, {}) == tensor_digest({}, {})
+    False
+    """
+    parts = ((name, str(x.dtype), x.shape, _bytes(x) if x.numel() > 0 else b"") for name, x in sorted(tensors.items()))
+    return content_digest(parts, facts, key)
+
+
+def _bytes(tensor: Tensor) -> memoryview:
+    flat = tensor.detach().cpu().reshape(-1).contiguous()
+    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single element may have any stride
+
+
+def save_tensors(
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    facts: Mapping[str, str] | None = None,
+    *,
+    key: str = "",
+    overwrite: bool = False,
+) -> str:
+    """Write a safetensors file and return its digest, which its metadata also records.
+
+    Args:
+        facts: further metadata.
+        key: key of the file in a cache; loading with a different key raises an error.
+        overwrite: replace an existing file.
+    Raises:
+        FileExistsError, OSError: as in `atomic_files`.
+    """
+    metadata = dict(facts or {})
+    content = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
+    digest = tensor_digest(content, metadata, key)
+    with atomic_file(path, overwrite=overwrite) as draft:
+        save_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
+        sort_metadata(draft)
+    return digest
+
+
+def load_tensors(
+    path: Path, *, key: str = "", undigested: Collection[str] | None = None, remedy: str = "write it again"
+) -> TensorFile:
+    """Read a file of `save_tensors` and check its digest.
+
+    Args:
+        key: the key that the file was saved with.
+        undigested: all metadata keys of this kind of file in version 0.1, which wrote no digest. A file with exactly
+            these keys is read without a check. None: every file must have a digest.
+        remedy: what the error message suggests if the file is missing or damaged.
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the digest does not match, or the file is not a safetensors file.
+    """
+    return TensorFile(*read_safetensors(path, "pt", tensor_digest, key, undigested, remedy))
+
+
+def check_tensor(
+    name: str,
+    tensor: Tensor,
+    dtype: torch.dtype,
+    shape: Sequence[int],
+    low: float | int,
+    high: float | int = FLOAT32_MAX,
+) -> None:
+    """Raise if the type, shape or value range of a tensor is not as expected.
+
+    Args:
+        name: name of the tensor, for the error message.
+        low, high: bounds of its values, both inclusive; NaN and infinity are always out of range.
+    Raises:
+        ValueError: the tensor differs; the message has the actual and the expected properties.
+    """
+    if tensor.dtype != dtype or tuple(tensor.shape) != tuple(shape):
+        raise InputError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {tuple(shape)}")
+    least, most = (x.item() for x in _extremes(tensor)) if tensor.numel() > 0 else (low, low)
+    if not low <= least <= most <= high:
+        raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
+
+
+def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the minimum and the maximum."""
+    try:
+        return tensor.aminmax()
+    except RuntimeError:  # torch before 2.2 lacks aminmax for half precision on the CPU
+        return tensor.float().aminmax()

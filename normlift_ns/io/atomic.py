@@ -1,0 +1,551 @@
+"""Digests of strings and files: the 128-bit XXH3, which detects damage but not forgery."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import hmac
+import json
+import os
+import re
+import secrets
+import shutil
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache, partial
+from hashlib import blake2b
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from xxhash import xxh3_128
+
+from normlift_ns.errors import InputError, user_state_folder
+
+_BLOCK_SIZE = 2**20
+_LEGACY_PREFIX = "blake2b:"
+"""Prefix of the digests that version 0.1 computed of weight files."""
+
+
+def text_digest(text: str) -> str:
+    """Return the digest of a string.
+
+    >>> text_digest("fox")
+    'xxh3_128:2acc0017ba959fe5c1cfee97854b92cf'
+    """
+    return f"xxh3_128:{xxh3_128(text.encode()).hexdigest()}"
+
+
+def file_digest(*files: Path, like: str = "") -> str:
+    """Return the digest of the concatenated content of files, regardless of their paths.
+
+    One core reads about 10 GB/s.
+
+    Args:
+        like: digest to compare the result with. For one of version 0.1, the result uses the hash of that version, at a
+            tenth of the speed.
+    Raises:
+        OSError: a file cannot be read.
+
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "a.txt"
+    >>> _ = path.write_text("fox")
+    >>> file_digest(path) == text_digest("fox"), file_digest(path, like="blake2b:0")
+    (True, 'blake2b:af951fc8e5abe85ac01baf525102361b')
+    """
+    legacy = like.startswith(_LEGACY_PREFIX)
+    new_hash: Callable[[], Any] = partial(blake2b, digest_size=16) if legacy else xxh3_128
+    state, block = new_hash(), bytearray(_BLOCK_SIZE)
+    for file in files:
+        with file.open("rb", buffering=0) as stream:
+            while size := stream.readinto(block):
+                state.update(memoryview(block)[:size])
+    return f"{_LEGACY_PREFIX if legacy else 'xxh3_128:'}{state.hexdigest()}"
+
+
+# Atomic system calls: locks that end with their process, renames that never overwrite, and exchanges of two paths.
+#
+# Some systems do not support them (Windows, some network drives). The functions then return None or False, and the
+# caller uses a fallback.
+
+
+_NO_REPLACE, _EXCHANGE = 1, 2
+_AT_FDCWD = -100
+"""Relative paths start at the working directory."""
+_LOCK_TIMEOUT = 10.0
+"""Seconds to wait for a lock; normlift_ns itself holds one only briefly."""
+_UNSUPPORTED = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
+"""Errors of kernels, file systems and containers that do not support renameat2."""
+
+
+def acquire_lock(folder: Path) -> int | None:
+    """Lock a folder until `release_lock` or until the process ends, even if it is killed.
+
+    Returns:
+        A file descriptor for `release_lock`; None if the system does not support locks.
+    Raises:
+        BlockingIOError: another process holds the lock.
+        OSError: the folder does not exist.
+    """
+    if sys.platform == "win32":
+        return None
+    import fcntl  # noqa: PLC0415 (not available on Windows)
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # opening a pipe would block forever
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise
+    except OSError:  # a file system without locks
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def release_lock(descriptor: int | None) -> None:
+    """Release a lock of `acquire_lock`."""
+    if descriptor is not None:
+        os.close(descriptor)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder, after waiting for it for at most 10 seconds.
+
+    If the lock is still taken then, continue without it: another program may hold it for as long as it runs.
+    """
+    descriptor, deadline = None, time.monotonic() + _LOCK_TIMEOUT
+    while time.monotonic() < deadline:
+        try:
+            descriptor = acquire_lock(folder)
+            break
+        except BlockingIOError:
+            time.sleep(0.005)
+    try:
+        yield
+    finally:
+        release_lock(descriptor)
+
+
+def rename_if_absent(source: Path, target: Path) -> bool:
+    """Rename a file or a folder and return True; return False if the new name already exists.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> (folder / "a").touch()
+    >>> rename_if_absent(folder / "a", folder / "b"), rename_if_absent(folder / "b", folder / "b")
+    (True, False)
+    """
+    try:
+        if not _rename(source, target, _NO_REPLACE):
+            if os.path.lexists(target):
+                return False
+            os.rename(source, target)
+    except FileExistsError:
+        return False
+    return True
+
+
+def exchange_paths(first: Path, second: Path) -> bool:
+    """Exchange two files or folders, with both names existing at all times; return False if that is not supported."""
+    return _rename(first, second, _EXCHANGE)
+
+
+def _rename(source: Path, target: Path, flag: int) -> bool:
+    """Call Linux's renameat2; return False if it is not supported."""
+    if sys.platform != "linux":
+        return False
+    try:
+        function = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:  # a C library without it
+        return False
+    function.argtypes = [ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint]
+    if function(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
+        return True
+    error = ctypes.get_errno()
+    if error in _UNSUPPORTED:
+        return False
+    raise OSError(error, os.strerror(error), str(source), None, str(target))
+
+
+# Write-ahead journal for replacing several files or a folder, so that a crash in the middle can be completed.
+#
+# A journal moves and deletes files, so `complete_journal` follows only journals that the same user's programs wrote.
+# Each is signed with a key in the user's state folder. A folder received from somebody else cannot contain a valid
+# signature.
+
+
+JOURNAL_SUFFIX = ".journal"
+_KEY_FILE, _KEY_BYTES, _MAX_JOURNAL_BYTES = "key", 32, 2**20
+
+
+def write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
+    """Write the journal of the steps that are about to move files from a temporary folder into its parent.
+
+    The journal itself is written atomically.
+
+    Args:
+        steps: `files`, `remove` and `overwrite`; or `place`, `new` and `old`. All names are without folders.
+    """
+    draft, journal = temporary / "steps.json", temporary / f"steps{JOURNAL_SUFFIX}"
+    text = json.dumps(steps)
+    draft.write_text(f"{_signature(temporary, text)}\n{text}", "utf8")
+    descriptor = os.open(draft, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    os.rename(draft, journal)
+    return journal
+
+
+def complete_journal(temporary: Path) -> bool:
+    """Complete or undo the steps of a journal; return False if this user did not write it.
+
+    Without a journal, do nothing and return True.
+    """
+    journal = temporary / f"steps{JOURNAL_SUFFIX}"
+    if not os.path.lexists(journal):
+        return True
+    steps = _read(journal)
+    if steps is None:
+        warnings.warn(
+            f"{temporary} holds files that another user or another machine was moving into {temporary.parent} when it "
+            "was stopped. They are left unchanged; run that command there again, or delete the folder",
+            stacklevel=2,
+        )
+        return False
+    folder = temporary.parent
+    if "place" in steps:
+        target = folder / Path(steps["place"]).name
+        for name in (steps["new"], steps["old"]):
+            if not os.path.lexists(target) and (temporary / Path(name).name).exists():
+                os.rename(temporary / Path(name).name, target)
+        return True
+    for name in (Path(name).name for name in steps["files"]):
+        if (temporary / name).exists() and (steps["overwrite"] or not os.path.lexists(folder / name)):
+            os.replace(temporary / name, folder / name)
+    for name in steps["remove"]:
+        (folder / Path(name).name).unlink(missing_ok=True)
+    journal.unlink()
+    return True
+
+
+def _read(journal: Path) -> dict[str, Any] | None:
+    """Return the steps of a journal; None if its signature is not valid."""
+    if journal.is_symlink() or not journal.is_file() or journal.stat().st_size > _MAX_JOURNAL_BYTES:
+        return None
+    signature, _, text = journal.read_bytes().decode("utf8", "replace").partition("\n")
+    valid = hmac.compare_digest(signature.encode(), _signature(journal.parent, text).encode())
+    return json.loads(text) if valid else None
+
+
+def _signature(temporary: Path, text: str) -> str:
+    """Return the signature of a journal, which includes its path: moving a journal invalidates it."""
+    message = f"{temporary.resolve()}\n{text}".encode("utf8", "surrogateescape")
+    return hmac.new(_key(), message, "sha256").hexdigest()
+
+
+@cache
+def _key() -> bytes:
+    """Return the user's key, created at its first use; a key for this process alone if it cannot be stored."""
+    folder, new = user_state_folder(), secrets.token_bytes(_KEY_BYTES)
+    if folder is None:
+        return new
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        path, draft = folder / _KEY_FILE, folder / f"{_KEY_FILE}.{secrets.token_hex(8)}"
+        if not path.exists():
+            descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(new)
+            rename_if_absent(draft, path)  # another process may have been faster
+            draft.unlink(missing_ok=True)
+        stored = path.read_bytes() if path.is_file() else b""
+        if len(stored) == _KEY_BYTES and (os.name == "nt" or path.stat().st_uid == os.getuid()):
+            return stored
+    return new
+
+
+# Atomic file writes, which replace existing files only if asked to.
+#
+# New files are written into a temporary folder next to their destination, flushed to the disk and renamed. A process
+# holds the lock of its temporary folder for as long as it runs; later processes remove folders that are not locked.
+
+
+_TEMPORARY_PREFIX = ".normlift-"
+_TEMPORARY_NAME = re.compile(r"\.normlift-[0-9a-f]{16}")
+_RUN_FILES = {"config.yml", "dataparser_transforms.json", "splat.json", "transforms.json"}
+_RUN_FILES |= {"nerfstudio_models", "normlift"}
+_MAX_AGE = 86400
+"""Seconds after which a temporary folder counts as left over on systems without locks."""
+
+
+class NotWrittenError(OSError):
+    """Failure to write a file or folder; the message has its final path and the reason."""
+
+
+@contextmanager
+def atomic_files(*paths: Path, overwrite: bool = False, remove: Sequence[Path] = ()) -> Iterator[tuple[Path, ...]]:
+    """Yield a temporary path for each path; when the block ends, rename all of them to their final paths together.
+
+    If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
+    first rename and the last, the next process that writes to the folder completes the renames.
+
+    Args:
+        paths: the final paths, all in one folder.
+        overwrite: replace existing files.
+        remove: existing files to delete in the same step.
+    Raises:
+        FileExistsError: a path exists, and `overwrite` is False.
+        NotWrittenError: writing failed, for instance because the disk is full; nothing has changed then.
+
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "new folder" / "a.txt"
+    >>> with atomic_files(path) as (draft,):
+    ...     _ = draft.write_text("text")
+    >>> path.read_text()
+    'text'
+    """
+    folder, existing = paths[0].parent, None
+    with _draft_folder(*paths) as temporary:
+        drafts = tuple(temporary / path.name for path in paths)
+        yield drafts
+        _flush(temporary)
+        with locked(folder):
+            if not overwrite:
+                existing = next((path for path in paths if os.path.lexists(path)), None)
+            if existing is None:
+                existing = _rename_drafts(temporary, drafts, overwrite, remove)
+        _flush_names(folder)
+    if existing is not None:
+        raise FileExistsError(f"{existing} exists; give another name, or allow overwriting it")
+
+
+@contextmanager
+def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """Yield a temporary path for a single file; see `atomic_files`."""
+    with atomic_files(path, overwrite=overwrite) as (draft,):
+        yield draft
+
+
+def write_text_file(path: Path, text: str, *, overwrite: bool = False) -> None:
+    """Write a UTF-8 text file atomically; raises the errors of `atomic_files`."""
+    with atomic_file(path, overwrite=overwrite) as draft:
+        draft.write_text(text, "utf8")
+
+
+@contextmanager
+def draft_directory(path: Path) -> Iterator[Path]:
+    """Yield an empty temporary folder, which `commit_directory` can rename to `path` or to another name next to it.
+
+    Raises:
+        NotWrittenError: writing failed, for instance because the disk is full.
+    """
+    with _draft_folder(path) as temporary:
+        draft = temporary / path.name
+        draft.mkdir()
+        yield draft
+
+
+def commit_directory(draft: Path, path: Path, *, overwrite: bool = False) -> bool:
+    """Rename a folder of `draft_directory` to its final path; return False if that exists and `overwrite` is False.
+
+    A replaced folder exists at every instant, old or new, because the two are exchanged. If the system cannot exchange
+    folders, a journal records the steps, and the next command that opens or writes the run completes them.
+    """
+    _flush(draft)
+    with locked(path.parent):
+        if not rename_if_absent(draft, path):
+            if not overwrite:
+                return False
+            if not exchange_paths(draft, path):
+                _replace_in_steps(draft, path)
+    _flush_names(path.parent)
+    return True
+
+
+def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
+    """Rename drafts to their final paths; return a path that another program has created meanwhile, if any."""
+    journal, folder = None, temporary.parent
+    if len(drafts) + len(remove) > 1:
+        complete_interrupted_writes(
+            folder
+        )  # complete an older interrupted export now: completing it later would overwrite this one
+        names = {"files": [draft.name for draft in drafts], "remove": [path.name for path in remove]}
+        journal = write_journal(temporary, names | {"overwrite": overwrite})
+        _flush_names(temporary)
+    for draft in drafts:
+        if overwrite:
+            os.replace(draft, folder / draft.name)
+        elif not rename_if_absent(draft, folder / draft.name):  # created just now by a program that ignores our lock
+            if journal is not None:
+                journal.unlink()
+            return folder / draft.name
+    for path in remove:
+        path.unlink(missing_ok=True)
+    return None
+
+
+def _replace_in_steps(draft: Path, path: Path) -> None:
+    old, temporary = f"{path.name}.old", draft.parent
+    write_journal(temporary, {"place": path.name, "new": draft.name, "old": old})
+    _flush_names(temporary)
+    try:
+        os.rename(path, temporary / old)
+        os.rename(draft, path)
+    finally:
+        complete_journal(temporary)
+
+
+def complete_interrupted_writes(folder: Path) -> None:
+    """Complete the interrupted replacements in a folder, and remove temporary folders that were left behind.
+
+    Temporary folders of running processes are left unchanged.
+    """
+    for temporary in folder.glob(f"{_TEMPORARY_PREFIX}*"):
+        if _TEMPORARY_NAME.fullmatch(temporary.name) is None or temporary.is_symlink():
+            continue
+        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):  # locked, or an invalid journal
+            descriptor = acquire_lock(temporary)
+            try:
+                removable = complete_journal(temporary)
+                if removable and (descriptor is not None or time.time() - temporary.stat().st_mtime > _MAX_AGE):
+                    shutil.rmtree(temporary, ignore_errors=True)
+            finally:
+                release_lock(descriptor)
+
+
+@contextmanager
+def _draft_folder(*paths: Path) -> Iterator[Path]:
+    """Yield a temporary folder next to the paths; error messages name these paths, not the temporary ones."""
+    folder, temporary = paths[0].parent, None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        complete_interrupted_writes(folder)
+        temporary, descriptor = _temporary_folder(folder)
+        try:
+            yield temporary
+        finally:
+            try:
+                complete_journal(temporary)
+                shutil.rmtree(temporary, ignore_errors=True)
+            finally:
+                release_lock(descriptor)
+    except (
+        OSError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:  # torch and safetensors raise the latter if a disk is full
+        reason = str(error)
+        if temporary is not None:
+            reason = reason.replace(f"{temporary}{os.sep}", f"{folder}{os.sep}")
+        if not isinstance(error, NotWrittenError):
+            names = ", ".join(map(str, paths))
+            blocked = isinstance(error, IsADirectoryError | NotADirectoryError | FileExistsError)
+            remedy = "delete what blocks this path" if blocked else "free disk space or choose another folder"
+            reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
+        raise NotWrittenError(reason) from error
+
+
+def _temporary_folder(folder: Path) -> tuple[Path, int | None]:
+    """Create and lock a temporary folder. Unlike a folder of mkdtemp, it has the default permissions of new folders."""
+    while True:
+        temporary = folder / f"{_TEMPORARY_PREFIX}{secrets.token_hex(8)}"
+        temporary.mkdir()
+        with suppress(BlockingIOError, FileNotFoundError):  # another process is in `complete_interrupted_writes`
+            descriptor = acquire_lock(temporary)
+            if temporary.exists():
+                return temporary, descriptor
+            release_lock(descriptor)
+
+
+def _flush(folder: Path) -> None:
+    """Flush a temporary folder with all its files to the disk, and give the files default permissions."""
+    mode = folder.stat().st_mode & 0o666  # safetensors writes files that only their owner can read
+    for parent, _, files in os.walk(folder):
+        for name in files:
+            path = os.path.join(parent, name)
+            with suppress(OSError):  # a file system without permissions
+                os.chmod(path, mode)
+            descriptor = os.open(path, os.O_RDWR)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        _flush_names(Path(parent))
+
+
+def _flush_names(folder: Path) -> None:
+    """Flush the entries of a folder to the disk, if the system supports it."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def refuse_existing(*paths: Path, overwrite: bool, instead: str) -> None:
+    """Raise, before anything is computed, if a command would overwrite an existing file without being asked to.
+
+    Args:
+        instead: flags with which the user can choose another path, for the error message.
+    Raises:
+        FileExistsError: one of the paths exists and `overwrite` is False.
+        ValueError: as in `refuse_run_files`.
+    """
+    refuse_run_files(*paths, instead=instead)
+    for folder in {path.parent for path in paths}:
+        complete_interrupted_writes(folder)
+    for path in paths:
+        if not overwrite and os.path.lexists(path):
+            raise FileExistsError(f"{path} exists; give another {instead}, or --overwrite True.")
+
+
+def safe_file_name(text: str) -> str:
+    """Return a string as part of a file name: at most 40 characters, with `_` for all but letters and digits.
+
+    >>> safe_file_name("../tea pot")
+    '___tea_pot'
+    """
+    return "".join(c if c.isalnum() else "_" for c in text[:40])
+
+
+def numbered_paths(path: Path) -> Iterator[Path]:
+    """Yield the path, then path_2, path_3, …
+
+    >>> names = numbered_paths(Path("red.ply"))
+    >>> next(names).name, next(names).name
+    ('red.ply', 'red_2.ply')
+    """
+    yield path
+    yield from (path.with_name(f"{path.stem}_{number}{path.suffix}") for number in count(2))
+
+
+def refuse_run_files(*paths: Path, instead: str) -> None:
+    """Raise, before anything is computed, if an output would replace a part of a run, even with --overwrite.
+
+    A run is a folder that has config.yml and nerfstudio_models/. Figures, tables and exports next to these are allowed.
+
+    Args:
+        instead: flags with which the user can choose another path, for the error message.
+    Raises:
+        ValueError: a path, with links resolved, is a file of a run or inside one of its folders.
+
+    >>> refuse_run_files(Path("answers.json"), instead="--json")
+    """
+    for path in paths:
+        resolved = path.resolve()
+        for run in resolved.parents:
+            entry = resolved.relative_to(run).parts[0]
+            if entry in _RUN_FILES and (run / "config.yml").is_file() and (run / "nerfstudio_models").is_dir():
+                raise InputError(
+                    f"{path} is part of the run {run}, and replacing it would destroy the run; give another {instead} "
+                    "(--overwrite True does not allow this)"
+                )

@@ -1,0 +1,177 @@
+"""Reading the files of a semantic field, with checks of digests, shapes, index ranges and finite values.
+
+This module does not need torch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int32, Int64
+
+from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import FLOAT32_MAX, check_array, load_arrays
+from normlift_ns.io.manifest import LIFT_AGAIN, check_digests, read_manifest
+
+FIELD_FILE, EVIDENCE_FILE = "field.safetensors", "evidence.safetensors"
+EVIDENCE_FORMAT = "normlift_ns.evidence/1"
+EVIDENCE_COUNTS = ("num_views", "weight_power", "num_excluded")
+SCALAR_NAMES = ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight", "view_count")
+"""Names of the per-Gaussian numbers, as in `core.lift.Scalars`."""
+_MAX_VIEWS = 2**24
+
+
+class RowArrays(NamedTuple):
+    """A sparse matrix in CSR layout, as in `core.sparse.SparseRows`."""
+
+    offsets: Int64[np.ndarray, " rows_plus_1"]
+    column: Int32[np.ndarray, " nnz"]
+    weight: Float[np.ndarray, " nnz"]
+
+    def check(self, name: str, num_columns: int) -> None:
+        """Raise if the arrays are not a valid weight matrix with `num_columns` columns.
+
+        Args:
+            name: name of the matrix, for the error message.
+        Raises:
+            ValueError: wrong type or shape, entries outside the matrix, or weights that are negative or not finite.
+        """
+        weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"
+        arrays = (("offsets", self.offsets, "int64"), ("columns", self.column, "int32"))
+        for part, array, dtype in (*arrays, ("weights", self.weight, weight_dtype)):
+            if array.ndim != 1 or array.dtype != dtype:
+                raise InputError(f"{name}: {part} are {array.dtype} {array.shape}, expected one-dimensional {dtype}")
+        ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.size > 0 else []
+        size = self.column.size
+        if ends != [0, size] or self.weight.size != size or bool((self.offsets[1:] < self.offsets[:-1]).any()):
+            raise InputError(
+                f"{name}: offsets must rise from 0 to the number of entries, got {ends} for {size} columns and "
+                f"{self.weight.size} weights"
+            )
+        low, high = (int(self.column.min()), int(self.column.max())) if size > 0 else (0, -1)
+        if low < 0 or high >= num_columns:
+            raise InputError(f"{name}: columns are in {low}..{high}, expected 0..{num_columns - 1}")
+        least, most = (float(self.weight.min()), float(self.weight.max())) if size > 0 else (0.0, 0.0)
+        if not 0 <= least <= most < math.inf:
+            raise InputError(f"{name}: weights are in {least}..{most}, expected finite weights of at least 0")
+
+
+class EvidenceArrays(NamedTuple):
+    """Content of a file that `Evidence.save` wrote."""
+
+    rows: RowArrays
+    region_view: Int32[np.ndarray, " s"]
+    unlabeled: RowArrays
+    counts: tuple[int, int, int]
+    """Number of views, power of the weights, number of excluded Gaussians."""
+    digest: str | None
+    """None for files of version 0.1."""
+
+
+class FieldArrays(NamedTuple):
+    """Content of the files that `SemanticField.save` wrote."""
+
+    manifest: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    """`source`, the scalars, `means` (not in version 0.1), and either `features`, or `coordinates` and optionally
+    `basis`.
+    """
+    evidence: EvidenceArrays | None
+    digested: frozenset[str]
+    """Files that have a digest in the manifest, as paths relative to its folder."""
+
+
+def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again") -> EvidenceArrays:
+    """Read and check a file that `Evidence.save` wrote.
+
+    Args:
+        key: the key that the file was saved with. With a key, a file without a digest (version 0.1) is an error.
+        remedy: what the error message suggests if the file is missing or damaged.
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged or not an evidence file.
+    """
+    undigested = None if key else ("format", *EVIDENCE_COUNTS)
+    arrays, metadata, digest = load_arrays(path, key=key, undigested=undigested, remedy=remedy)
+    if metadata.get("format") != EVIDENCE_FORMAT:
+        raise InputError(
+            f"{path} is not an evidence file of this version: format {metadata.get('format')!r}, expected "
+            f"{EVIDENCE_FORMAT!r}"
+        )
+    try:
+        rows = RowArrays(*(arrays[name] for name in ("offsets", "region", "weight")))
+        unlabeled = RowArrays(*(arrays[f"unlabeled_{name}"] for name in ("offsets", "column", "weight")))
+        region_view = arrays["region_view"]
+        views, power, excluded = (int(metadata[name]) for name in EVIDENCE_COUNTS)
+        if region_view.ndim != 1 or region_view.dtype != "int32":
+            raise InputError(f"region_view is {region_view.dtype} {region_view.shape}, expected int32, [S]")
+        rows.check("region weights", len(region_view))
+        if not (0 <= views <= _MAX_VIEWS and power in (0, 1, 2) and 0 <= excluded <= len(rows.offsets) - 1):
+            counts = ", ".join(map(str, (views, power, excluded)))
+            raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {counts[:50]}, out of range")
+        unlabeled.check("weights of unlabeled pixels", views)
+        if len(unlabeled.offsets) != len(rows.offsets):
+            raise InputError(
+                f"{len(rows.offsets) - 1} Gaussians have region weights, but {len(unlabeled.offsets) - 1} have weights "
+                "of unlabeled pixels"
+            )
+        _check_views(region_view, views)
+        return EvidenceArrays(rows, region_view, unlabeled, (views, power, excluded), digest)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path} is damaged ({error}); {remedy}") from error
+
+
+def _check_views(region_view: Int32[np.ndarray, " s"], views: int) -> None:
+    low, high = (int(region_view.min()), int(region_view.max())) if region_view.size > 0 else (0, -1)
+    if low < 0 or high >= views or bool((region_view[1:] < region_view[:-1]).any()):
+        raise InputError(f"region_view is in {low}..{high}, expected rising values in 0..{views - 1}")
+
+
+def read_field(folder: Path) -> FieldArrays:
+    """Read the files that `SemanticField.save` wrote, and check all digests.
+
+    Raises:
+        FileNotFoundError: the folder has no complete field.
+        ValueError: unknown schema version, or a damaged file, which the message names.
+    """
+    manifest, digests = read_manifest(folder)
+    try:
+        arrays, _, digest = load_arrays(folder / FIELD_FILE, undigested=(), remedy=LIFT_AGAIN)
+        actual, evidence = {FIELD_FILE: digest}, None
+        if manifest["form"] == "evidence":
+            evidence = read_evidence(folder / EVIDENCE_FILE, remedy=LIFT_AGAIN)
+            actual[EVIDENCE_FILE] = evidence.digest
+        check_digests(folder, actual, digests)
+        _check_field(folder / FIELD_FILE, arrays, manifest, evidence)
+    except KeyError as error:
+        raise InputError(f"the semantic field in {folder} is damaged: {error} is missing; {LIFT_AGAIN}") from error
+    return FieldArrays(manifest, arrays, evidence, frozenset(digests or ()))
+
+
+def _check_field(
+    path: Path, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any], evidence: EvidenceArrays | None
+) -> None:
+    n, dimension = int(manifest["num_gaussians"]), int(manifest["dimension"])
+    try:
+        check_array("source", arrays["source"], "int32", (n,), 0, n - 1)
+        if "means" in arrays:  # Gaussians that are never rendered may have means that are not finite
+            check_array("means", np.nan_to_num(arrays["means"]), "float32", (n, 3), -FLOAT32_MAX)
+        for name in SCALAR_NAMES:
+            check_array(name, arrays[name], "int32" if name == "view_count" else "float32", (n,), 0)
+        if evidence is not None:
+            check_array("features", arrays["features"], "float32", (len(evidence.region_view), dimension), -FLOAT32_MAX)
+            if len(evidence.rows.offsets) - 1 != n:
+                raise InputError(f"{EVIDENCE_FILE} has {len(evidence.rows.offsets) - 1} Gaussians, expected {n}")
+            return
+        rank = dimension
+        if manifest["form"] == "low_rank":
+            rank = len(arrays["basis"])
+            check_array("basis", arrays["basis"], "float32", (rank, dimension), -FLOAT32_MAX)
+        rows = int((arrays["norm"] > 0).sum())
+        check_array("coordinates", arrays["coordinates"], "float16", (rows, rank), -FLOAT32_MAX)
+    except ValueError as error:
+        raise InputError(f"{path} is damaged: {error}; {LIFT_AGAIN}") from error

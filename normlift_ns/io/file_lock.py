@@ -1,0 +1,276 @@
+"""Work claims for processes that share a folder, without locks.
+
+A claim is the file KEY.NUMBER, created with O_EXCL, so that only one process gets it, also on network drives. NUMBER
+counts the attempts at a task; only the latest attempt counts. Its owner writes a heartbeat into the file, and creates
+KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process takes the task over by claiming the
+next number, which again only one process gets. Claim files are never deleted, so no process can delete the claim of
+another. Each process times heartbeats with its own clock; clocks of different machines need not agree.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+
+ABANDONED = "left"
+"""Outcome of an abandoned attempt; any process may claim the task again immediately."""
+BEATS_PER_TIMEOUT = 6
+"""Heartbeats per timeout: after one timeout without a heartbeat, an owner counts as dead."""
+_CLAIM_NAME = re.compile(r"([0-9a-z_-]+)\.([1-9][0-9]*)(?:\.([a-z]+))?")
+_PULSE_DIGITS = 12
+_MAX_POLL_INTERVAL = 5.0
+"""Seconds between two looks at the claims of other processes."""
+
+
+class ClaimState(NamedTuple):
+    """State of a task."""
+
+    number: int
+    """Number of the latest attempt; 0 if the task was never claimed."""
+    outcome: str | None
+    """Outcome of that attempt; None while it runs, or if its owner died."""
+
+
+UNCLAIMED = ClaimState(0, None)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """An attempt at a task, owned by one process."""
+
+    folder: Path
+    key: str
+    number: int
+
+    @property
+    def path(self) -> Path:
+        """Path of the claim file."""
+        return self.folder / f"{self.key}.{self.number}"
+
+
+class ObservedPulse(NamedTuple):
+    """Latest known heartbeat of a claim."""
+
+    pulse: bytes
+    since: float
+    """Time at which this process first read this pulse, in seconds of its own clock."""
+
+
+def claim_states(names: Iterable[str]) -> dict[str, ClaimState]:
+    """Return the state of every task that was ever claimed, by key.
+
+    Args:
+        names: names of the files in the folder.
+
+    >>> claim_states(["a.1", "a.1.left", "a.2", "b.1", "b.1.done", "notes.txt"])
+    {'a': State(number=2, outcome=None), 'b': State(number=1, outcome='done')}
+    """
+    latest: dict[str, ClaimState] = {}
+    for name in names:
+        match = _CLAIM_NAME.fullmatch(name)
+        if match is not None:
+            key, state = match[1], ClaimState(int(match[2]), match[3])
+            previous = latest.get(key, UNCLAIMED)
+            if (state.number, state.outcome or "") > (previous.number, previous.outcome or ""):
+                latest[key] = state
+    return latest
+
+
+def is_claimable(state: ClaimState, at_start: ClaimState) -> bool:
+    """Return whether a task may be claimed immediately.
+
+    It may if it was never claimed, if it was abandoned, or if its latest attempt ended before this process started.
+
+    >>> is_claimable(ClaimState(1, "failed"), at_start=ClaimState(1, "failed")), is_claimable(ClaimState(1, "failed"), at_start=UNCLAIMED)
+    (True, False)
+    """
+    return state.number == 0 or state.outcome == ABANDONED or (state.outcome is not None and state == at_start)
+
+
+def observe_pulse(before: ObservedPulse | None, pulse: bytes, now: float) -> ObservedPulse:
+    """Return the updated heartbeat record after reading `pulse` at time `now`.
+
+    >>> observe_pulse(ObservedPulse(b"7", since=10.0), b"7", now=15.0), observe_pulse(ObservedPulse(b"7", since=10.0), b"8", now=15.0)
+    (Seen(pulse=b'7', since=10.0), Seen(pulse=b'8', since=15.0))
+    """
+    return before if before is not None and before.pulse == pulse else ObservedPulse(pulse, now)
+
+
+def is_dead(seen: ObservedPulse, now: float, patience: float) -> bool:
+    """Return whether a heartbeat has not changed for `patience` seconds.
+
+    >>> is_dead(ObservedPulse(b"7", since=10.0), 69.0, 60.0), is_dead(ObservedPulse(b"7", since=10.0), 70.0, 60.0)
+    (False, True)
+    """
+    return now - seen.since >= patience
+
+
+def read_claim_states(folder: Path) -> dict[str, ClaimState]:
+    """Return the `claim_states` of a folder; an empty dict if the folder does not exist yet."""
+    try:
+        return claim_states(os.listdir(folder))
+    except FileNotFoundError:
+        return {}
+
+
+def try_claim(folder: Path, key: str, after: int) -> Claim | None:
+    """Claim the next attempt at a task; return None if another process claimed it first.
+
+    Args:
+        key: name of the task, of lower-case letters, digits, - and _.
+        after: number of the latest attempt.
+    Raises:
+        OSError: the folder cannot be written.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> mine = try_claim(folder, "fox", after=0)
+    >>> mine.path.name, try_claim(folder, "fox", after=0)
+    ('fox.1', None)
+    """
+    attempt = Claim(folder, key, after + 1)
+    assert _CLAIM_NAME.fullmatch(attempt.path.name), key
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with attempt.path.open("xb") as file:  # host name and process id are for human readers
+            file.write(f"{0:0{_PULSE_DIGITS}d} {socket.gethostname()} {os.getpid()}\n".encode())
+    except FileExistsError:
+        return None
+    return attempt
+
+
+def write_pulse(claim: Claim, count: int) -> bool:
+    """Write the heartbeat of a claim; return False if another process has taken the task over.
+
+    Failing to write the heartbeat is not an error; other processes then see it stop.
+
+    Args:
+        count: a non-negative number that differs from the previous one.
+    """
+    with suppress(OSError), claim.path.open("r+b", buffering=0) as file:
+        file.write(f"{count:0{_PULSE_DIGITS}d}".encode())
+    return not os.path.lexists(Claim(claim.folder, claim.key, claim.number + 1).path)
+
+
+def read_pulse(claim: Claim) -> bytes:
+    """Read the heartbeat of a claim; return an empty string if it cannot be read."""
+    with suppress(OSError):
+        return claim.path.read_bytes()[:_PULSE_DIGITS]
+    return b""
+
+
+def finish_claim(claim: Claim, outcome: str) -> None:
+    """Record the outcome of an attempt, so that other processes stop waiting for it.
+
+    Args:
+        outcome: a word of lower-case letters; `ABANDONED` lets other processes claim the task immediately.
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    path = claim.path.with_name(f"{claim.path.name}.{outcome}")
+    assert _CLAIM_NAME.fullmatch(path.name), outcome
+    path.touch()
+
+
+def iter_claims(
+    folder: Path,
+    keys: Sequence[str],
+    at_start: Mapping[str, ClaimState],
+    patience: float,
+    *,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[Claim]:
+    """Yield claims of this process until every task has ended, in this process or another.
+
+    The generator waits for tasks of other processes, and claims them if their heartbeat stops. The caller must work on
+    each claim, call `write_pulse` (`BEATS_PER_TIMEOUT` times per `patience`), and call `finish_claim` before it takes the next claim.
+
+    Args:
+        keys: names of the tasks.
+        at_start: result of `read_claim_states` before the caller listed its tasks. Attempts that had ended by then are
+            repeated; attempts that end later are not.
+        patience: seconds without a heartbeat after which an owner counts as dead.
+        clock, sleep: replacements for tests.
+    Raises:
+        OSError: the folder cannot be written.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> for mine in iter_claims(folder, ["a", "b"], {}, patience=60.0):
+    ...     finish_claim(mine, "done")
+    >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, patience=60.0))
+    (State(number=1, outcome='done'), [])
+    """
+    heartbeats: dict[Claim, ObservedPulse] = {}
+    while True:
+        now, current, waiting, mine = clock(), read_claim_states(folder), False, None
+        for key in keys:
+            state = current.get(key, UNCLAIMED)
+            available = is_claimable(state, at_start.get(key, UNCLAIMED))
+            if not available and state.outcome is None:
+                other = Claim(folder, key, state.number)
+                heartbeats[other] = observe_pulse(heartbeats.get(other), read_pulse(other), now)
+                available, waiting = is_dead(heartbeats[other], now, patience), True
+            if available and (mine := try_claim(folder, key, state.number)) is not None:
+                break
+            waiting |= available  # another process claimed it first, and may die
+        if mine is not None:
+            yield mine
+        elif not waiting:
+            return
+        else:
+            sleep(min(patience / BEATS_PER_TIMEOUT, _MAX_POLL_INTERVAL))
+
+
+# JSON Lines files: each process appends to a file of its own, and readers read all files of a folder.
+
+
+JSONL_SUFFIX = ".jsonl"
+_Line = TypeVar("_Line")
+
+
+def append_jsonl(path: Path, line: Any) -> None:
+    """Append a line, with a single write, and wait until it is on the disk.
+
+    Args:
+        path: a file that no other process writes.
+        line: a dataclass instance or other value that msgspec encodes as JSON.
+    Raises:
+        OSError: the file cannot be written.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    with os.fdopen(descriptor, "wb", buffering=0) as file:
+        file.write(msgspec.json.encode(line) + b"\n")
+        os.fsync(descriptor)
+
+
+def read_jsonl(folder: Path, kind: type[_Line]) -> list[_Line]:
+    """Return the lines of all .jsonl files in a folder, file by file in the order of their names.
+
+    Lines that do not decode as `kind` are skipped: a process that is killed may leave an incomplete one.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> append_jsonl(folder / "one.jsonl", {"fox": 1})
+    >>> _ = (folder / "two.jsonl").write_text('{"fox": 2}\\n{"fo')
+    >>> read_jsonl(folder, dict)
+    [{'fox': 1}, {'fox': 2}]
+    """
+    lines = []
+    for path in sorted(folder.glob(f"*{JSONL_SUFFIX}")):
+        for line in path.read_bytes().splitlines():
+            try:
+                lines.append(msgspec.json.decode(line, type=kind))
+            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+                continue
+    return lines

@@ -1,0 +1,523 @@
+"""Exact lists of the splats that touch each cell of an image, nearest first, built by two stable sorts.
+
+A cell is one of gsplat's tiles or a part of one. A splat is in the list of a cell if its rectangle touches the tile, as
+in gsplat, and alpha can reach its threshold in a pixel of the cell. The second condition is computed in float64 with a
+margin for all float32 rounding of alpha. So the sums equal those with gsplat's own lists.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float32, Int, Int32, Int64
+from torch import Tensor
+
+from normlift_ns.kernels.projection import SPLAT, ProjectedSplats
+
+_BLOCK = 32
+_ROUNDING = tl.constexpr(2.0**-20)
+"""Relative float32 rounding error of the squares in an exponent: at most 12 half units in the last place."""
+_REACH_MARGIN = tl.constexpr(1e-3)
+"""Added to the largest relevant exponent, for the rounding of the exponential and of float64 here."""
+_NEEDLE = tl.constexpr(1e-6)
+"""Ratio of a determinant to the product of its diagonal below which it does not determine the reach of a splat."""
+_FAR = tl.constexpr(1e30)
+
+
+class CellGrid(NamedTuple):
+    """Division of images of one size into cells."""
+
+    width: int
+    height: int
+    tile: int
+    """Side of gsplat's tiles in pixels, a power of two."""
+    cell_width: int
+    """Width in pixels of the cells that have lists; it divides a tile."""
+    cell_height: int
+    """Height in pixels of the cells that have lists; it divides a tile."""
+
+    @property
+    def across(self) -> int:
+        """Number of cells from left to right."""
+        return -(-self.width // self.cell_width)
+
+    @property
+    def down(self) -> int:
+        """Number of cells from top to bottom."""
+        return -(-self.height // self.cell_height)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells in an image."""
+        return self.across * self.down
+
+
+class CellLists(NamedTuple):
+    """Splats by cell, nearest first: cell c has members[offsets[c]:offsets[c + 1]].
+
+    Cells are numbered row by row, view after view.
+    """
+
+    offsets: Int32[Tensor, " cells_plus_1"]
+    members: Int32[Tensor, " pairs"]
+    """Rows of the splats."""
+
+
+@triton.jit
+def _pairs(
+    splats, order, keys, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
+    tiles_across, tiles_down, cells_across, cells_down,
+    TILE: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, CULL: tl.constexpr, WRITE: tl.constexpr,
+    SPLAT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Count the cells of every splat in some order, or write them, at most as many as were counted."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    valid = i < entries
+    e = tl.load(order + i, mask=valid, other=0)
+    row = splats + SPLAT * e
+    u, v = tl.load(row, mask=valid, other=0.0), tl.load(row + 1, mask=valid, other=0.0)
+    half_width, half_height = tl.load(row + 6, mask=valid, other=0.0), tl.load(row + 7, mask=valid, other=0.0)
+    # The tiles of the rectangle, in float32 like gsplat, and their cells.
+    x0 = tl.minimum(tl.maximum(tl.floor(u / TILE - half_width / TILE), 0.0), tiles_across).to(tl.int32)
+    x1 = tl.minimum(tl.maximum(tl.ceil(u / TILE + half_width / TILE), 0.0), tiles_across).to(tl.int32)
+    y0 = tl.minimum(tl.maximum(tl.floor(v / TILE - half_height / TILE), 0.0), tiles_down).to(tl.int32)
+    y1 = tl.minimum(tl.maximum(tl.ceil(v / TILE + half_height / TILE), 0.0), tiles_down).to(tl.int32)
+    x0, x1 = x0 * (TILE // CELL_W), tl.minimum(x1 * (TILE // CELL_W), cells_across)
+    y0, y1 = y0 * (TILE // CELL_H), tl.minimum(y1 * (TILE // CELL_H), cells_down)
+    y1 = tl.where(valid, y1, y0)
+
+    # {a dx^2 + 2 b dx dy + c dy^2 <= reach}: an ellipse that contains every pixel with alpha >= min_alpha.
+    a = 2.0 * tl.load(row + 2, mask=valid, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
+    c = 2.0 * tl.load(row + 3, mask=valid, other=1.0).to(tl.float64) * (1.0 - _ROUNDING)
+    b = tl.load(row + 4, mask=valid, other=0.0).to(tl.float64)
+    opacity = tl.load(row + 5, mask=valid, other=1.0)
+    reach = 2.0 * (tl.log(opacity / min_alpha).to(tl.float64) + _REACH_MARGIN)
+    u, v = u.to(tl.float64), v.to(tl.float64)
+    det = a * c - b * b
+    ellipse = (det > _NEEDLE * (a * c)) & (reach > 0)
+    if not CULL:
+        ellipse = ellipse & (i < 0)
+    det = tl.where(ellipse, det, 1.0)
+    a, c = tl.where(ellipse, a, 1.0), tl.where(ellipse, c, 1.0)
+    b = tl.where(ellipse, b, 0.0)
+    reach = tl.where(ellipse, reach, 0.0)
+    half_extent = tl.where(ellipse, tl.sqrt(reach * a / det), _FAR)
+    turn = b / c * tl.sqrt(reach * c / det)  # dy at the left end of the ellipse, -dy at its right end
+    low = tl.ceil((v - half_extent - (CELL_H - 0.5)) / CELL_H)
+    high = tl.floor((v + half_extent - 0.5) / CELL_H) + 1.0
+    y0 = tl.maximum(tl.minimum(low, y1.to(tl.float64)), y0.to(tl.float64)).to(tl.int32)
+    y1 = tl.minimum(tl.maximum(high, y0.to(tl.float64)), y1.to(tl.float64)).to(tl.int32)
+
+    total = tl.zeros([BLOCK], tl.int32)
+    if WRITE:
+        place, end = tl.load(starts + i, mask=valid, other=0), tl.load(ends + i, mask=valid, other=0)
+        view = (tl.load(keys + e, mask=valid, other=0) % views).to(tl.int32) * (cells_across * cells_down)
+    for k in range(tl.max(y1 - y0, axis=0)):
+        y = y0 + k
+        top = (y * CELL_H).to(tl.float64) + 0.5 - v
+        bottom = tl.minimum((y * CELL_H).to(tl.float64) + (CELL_H - 0.5), height - 0.5) - v
+        top, bottom = tl.maximum(top, -half_extent), tl.minimum(bottom, half_extent)
+        at_right = tl.minimum(tl.maximum(-turn, top), bottom)
+        at_left = tl.minimum(tl.maximum(turn, top), bottom)
+        right = u - b / a * at_right + tl.sqrt(tl.maximum(reach * a - det * at_right * at_right, 0.0)) / a
+        left = u - b / a * at_left - tl.sqrt(tl.maximum(reach * a - det * at_left * at_left, 0.0)) / a
+        right, left = tl.where(ellipse, right, _FAR), tl.where(ellipse, left, -_FAR)
+        first = tl.maximum(tl.ceil((left - (CELL_W - 0.5)) / CELL_W), x0.to(tl.float64))
+        last = tl.minimum(tl.floor((right - 0.5) / CELL_W) + 1.0, x1.to(tl.float64))
+        touches = (y < y1) & (top <= bottom) & (left <= width - 0.5) & (first < last)
+        count = tl.where(touches, last - first, 0.0).to(tl.int32)
+        if WRITE:
+            cell = view + y * cells_across + tl.where(touches, first, 0.0).to(tl.int32)
+            for j in range(tl.max(count, axis=0)):
+                writes = (j < count) & (place < end)
+                tl.store(out_cell + place, (cell + j).to(out_cell.dtype.element_ty), mask=writes)
+                tl.store(out_member + place, e.to(tl.int32), mask=writes)
+                place += writes.to(tl.int64)
+        total += count
+    if not WRITE:
+        tl.store(out_count + i, total, mask=valid)
+
+
+def build_cell_lists(
+    projected: ProjectedSplats, views: int, grid: CellGrid, min_alpha: float, *, cull: bool = True
+) -> CellLists:
+    """Return the splats of every cell of all views.
+
+    Args:
+        projected: Splats of all views.
+        views: Number of views.
+        grid: Cells of an image.
+        min_alpha: Threshold of alpha.
+        cull: Whether to omit a splat from cells in which alpha stays below the threshold. Other entries of the lists
+            do not depend on it.
+    """
+    device, entries, tile = projected.depth.device, len(projected.depth), grid.tile
+    order = projected.depth.sort(stable=True).indices  # equal depths stay in the order of the Gaussians
+    count = torch.empty(entries, dtype=torch.int32, device=device)
+    launch = (triton.cdiv(entries, _BLOCK),)
+    sizes = (entries, views, grid.width, grid.height, min_alpha, -(-grid.width // tile), -(-grid.height // tile))
+    sizes += (grid.across, grid.down)
+    shape = {"TILE": tile, "CELL_W": grid.cell_width, "CELL_H": grid.cell_height, "SPLAT": SPLAT, "BLOCK": _BLOCK}
+    options = {**shape, "CULL": cull, "num_warps": 1}
+    unused = count
+    if entries > 0:
+        _pairs[launch](
+            projected.splats, order, projected.seen, unused, unused, count, unused, unused, *sizes,
+            WRITE=False, **options,
+        )  # fmt: skip
+    ends = count.cumsum(0)
+    pairs = int(ends[-1]) if entries > 0 else 0
+    # If a cell was counted but not written, because of different rounding, its entry sorts behind all cells.
+    end = views * grid.cells
+    dtype = torch.int16 if end < 2**15 else torch.int32
+    cell = torch.full((pairs,), end, dtype=dtype, device=device)
+    member = torch.zeros(pairs, dtype=torch.int32, device=device)
+    if pairs > 0:
+        starts = ends - count
+        _pairs[launch](
+            projected.splats, order, projected.seen, starts, ends, count, cell, member, *sizes, WRITE=True, **options
+        )  # fmt: skip
+    cell, by_cell = cell.sort(stable=True)
+    bounds = torch.arange(end + 1, dtype=dtype, device=device)
+    return CellLists(torch.searchsorted(cell, bounds, out_int32=True), member[by_cell])
+
+
+# Sums of compositing weights by (splat, region): one single-warp program per cell, without atomics.
+#
+# A program holds the pixels of its cell in registers and iterates over its splats, nearest first, with the arithmetic
+# of gsplat's rasterize_to_pixels_fwd.cu. Every cell has its own part of the output, large enough for any result, and
+# fills it from the start. So the result does not depend on the order in which programs run.
+
+
+UNROLL = 4
+"""Number of splats between checks whether a cell is finished."""
+_MOST_SLOTS = 2**26
+"""Largest number of slots in a chunk, of 8 or 12 bytes each."""
+_COPIED = 128
+"""Sums that a program moves in one step."""
+_PLACES = 512
+"""Sums per program that decodes keys."""
+
+
+class AlphaLimits(NamedTuple):
+    """Fields of the rasterizer's settings that compositing uses."""
+
+    max_alpha: float
+    min_alpha: float
+    min_transmittance: float
+
+
+class RegionSums(NamedTuple):
+    """Nonzero sums, one per cell, splat and region, ordered by cell; a key can occur in several cells."""
+
+    key: Int[Tensor, " m"]
+    """Keys row * columns + label + 1, with the row of the splat."""
+    weight: Float32[Tensor, " m"]
+
+
+@triton.jit
+def cell_pixels(cell, cells_across, CELL_W: tl.constexpr, CELL_H: tl.constexpr):
+    """Return the rows [CELL_H, 1] and columns [1, CELL_W] of a cell in the image."""
+    y = (cell // cells_across) * CELL_H + tl.arange(0, CELL_H)[:, None]
+    x = (cell % cells_across) * CELL_W + tl.arange(0, CELL_W)[None, :]
+    return y, x
+
+
+@triton.jit
+def _unpack_floats(pair):
+    """Return the float32 numbers in the low and in the high half of an int64."""
+    return pair.to(tl.int32).to(tl.float32, bitcast=True), (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def load_splat(splats, m, valid):
+    """Return u, v, half of xx, half of yy, xy and opacity of a splat; an invalid splat has opacity 0."""
+    row = splats + 4 * m.to(tl.int64)
+    u, v = _unpack_floats(tl.load(row, mask=valid, other=0))
+    a, c = _unpack_floats(tl.load(row + 1, mask=valid, other=0))
+    b, opacity = _unpack_floats(tl.load(row + 2, mask=valid, other=0))
+    return u, v, a, c, b, opacity
+
+
+@triton.jit
+def blend(u, v, a, c, b, opacity, px, py, T, max_alpha, min_alpha, min_transmittance):
+    """Return (A_ij, transmittance after it) of one splat in all pixels; a finished pixel has transmittance 0."""
+    dx, dy = u - px, v - py
+    # Fused as by nvcc in rasterize_to_pixels_fwd.cu.
+    sigma = tl.fma(b * dx, dy, tl.fma(dx, a * dx, dy * (c * dy)))
+    alpha = tl.minimum(opacity * tl.exp2(sigma * -1.4426950408889634), max_alpha)
+    visible = (sigma >= 0) & (alpha >= min_alpha)
+    after = T * (1.0 - alpha)
+    continues = after > min_transmittance
+    return tl.where(visible & continues, alpha * T, 0.0), tl.where(visible, tl.where(continues, after, 0.0), T)
+
+
+@triton.jit
+def _number_labels(
+    labels, local, table, counts, width, height, cells_across, cells, CELL_W: tl.constexpr, CELL_H: tl.constexpr
+):
+    """Number the labels >= -1 of a cell in ascending order.
+
+    The numbers are written to local[cell, pixel], -1 for none, and the labels to table[cell, number].
+    """
+    cell = tl.program_id(0).to(tl.int64)
+    view = cell // cells
+    y, x = cell_pixels((cell % cells).to(tl.int32), cells_across, CELL_W, CELL_H)
+    label = tl.load(labels + (view * height + y) * width + x, mask=(y < height) & (x < width), other=-2)
+    END: tl.constexpr = 2147483647
+    number = tl.full([CELL_H, CELL_W], -1, tl.int32)
+    count = 0
+    current = tl.min(tl.where(label >= -1, label, END))
+    while current != END:
+        number = tl.where(label == current, count, number)
+        tl.store(table + cell * CELL_W * CELL_H + count, current)
+        count += 1
+        current = tl.min(tl.where(label > current, label, END))
+    pixel = tl.arange(0, CELL_H)[:, None] * CELL_W + tl.arange(0, CELL_W)[None, :]
+    tl.store(local + cell * CELL_W * CELL_H + pixel, number.to(tl.int16))
+    tl.store(counts + cell, count)
+
+
+@triton.jit
+def _sum_regions(
+    splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
+    first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
+    POWER: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr,
+):  # fmt: skip
+    cell = first_cell + tl.program_id(0).to(tl.int64)
+    start, stop = tl.load(offsets + cell), tl.load(offsets + cell + 1)
+    count = tl.load(counts + cell)
+    first = (tl.load(base + cell) - first_slot).to(tl.int32)
+    slot = first
+    if (start < stop) & (count > 0):
+        y, x = cell_pixels((cell % cells).to(tl.int32), cells_across, CELL_W, CELL_H)
+        px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
+        pixel = tl.arange(0, CELL_H)[:, None] * CELL_W + tl.arange(0, CELL_W)[None, :]
+        number = tl.load(local + cell * CELL_W * CELL_H + pixel).to(tl.int32)
+        only_column = tl.load(table + cell * CELL_W * CELL_H) + 1
+        T = tl.where(number >= 0, 1.0, 0.0)
+        i = start
+        alive = 1
+        # The next splat is loaded while the current one is computed.
+        m = tl.load(members + i)
+        u, v, a, c, b, o = load_splat(splats, m, i < stop)
+        later = tl.load(members + i + 1, mask=i + 1 < stop, other=0)
+        while (i < stop) & (alive > 0):
+            for _ in tl.static_range(UNROLL):
+                next_m = later
+                later = tl.load(members + i + 2, mask=i + 2 < stop, other=0)
+                next_u, next_v, next_a, next_c, next_b, next_o = load_splat(splats, next_m, i + 1 < stop)
+
+                weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
+                if POWER == 2:
+                    weight = weight * weight
+                if POWER == 0:
+                    weight = tl.where(weight > 0, 1.0, 0.0)
+                total = tl.sum(weight)
+                if total > 0:
+                    base_key = m.to(out_key.dtype.element_ty) * columns
+                    if count == 1:
+                        tl.store(out_weight + slot, total)
+                        tl.store(out_key + slot, base_key + only_column)
+                        slot += 1
+                    else:
+                        for r in range(count):
+                            part = tl.sum(tl.where(number == r, weight, 0.0))
+                            if part > 0:
+                                label = tl.load(table + cell * CELL_W * CELL_H + r) + 1
+                                tl.store(out_weight + slot, part)
+                                tl.store(out_key + slot, base_key + label)
+                                slot += 1
+                i += 1
+                m, u, v, a, c, b, o = next_m, next_u, next_v, next_a, next_c, next_b, next_o
+            alive = tl.max(tl.where(T > 0, 1, 0))
+    tl.store(out_used + cell - first_cell, slot - first)
+
+
+@triton.jit
+def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED: tl.constexpr):
+    """Move the used slots of a cell directly behind those of the previous cells."""
+    cell = tl.program_id(0).to(tl.int64)
+    count = tl.load(used + cell)
+    source, target = tl.load(base + cell) - first_slot, tl.load(ends + cell) - count
+    for k in range(0, count, COPIED):
+        i = k + tl.arange(0, COPIED)
+        tl.store(out_key + target + i, tl.load(key + source + i, mask=i < count), mask=i < count)
+        tl.store(out_weight + target + i, tl.load(weight + source + i, mask=i < count), mask=i < count)
+
+
+def sum_regions(
+    splats: Float32[Tensor, "m 8"],
+    lists: CellLists,
+    labels: Int32[Tensor, "views h w"],
+    grid: CellGrid,
+    *,
+    columns: int,
+    limits: AlphaLimits,
+    weight_power: int,
+) -> RegionSums:
+    """Return the sums of A_ij ** weight_power over the pixels of each region in each cell, for views of one size.
+
+    Args:
+        splats: Projected Gaussians; see `SPLAT`.
+        lists: Splats by cell.
+        labels: Region of every pixel. -1 means unlabeled and is summed like a region; pixels below -1 are ignored.
+        grid: Cells of an image.
+        columns: A number above the largest label + 1.
+        limits: Limits of alpha and transmittance.
+        weight_power: Exponent of A_ij.
+    """
+    views, device, pixels = len(labels), splats.device, grid.cell_width * grid.cell_height
+    cells = views * grid.cells
+    shape = {"CELL_W": grid.cell_width, "CELL_H": grid.cell_height, "num_warps": 1}
+    local = torch.empty(cells, pixels, dtype=torch.int16, device=device)
+    table = torch.empty(cells, pixels, dtype=torch.int32, device=device)
+    counts = torch.empty(cells, dtype=torch.int32, device=device)
+    _number_labels[(cells,)](
+        labels, local, table, counts, grid.width, grid.height, grid.across, grid.cells, **shape
+    )  # fmt: skip
+    slots = torch.cat([counts.new_zeros(1), counts * lists.offsets.diff().long()]).cumsum(0)  # first slot of each cell
+    dtype = torch.int32 if len(splats) * columns < 2**31 else torch.int64  # int32 takes half the time to sort
+    parts = [RegionSums(torch.zeros(0, dtype=dtype, device=device), torch.zeros(0, device=device))]
+    for first, last, low, high in _chunks(slots):
+        key = torch.empty(high - low, dtype=dtype, device=device)
+        weight = torch.empty(high - low, device=device)
+        used = torch.empty(last - first, dtype=torch.int32, device=device)
+        _sum_regions[(last - first,)](
+            splats.view(torch.int64), lists.members, lists.offsets, local, table, counts, slots, key, weight, used,
+            first, low, columns, grid.across, grid.cells, *limits,
+            POWER=weight_power, UNROLL=UNROLL, **shape,
+        )  # fmt: skip
+        ends = used.cumsum(0)
+        total = int(ends[-1])
+        packed = RegionSums(key.new_empty(total), weight.new_empty(total))
+        _pack[(last - first,)](key, weight, slots[first:], used, ends, *packed, low, COPIED=_COPIED, num_warps=1)
+        parts.append(packed)
+    return parts[1] if len(parts) == 2 else RegionSums(*(torch.cat(x) for x in zip(*parts)))
+
+
+def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, int]]:
+    """Return ranges of cells with at most _MOST_SLOTS slots, or of a single cell: (first, last) cell and slot.
+
+    The last cell and slot are exclusive.
+    """
+    total = int(slots[-1])
+    if total <= _MOST_SLOTS:
+        return [(0, len(slots) - 1, 0, total)] if total > 0 else []
+    bounds = torch.arange(0, total + _MOST_SLOTS, _MOST_SLOTS, device=slots.device)
+    cell = torch.cat([torch.searchsorted(slots, bounds, right=True) - 1, slots.new_tensor([len(slots) - 1])]).unique()
+    return [
+        (first, last, low, high) for (first, low), (last, high) in pairwise(zip(cell.tolist(), slots[cell].tolist()))
+    ]
+
+
+@triton.jit
+def _places(key, splat_keys, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    valid = i < count
+    k = tl.load(key + i, mask=valid, other=0)
+    splat = k // columns
+    gaussian_view = tl.load(splat_keys + splat, mask=valid, other=0)
+    gaussian = gaussian_view // views
+    column = tl.load(first + (gaussian_view - gaussian * views), mask=valid, other=0) + (k - splat * columns).to(
+        tl.int32
+    )
+    tl.store(out_gaussian + i, gaussian.to(tl.int32), mask=valid)
+    tl.store(out_column + i, column, mask=valid)
+
+
+def decode_keys(
+    key: Int[Tensor, " m"], splat_keys: Int64[Tensor, " splats"], first: Int32[Tensor, " views_plus_1"], columns: int
+) -> tuple[Int32[Tensor, " m"], Int32[Tensor, " m"]]:
+    """Return the Gaussian and the column of every sum.
+
+    Args:
+        key: Keys as in `RegionSums`.
+        splat_keys: Keys gaussian * views + view of every splat.
+        first: First column of every view.
+        columns: Columns per row in `key`.
+    """
+    gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))
+    if len(key) > 0:
+        _places[(triton.cdiv(len(key), _PLACES),)](
+            key, splat_keys, first, gaussian, column, len(key), columns, len(first) - 1, BLOCK=_PLACES, num_warps=4
+        )
+    return gaussian, column
+
+
+# Compositing of images with any number of channels: one single-warp program per cell and group of channels.
+
+
+_CHANNELS = 8
+"""Largest number of channels in a program; more channels need more programs, which recompute the weights."""
+
+
+@triton.jit
+def _composite(
+    splats, members, offsets, gaussians, values, image, out_alpha, width, height, channels, cells_across,
+    max_alpha, min_alpha, min_transmittance,
+    CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr, CHANNELS: tl.constexpr,
+):  # fmt: skip
+    cell = tl.program_id(0)
+    channel = tl.program_id(1) * CHANNELS + tl.arange(0, CHANNELS)[None, None, :]
+    start, stop = tl.load(offsets + cell), tl.load(offsets + cell + 1)
+    y, x = cell_pixels(cell, cells_across, CELL_W, CELL_H)
+    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
+    inside = (y < height) & (x < width)
+    T = tl.where(inside, 1.0, 0.0)
+    weight_sum = tl.zeros([CELL_H, CELL_W], tl.float32)
+    color = tl.zeros([CELL_H, CELL_W, CHANNELS], tl.float32)
+    i = start
+    alive = 1
+    while (i < stop) & (alive > 0):
+        for _ in tl.static_range(UNROLL):
+            inside_list = i < stop
+            m = tl.load(members + i, mask=inside_list, other=0).to(tl.int64)
+            u, v, a, c, b, o = load_splat(splats, m, inside_list)
+            gaussian = tl.load(gaussians + m)
+            weight, T = blend(u, v, a, c, b, o, px, py, T, max_alpha, min_alpha, min_transmittance)
+            value = tl.load(values + gaussian * channels + channel, mask=channel < channels, other=0.0)
+            color += weight[:, :, None] * value
+            weight_sum += weight
+            i += 1
+        alive = tl.max(tl.where(T > 0, 1, 0))
+    pixel = y.to(tl.int64) * width + x
+    tl.store(image + pixel[:, :, None] * channels + channel, color, mask=inside[:, :, None] & (channel < channels))
+    if tl.program_id(1) == 0:
+        tl.store(out_alpha + pixel, weight_sum, mask=inside)
+
+
+def composite(
+    splats: Float32[Tensor, "m 8"],
+    lists: CellLists,
+    gaussians: Int64[Tensor, " m"],
+    values: Float32[Tensor, "n c"],
+    grid: CellGrid,
+    limits: AlphaLimits,
+) -> tuple[Float32[Tensor, "h w c"], Float32[Tensor, "h w"]]:
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel of one view.
+
+    Args:
+        splats: Projected Gaussians; see `SPLAT`.
+        lists: Splats by cell.
+        gaussians: Gaussian of every splat.
+        values: Values of every Gaussian.
+        grid: Cells of the image.
+        limits: Limits of alpha and transmittance.
+    """
+    channels = values.shape[1]
+    image = torch.zeros(grid.height, grid.width, channels, device=splats.device)
+    alpha = torch.zeros(grid.height, grid.width, device=splats.device)
+    if len(lists.members) == 0:
+        return image, alpha
+    block = min(_CHANNELS, triton.next_power_of_2(max(1, channels)))
+    _composite[(grid.cells, max(1, triton.cdiv(channels, block)))](
+        splats.view(torch.int64), lists.members, lists.offsets, gaussians, values.contiguous(), image, alpha,
+        grid.width, grid.height, channels, grid.across, *limits, CELL_W=grid.cell_width, CELL_H=grid.cell_height,
+        UNROLL=UNROLL, CHANNELS=block, num_warps=1,
+    )  # fmt: skip
+    return image, alpha

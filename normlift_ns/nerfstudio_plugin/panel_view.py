@@ -1,0 +1,711 @@
+"""Clicks on the scene in nerfstudio's viewer. At most one browser at a time waits for a click."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, suppress
+from functools import cache
+from pathlib import Path
+from threading import RLock, Thread
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.viewer.render_state_machine import RenderAction
+from nerfstudio.viewer.viewer_elements import ViewerControl
+from torch import Tensor
+
+from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.data.nerfstudio.load import load_nerfstudio_scene
+from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
+from normlift_ns.errors import InputError, describe_error
+from normlift_ns.exports import MIN_OPACITY_LOGIT, write_splat_ply
+from normlift_ns.io.atomic import safe_file_name
+from normlift_ns.io.run_dir import cache_folder
+from normlift_ns.options import RELEVANCY_RULES, RasterizeMode
+from normlift_ns.query.engine import Answer
+from normlift_ns.query.question import load_query, save_query
+from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text, prompt_colors
+from normlift_ns.rendering.figures import Display, make_display, output_names
+from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD
+from normlift_ns.session.objects import ObjectList, ObjectRow, list_objects, unoccluded_viewpoint
+from normlift_ns.session.prompts import click_name, merge_queries
+from normlift_ns.session.state import History, RequestToken, RequestTokens, State
+from normlift_ns.viewer.adapter import ignore_closed_clients
+from normlift_ns.viewer.widgets import (
+    MAX_OBJECT_ROWS,
+    Explanation,
+    ObjectRows,
+    color_swatch,
+    diagnostics_mdx,
+    escape_mdx,
+)
+
+VISER_SCALE = 10.0
+"""Units of the viser scene per scene unit: nerfstudio's VISER_NERFSTUDIO_SCALE_RATIO."""
+CLICK_MODES = {"More like this": "like", "Select": "select", "Add": "add", "Drop": "take away"}
+"""What a click does, by the caption of its button."""
+
+
+class ClickListener:
+    """Listener for clicks on the scene, in at most one browser of a viewer.
+
+    Args:
+        hit: called with the mode of the click, and with the origin and direction of its ray in scene units.
+    """
+
+    def __init__(self, hit: Callable[[str, Tensor, Tensor], None]) -> None:
+        self._hit = hit
+        self._armed: tuple[str, Any] | None = None
+        self.known: dict[str, np.ndarray] = {}
+        """Directions of the clicked Gaussians, by the names of their prompts."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether a browser waits for a click."""
+        return self._armed is not None
+
+    def arm(self, button: str, client: Any) -> None:
+        """Wait for a click in one browser.
+
+        Args:
+            button: caption of the button, a key of `CLICK_MODES`.
+        """
+        self.disarm()
+        client.scene.on_pointer_event("click")(self._clicked)
+        self._armed = (CLICK_MODES[button], client)
+
+    def disarm(self) -> None:
+        """Stop waiting for a click."""
+        armed, self._armed = self._armed, None
+        if armed is not None and armed[1].scene._scene_pointer_cb is not None:
+            with suppress(Exception):  # raised by viser if the browser has just disconnected
+                armed[1].scene.remove_pointer_callback()
+
+    def forget(self, client: Any) -> bool:
+        """Handle a disconnected browser; return whether it waited for a click."""
+        waited = self._armed is not None and self._armed[1].client_id == client.client_id
+        if waited:
+            self._armed = None
+        return waited
+
+    def keep(self, vector: np.ndarray, taken: Iterable[str]) -> str:
+        """Keep the direction of a clicked Gaussian.
+
+        Args:
+            taken: prompt names that must not be used again, in addition to those of `known`.
+        Returns:
+            Name of the new prompt.
+        """
+        names = {*self.known, *taken}
+        name = next(name for n in range(1, len(names) + 2) if (name := click_name(n)) not in names)
+        self.known[name] = vector
+        return name
+
+    def _clicked(self, event: Any) -> None:
+        armed = self._armed
+        if armed is None or event.ray_origin is None:
+            return
+        self.disarm()
+        self._hit(armed[0], torch.tensor(event.ray_origin) / VISER_SCALE, torch.tensor(event.ray_direction))
+
+
+# Status text of the panel as MDX, which the viewer compiles.
+
+
+_MAX_TABLE_ROWS = 8
+
+
+def visible_mask(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
+    """Return the mask of Gaussians that are opaque enough to be drawn.
+
+    Args:
+        opacities: logits.
+    """
+    return opacities.detach()[:, 0] >= MIN_OPACITY_LOGIT
+
+
+def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"]) -> str:
+    """Return the status: running work, message, size of the selection, reasons for differing counts, and warnings.
+
+    Args:
+        busy: description of the running work; empty: none.
+        drawn: mask of Gaussians, as from `visible_mask`.
+    """
+    lines = [escape_mdx(text) for text in (busy, clip_text(message, 400)) if text]
+    selection = state.selection
+    count, hidden = int(selection.sum()), 0 if state.hidden is None else int(state.hidden.sum())
+    if state.question is None and count == 0:
+        lines.append("No query yet.")
+    else:
+        lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand}")
+    faint = int((selection & ~drawn.to(selection.device)).sum())
+    if faint > 0:
+        lines.append(f"{faint:,} of them are never drawn or exported (opacity below 1/255).")
+    if state.answer is not None and state.from_answer and state.shown is None:
+        several = int((state.answer.selected.sum(dim=1) > 1).sum())
+        if several > 0:
+            lines.append(f"{several:,} of them are selected by several prompts.")
+    if hidden > 0:
+        lines.append(f"{hidden:,} Gaussians are hidden.")
+    if state.remark:
+        lines.append(escape_mdx(state.remark))
+    return "\n\n".join(lines)
+
+
+def prompt_table(state: State) -> str:
+    """Return a table with the color, count and highest relevancy of each prompt, or with the prompt's error."""
+    answer = state.answer
+    if len(state.prompts) == 0 or answer is None:
+        return ""
+    counts, valid = answer.selected.sum(dim=0).tolist(), answer.valid
+    peaks = answer.relevancy[valid].amax(dim=0).tolist() if bool(valid.any()) else [0.0] * len(counts)
+    colors = prompt_colors(answer.texts).tolist()
+    rows = {text: (counts[i], peaks[i], colors[i]) for i, text in enumerate(answer.texts)}
+    lines = [
+        f"{escape_mdx(answer.question.rule)} above {answer.question.threshold:g}",
+        "",
+        "| | prompt | selected | peak |",
+        "|---|---|---|---|",
+    ]
+    failed = [prompt for prompt in state.prompts if prompt.problem]  # listed first, to be noticed
+    listed = [*failed, *(prompt for prompt in state.prompts if not prompt.problem)][:_MAX_TABLE_ROWS]
+    for prompt in listed:
+        name = escape_mdx(clip_text(prompt.text, 40))
+        if prompt.problem or prompt.text not in rows:
+            lines.append(f"| ⚠ | {name} | {escape_mdx(clip_text(prompt.problem, 120))} | |")
+            continue
+        count, peak, color = rows[prompt.text]
+        lines.append(f"| {color_swatch(color)} | {name} | {count:,} | {peak:.2f} |")
+    if len(state.prompts) > len(listed):
+        lines.append(f"| | and {len(state.prompts) - len(listed)} more | | |")
+    return "\n".join(lines)
+
+
+# Results that the panel exports: the selection as a file, and the prompts stored in a run.
+
+
+class PanelHost(Protocol):
+    """Interface of the model that the panel uses."""
+
+    def show(self, display: Display | None) -> None:
+        """Replace what is rendered in addition to the colors."""
+        ...
+
+    def in_sight(self, origin: Tensor, direction: Tensor) -> Tensor:
+        """Return the weights of the Gaussians on a ray."""
+        ...
+
+    def scene(self) -> GaussianScene:
+        """Return all Gaussians."""
+        ...
+
+    def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
+        """Return what `write_splat_ply` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
+        ...
+
+
+def export_selection(host: PanelHost, state: State, mask: Bool[Tensor, " n"], stem: str) -> tuple[str, bytes, int]:
+    """Export Gaussians as a PLY file.
+
+    Args:
+        mask: the selection, or an object in it.
+        stem: name of the file without suffix.
+    Returns:
+        Name and content of the file, and its number of Gaussians.
+    Raises:
+        ValueError: nothing is selected, or no selected Gaussian is ever drawn.
+    """
+    if not bool(mask.any()):
+        raise InputError("Nothing is selected; there is nothing to download.")
+    parameters, harmonics, mode = host.splats()
+    if not bool((mask & visible_mask(parameters["opacities"])).any()):
+        raise InputError("No selected Gaussian is ever drawn (opacity below 1/255); there is nothing to download.")
+    name = f"{safe_file_name(stem)}.ply"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        rows = write_splat_ply(
+            path,
+            parameters,
+            state.space.field,
+            state.answer,
+            keep=mask,
+            spherical_harmonics=harmonics,
+            rasterize_mode=mode,
+        )
+        return name, path.read_bytes(), len(rows)
+
+
+def store_prompts(folder: Path | None, state: State, *, replaces: bool) -> int:
+    """Store the prompts of a state in a run, in addition to the prompts stored there.
+
+    Args:
+        folder: folder of the semantic field; None: the run is not stored yet.
+        replaces: replace the stored prompts.
+    Returns:
+        Number of prompts that the run stores now.
+    Raises:
+        ValueError: there are no prompts to store, or the stored prompts use another rule.
+    """
+    if state.question is None or folder is None:
+        raise InputError("No query yet; there is nothing to save.")
+    question = merge_queries(None if replaces else load_query(folder), state.question)
+    save_query(folder, question)
+    return len(question.texts)
+
+
+# Widgets of the panel: a separate tab in nerfstudio's viewer, in front of its other tabs.
+#
+# The widgets are viser's. nerfstudio's own elements appear in a folder far down, do not report which browser pressed
+# them, and hold the render lock while their callbacks run.
+
+
+ALL_PROMPTS = "all prompts"
+TAB_LABEL = "Search"
+_SCRIPT = """
+(() => {
+  if (window.normlift) return;
+  window.normlift = true;
+  const style = document.createElement("style");
+  style.textContent = `.mantine-Button-root[data-variant="outline"] { padding-inline: 2px; }
+    .mantine-Flex-root > div:has(label:empty) { display: none; }`;
+  document.head.append(style);
+  const press = (text) => {
+    const found = [...document.querySelectorAll("button")].find((b) => b.textContent.trim() === text);
+    if (found && !found.disabled) found.click();
+  };
+  addEventListener("keydown", (event) => {
+    const row = event.target.closest ? event.target.closest("div:has(label)") : null;
+    const label = row && row.querySelector("label") ? row.querySelector("label").textContent : "";
+    const asks = event.target.tagName === "INPUT" && ["Prompts", "Negatives"].includes(label);
+    if (event.key === "Enter" && asks) setTimeout(() => press("Ask"), 150);
+    if (event.key === "Escape") press("Cancel");
+  });
+})();
+"""
+"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. It sends typed text at most every 50 ms."""
+
+
+class PanelWidgets:
+    """The tab with its widgets, shared by all browsers.
+
+    Args:
+        server: viser's server.
+        act: called with the name of the pressed or changed widget, its value, and the client of the browser.
+        lock: lock of the panel, held while a change is passed to `act`. No other thread can revert it meanwhile.
+    """
+
+    def __init__(self, server: Any, act: Callable[[str, Any, Any], None], lock: AbstractContextManager[Any]) -> None:
+        self._gui, self._act = server.gui, act
+        self._lock = lock
+        self._values: dict[str, Any] = {}
+        with add_first_tab(server.gui, TAB_LABEL, "SEARCH"):
+            self.prompts = self._gui.add_text("Prompts", "", hint="What to look for, separated by commas.")
+            self.ask = self._button("Ask", hint="Or press Enter in the prompts.")
+            self.cancel = self._button("Cancel", hint="Or press Escape. Stops a query or a pending click.")
+            self.cancel.visible = False
+            self.status = self._gui.add_markdown("")
+            self.poor = self._button("Leave out what is poorly evidenced")
+            self.poor.visible = False
+            self._group("History", ("Undo", "Redo", "Clear"))
+            self.threshold = self._slider(
+                "Threshold", MIN_THRESHOLD, MAX_THRESHOLD, 0.005, 0.5, "Relevancy above which Gaussians are selected."
+            )
+            self.reliability = self._slider(
+                "Minimum reliability", 0.0, 1.0, 0.01, 0.0, "Reliability R that selected Gaussians must have."
+            )
+            self._button("Suggested", hint="Use the threshold that the histogram suggests, its dashed line.")
+            self._group("Selection", ("Hide", "Only", "All"))
+            self._button("Select likely floaters", hint="Gaussians of no surface. Check them, then hide them.")
+            self.found = self._gui.add_markdown("")
+            self.histograms = self._gui.add_markdown("")
+            self.rows = ObjectRows(self._gui, lambda action, row, event: act(action, row, event.client))
+            with self._gui.add_folder("Why"):
+                self.why = self._button("Why?", hint="Show the training images that voted for the selection.")
+                self.reasons = self._gui.add_markdown("")
+            with self._gui.add_folder("Click in the scene"):
+                self._button("More like this", hint="Ask for everything similar to the Gaussian you click.")
+                self._group("Objects", ("Select", "Add", "Drop"))
+                self.steps = self._slider(
+                    "Grow", -MAX_GROW_STEPS, MAX_GROW_STEPS, 1, 0, "Grow or shrink the selection, from part to whole."
+                )
+            with self._gui.add_folder("Keep"):
+                self._button("Download selection", hint="The selected Gaussians as a PLY file.")
+                self._button("Save prompts in run", hint="Add them to the stored prompts; ns-render draws them.")
+                self.replace = self._button("Replace the saved prompts")
+                self.replace.visible = False
+            with self._gui.add_folder("How it is asked and drawn", expand_by_default=False):
+                self.shown = self._input(
+                    "shown",
+                    self._gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt that selects."),
+                )
+                self.colormap = self._input(
+                    "colormap", self._gui.add_dropdown("Colours", COLORMAPS, COLORMAPS[0], hint="Relevancy colormap.")
+                )
+                hint = "Prompts to compare with, separated by commas."
+                self.negatives = self._gui.add_text("Negatives", "", hint=hint)
+                rules = ("auto", *RELEVANCY_RULES)
+                self.rule = self._gui.add_dropdown("Relevancy", rules, "auto", hint="lerf and margin use negatives.")
+                self.refined = self._input(
+                    "refined", self._gui.add_checkbox("Refined", True, hint="Use refined features.")
+                )
+        self._gui._websock_interface.queue_message(_javascript(_SCRIPT))
+
+    def forget(self, negatives: str) -> None:
+        """Reset the settings that apply to the next query.
+
+        Args:
+            negatives: default negative prompts.
+        """
+        self._reset("Minimum reliability", self.reliability, 0.0)
+        self._reset("refined", self.refined, True)
+        self.rule.value, self.negatives.value = "auto", negatives
+
+    def follow(self, state: State) -> None:
+        """Show a state in every widget except the text boxes."""
+        texts = () if state.answer is None else state.answer.texts
+        options = (ALL_PROMPTS, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
+        if tuple(self.shown.options) != options:
+            self._values["shown"] = ALL_PROMPTS
+            self.shown.options = options
+            self._values["shown"] = self.shown.value  # viser keeps the choice if it is a new option
+        self._set("shown", self.shown, options[0 if state.shown is None else state.shown + 1])
+        if state.question is not None:
+            threshold = min(MAX_THRESHOLD, max(MIN_THRESHOLD, state.question.threshold))
+            self._set("Threshold", self.threshold, threshold)
+            self._set("Minimum reliability", self.reliability, state.question.min_reliability)
+            self._set("refined", self.refined, state.question.refined)
+        self._set("Grow", self.steps, state.steps)
+        self.poor.visible = state.remark != ""
+
+    def explain(self, reasons: str, *, busy: bool) -> None:
+        """Show the explanation of a selection.
+
+        Args:
+            reasons: MDX, as `viewer.widgets.Explanation.content`.
+            busy: whether the explanation is being computed.
+        """
+        self.why.disabled = busy
+        if self.reasons.content != reasons:
+            self.reasons.content = reasons
+
+    def place(self, value: str) -> int | None:
+        """Return the index of the prompt that an option of the dropdown names; None: all prompts."""
+        return None if value == ALL_PROMPTS else int(value.split(":", maxsplit=1)[0]) - 1
+
+    def _button(self, label: str, *, hint: str | None = None) -> Any:
+        button = self._gui.add_button(label, hint=hint)
+        button.on_click(lambda event: self._act(label, None, event.client))
+        return button
+
+    def _group(self, label: str, options: tuple[str, ...]) -> None:
+        group = self._gui.add_button_group(label, options)
+        group._impl.is_button = True  # else viser 0.2.7 ignores a second press of the same button
+        group.on_click(lambda event: self._act(group.value, None, event.client))
+
+    def _slider(self, label: str, low: float, high: float, step: float, value: float, hint: str) -> Any:
+        return self._input(label, self._gui.add_slider(label, low, high, step, value, hint=hint))
+
+    def _input(self, name: str, widget: Any) -> Any:
+        """Pass the changes of a widget to `act`, except changes made by the program; return the widget."""
+        self._values[name] = widget.value
+
+        def changed(event: Any) -> None:
+            with self._lock:
+                if widget.value != self._values[name]:
+                    self._values[name] = widget.value
+                    self._act(name, widget.value, event.client)
+
+        widget.on_update(changed)
+        return widget
+
+    def _set(self, name: str, widget: Any, value: Any) -> None:
+        """Set a widget without calling `act`, unless it has a user's change that `act` has not received yet."""
+        if widget.value == self._values[name]:
+            self._reset(name, widget, value)
+
+    def _reset(self, name: str, widget: Any, value: Any) -> None:
+        """Set a widget without calling `act`, even if a user has just changed it."""
+        if widget.value != value:
+            self._values[name] = value
+            widget.value = value
+
+
+def add_first_tab(gui: Any, label: str, icon: str) -> Any:
+    """Add a tab in front of the viewer's tabs. Widgets created in its context are placed in it.
+
+    viser adds new tabs at the end, and the viewer does not expose its tab group.
+    """
+    from viser import Icon, _gui_handles  # noqa: PLC0415 (nerfstudio's commands without a viewer load this module)
+
+    handles = gui._container_handle_from_id.values()
+    tabs = [handle for handle in handles if isinstance(handle, _gui_handles.GuiTabHandle)]
+    group = tabs[0]._parent if len(tabs) > 0 else gui.add_tab_group()
+    tab = group.add_tab(label, getattr(Icon, icon))
+    rows: list[list[Any]] = [group._labels, group._icons_html, group._tabs]
+    for row in rows:
+        row.insert(0, row.pop())
+    group._sync_with_client()
+    return tab
+
+
+def _javascript(source: str) -> Any:
+    from viser import _messages  # noqa: PLC0415 (as above)
+
+    return _messages.RunJavascriptMessage(source=source)
+
+
+# Details of an answer in the panel: objects, histograms, and the training images behind it.
+
+
+_DELAY = 0.1
+"""Seconds without a change before the details are computed."""
+
+
+def explanation_of_run(folder: Path | None, field: SemanticField) -> Explanation:
+    """Return the explanations of a lifted run.
+
+    The run is opened a second time at the first explanation, without nerfstudio and with its images.
+
+    Args:
+        folder: folder of the semantic field; None: the run is not stored yet.
+    """
+
+    @cache
+    def votes() -> RecordedVotes:
+        if folder is None:
+            raise InputError("The run is not stored yet, so the images behind the selection are unknown.")
+        run = folder.parent
+        scene = (
+            open_saved_splat(run)
+            if is_saved_splat(run)
+            else load_nerfstudio_scene(run / "config.yml", by_nerfstudio=_no_aria)
+        )
+        return RecordedVotes(scene, field.to("cpu"), cache_folder(run))
+
+    return Explanation(votes)
+
+
+def _no_aria(*_: Any) -> Any:
+    raise InputError(
+        "Images of Aria cameras (FISHEYE624) cannot be shown here. Use ns-normlift-view or ns-normlift-query --why."
+    )
+
+
+class BackgroundDetails:
+    """Background computation of objects and histograms, after a moment without changes. Stale results are dropped.
+
+    Args:
+        show: called in a separate thread with a function that returns False for stale results, the objects and the
+            histograms.
+        failed: called with any exception raised.
+    """
+
+    def __init__(
+        self, show: Callable[[Callable[[], bool], ObjectList, str], None], failed: Callable[[Exception], None]
+    ):
+        self._show, self._failed, self._turns = show, failed, RequestTokens()
+
+    def follow(self, state: State) -> None:
+        """Compute the details of the state that is shown now."""
+        token = self._turns.start("Looking for objects.")
+        Thread(target=self._compute, args=(token, state), daemon=True).start()
+
+    def cancel(self) -> None:
+        """Drop the results of the running computation."""
+        self._turns.cancel()
+
+    def _compute(self, token: RequestToken, state: State) -> None:
+        time.sleep(_DELAY)
+        if not self._turns.wanted(token):
+            return
+        try:
+            objects, histograms = list_objects(state, most=MAX_OBJECT_ROWS), diagnostics_mdx(state)
+            self._show(lambda: self._turns.finish(token), objects, histograms)
+        except Exception as error:  # no error may stop the viewer
+            if self._turns.finish(token):
+                self._failed(error)
+
+
+def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
+    """Move the camera of one browser to face an object, from the current side unless something blocks the view."""
+    camera = client.camera
+    view = (np.asarray(camera.position) / VISER_SCALE, camera.up_direction, float(camera.fov))
+    position = unoccluded_viewpoint(target, scene, drawn, *view)
+    with client.atomic():
+        camera.position = np.array(position) * VISER_SCALE
+        camera.look_at = np.array(target.centre) * VISER_SCALE
+
+
+# View of the panel: shows a state in the widgets and in the image of nerfstudio's viewer.
+
+
+NO_FIELD_MESSAGE = "No semantics yet. They are lifted at the end of training."
+
+
+def rerender_clients(viewer: Any) -> None:
+    """Render the image again in every browser that shows nerfstudio's viewer.
+
+    nerfstudio 1.1.5's own `Viewer._trigger_rerender` stops at the first browser that connects or disconnects at this
+    moment, and leaves outdated images in the browsers after it.
+    """
+    if not viewer.ready:
+        return
+    for number, client in viewer.viser_server.get_clients().items():
+        with suppress(KeyError):  # connecting, and about to render anyway, or disconnecting
+            viewer.render_statemachines[number].action(RenderAction("move", viewer.get_camera_state(client)))
+
+
+class _Control(ViewerControl):
+    """Element through which nerfstudio passes its viewer to the panel."""
+
+    def __init__(self, panel: PanelView) -> None:
+        self._panel = [panel]  # in a list: nerfstudio searches attributes for widgets
+
+    def _setup(self, viewer: Any) -> None:
+        super()._setup(viewer)
+        self._panel[0].install(viewer)
+
+
+class PanelView(torch.nn.Module):
+    """Widgets and display of the panel. A module, because nerfstudio searches only modules for a `ViewerControl`.
+
+    Args:
+        armed: returns whether a browser waits for a click.
+    """
+
+    def __init__(self, host: PanelHost, armed: Callable[[], bool]) -> None:
+        super().__init__()
+        self._host = [host]  # in a list: the model is the parent of this module
+        self._armed = armed
+        self._viewer: Any = None
+        self._widgets: PanelWidgets | None = None
+        self._history: History[State] | None = None
+        self._line, self._message, self._negatives = "", "", ""
+        self._colormap: Colormap = COLORMAPS[0]
+        self._turns, self._lock = RequestTokens(), RLock()
+        self._reasons: Explanation | None = None
+        self._details = BackgroundDetails(self._show_details, lambda error: self.tell(describe_error(error)[0]))
+        self.control = _Control(self)
+
+    @property
+    def state(self) -> State | None:
+        """The state shown now; None without a field."""
+        return None if self._history is None else self._history.now
+
+    @property
+    def answer(self) -> Answer | None:
+        """The answer to the query of the state; None without one."""
+        return None if self.state is None else self.state.answer
+
+    @property
+    def viewed(self) -> bool:
+        """Whether a viewer shows the panel."""
+        return self._widgets is not None
+
+    def act(self, name: str, value: Any = None, client: Any = None) -> None:
+        """Carry out the action of a widget.
+
+        Args:
+            name: name of the widget or caption of the button.
+            client: the browser in which it was pressed.
+        """
+        raise NotImplementedError
+
+    def forget(self, client: Any) -> None:
+        """Handle a disconnected browser."""
+        raise NotImplementedError
+
+    def install(self, viewer: Any) -> None:
+        """Add the tab to a viewer."""
+        self._viewer = viewer
+        self._widgets = PanelWidgets(viewer.viser_server, self.act, self._lock)
+        viewer.viser_server.on_client_disconnect(self._on_disconnect)
+        ignore_closed_clients(viewer.viser_server)
+        self._widgets.prompts.value, self._widgets.negatives.value = self._line, self._negatives
+        if self.state is not None:
+            self._details.follow(self.state)
+        self._update_widgets()
+
+    def _on_disconnect(self, client: Any) -> None:
+        """Handle a disconnect in another thread.
+
+        viser calls this under its own lock, for which a thread that holds the panel's lock may be waiting.
+        """
+        Thread(target=self.forget, args=(client,), daemon=True).start()
+
+    def tell(self, message: str) -> None:
+        """Show a message above the size of the selection."""
+        with self._lock:
+            self._message = message
+            self._update_widgets()
+
+    def _show(self, history: History[State], *, answered: bool = False) -> None:
+        """Show the current state of a history. The display is complete before the model gets it.
+
+        Args:
+            answered: whether the selection is new, so that the overlay replaces an rgb output.
+        """
+        state = history.now
+        drawn = None if state.hidden is None else state.drawn
+        display = make_display(
+            state.space.field,
+            state.answer,
+            shown=state.shown,
+            colormap=self._colormap,
+            chosen=state.selection,
+            drawn=drawn,
+            by_hand=not state.from_answer,
+        )
+        self._history = history
+        if self._reasons is not None:
+            self._reasons.follow(state)
+        if self._viewer is not None:
+            self._select_output(display, answered=answered)
+            self._details.follow(state)
+        self._host[0].show(display)
+        self._update_widgets()
+        if self._viewer is not None:
+            rerender_clients(self._viewer)
+
+    def _select_output(self, display: Display, *, answered: bool) -> None:
+        """Switch to the overlay if the current output no longer exists, or if it is rgb and there is a new answer."""
+        output = self._viewer.control_panel._output_render
+        outdated = output.value.startswith("relevancy_") and output.value not in output_names(display.texts)
+        if "overlay" in output.options and (outdated or (answered and output.value == "rgb")):
+            output.value = "overlay"
+
+    def _set_prompts(self, line: str) -> None:
+        """Replace the text in the prompt box, which otherwise only the user edits."""
+        self._line = line
+        if self._widgets is not None:
+            self._widgets.prompts.value = line
+
+    def _update_widgets(self) -> None:
+        """Show the state in the widgets."""
+        widgets, state = self._widgets, self.state
+        if widgets is None:
+            return
+        explaining = "" if self._reasons is None else self._reasons.busy
+        widgets.ask.disabled = self._turns.busy != "" or state is None
+        busy = self._turns.busy or explaining
+        widgets.cancel.visible = busy != "" or self._armed()
+        widgets.explain("" if self._reasons is None else self._reasons.content, busy=explaining != "")
+        if state is None:
+            widgets.status.content, widgets.found.content, widgets.histograms.content = NO_FIELD_MESSAGE, "", ""
+            return
+        widgets.follow(state)
+        visible = visible_mask(self._host[0].splats()[0]["opacities"])
+        widgets.status.content = status_mdx(state, self._message, busy, visible)
+        widgets.found.content = prompt_table(state)
+
+    def _show_details(self, is_current: Callable[[], bool], objects: ObjectList, histograms: str) -> None:
+        with self._lock:
+            if self._widgets is not None and is_current():
+                self._widgets.rows.show(objects)
+                self._widgets.histograms.content = histograms

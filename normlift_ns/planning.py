@@ -1,0 +1,699 @@
+"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib.metadata import PackageNotFoundError, requires, version
+from itertools import chain, islice
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal, NamedTuple, TypeVar, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.consensus import consensus
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.core.lift import lift
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.core.refine import clamp_k, refine
+from normlift_ns.core.scene import Scene
+from normlift_ns.data.alignment import in_frustum
+from normlift_ns.encoders.base import FeatureSource, segmentation_workers
+from normlift_ns.encoders.build import resolve_regions
+from normlift_ns.encoders.cache import NotCachedError, cached_only
+from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
+from normlift_ns.encoders.registry import has_local_clip_weights, has_local_sam_weights
+from normlift_ns.evidence_collection import (
+    RasterConfig,
+    ViewBatch,
+    batch_evidence,
+    evidence_keys,
+    observe_views,
+    sample_evenly,
+)
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
+from normlift_ns.pipeline import choose_raster_config, start_kernel_warm_up
+from normlift_ns.progress import peak_gib
+from normlift_ns.rasterization.evidence_cache import views_in_cache
+
+# Extrapolation from measurements of a few views to the time, memory and disk space of a whole lift.
+
+
+_EVIDENCE_COPIES = 3
+"""Copies of the evidence in memory while the parts of all blocks are joined and converted to regions."""
+_DIRECTION_COPIES = 2
+"""Copies of the directions in memory while the vote gathers them and a storage format is chosen."""
+_OFFSET_BYTES = 16
+"""Minimum bytes per Gaussian in an evidence file."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Cost of a stage: a fixed part, and a part for each item."""
+
+    fixed: float
+    each: float
+    count: float
+    """Number of items in the whole lift."""
+
+    def of(self, share: float = 1.0) -> float:
+        """Return the cost of a share of the items.
+
+        >>> Rate(fixed=2.0, each=0.5, count=10).of(0.5)
+        4.5
+        """
+        return self.fixed + self.each * self.count * share
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Measurements of a capture on a machine. Seconds are for one device."""
+
+    device: str
+    views: int
+    """Number of views to lift."""
+    gaussians: int
+    dimension: int
+    """Length of the feature vectors."""
+    regions: float
+    """Regions per view."""
+    entries: float
+    """Evidence entries per view."""
+    entry_bytes: int
+    """Bytes per evidence entry."""
+    before_s: Mapping[str, float]
+    """Seconds of steps that were done already and will be repeated, by name (start, open, kernels, check)."""
+    load_s: float
+    """Seconds until the network is loaded."""
+    features_s: float | None
+    """Seconds per view with new features; None if all are cached."""
+    kept_features_s: float | None
+    """Seconds per view with cached features; None if none are cached."""
+    features_kept: float
+    """Share of the views with cached features, in 0..1."""
+    evidence_s: float
+    """Seconds per view that is rasterized."""
+    kept_evidence_s: float
+    """Seconds per view with cached evidence."""
+    evidence_kept: float
+    """Share of the views with cached evidence, in 0..1."""
+    core_s: Mapping[str, Rate]
+    """Cost of consensus, lift, neighbors, vote and store, as far as they are enabled."""
+    field_bytes: Rate
+    """Size of the stored semantics."""
+    run_bytes: int
+    """Size of the checkpoint that is stored with them."""
+    write_bytes_s: float
+    """Bytes written per second."""
+    view_bytes: float
+    """Size of a view's features and regions in the cache."""
+    host_bytes: int
+    """Peak memory of this process so far."""
+    device_bytes: int | None
+    """Peak GPU memory until the evidence was computed; None without a GPU."""
+    looked_at: int = 0
+    """Number of views that were measured."""
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """One stage of a lift."""
+
+    name: str
+    seconds: float
+    remark: str = ""
+    """Cached part of the stage, in words."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Estimated time, memory and disk space of a lift."""
+
+    device: str
+    num_devices: int
+    views: int
+    gaussians: int
+    stages: tuple[PlannedStage, ...]
+    features_kept: int
+    """Approximate number of views with cached 2D features."""
+    evidence_kept: int
+    """Approximate number of views with cached evidence."""
+    host_bytes: int
+    """Memory of each process."""
+    device_bytes: int | None
+    """Memory of each GPU; None without a GPU."""
+    disk_bytes: int
+    """Bytes to be written."""
+    looked_at: int
+    """Number of views that the estimate is based on."""
+
+    @property
+    def seconds(self) -> float:
+        """Total time of all stages."""
+        return sum(stage.seconds for stage in self.stages)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the plan as JSON types, with `seconds` of each stage and `total_s`."""
+        facts = {name: value for name, value in asdict(self).items() if name != "stages"}
+        return {**facts, "seconds": {stage.name: stage.seconds for stage in self.stages}, "total_s": self.seconds}
+
+
+def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
+    """Estimate the cost of a lift.
+
+    Views and Gaussians are divided among the devices. The preceding steps, loading and writing are not.
+
+    Args:
+        num_devices: number of processes that share the work, each with its own device; at least 1.
+    Raises:
+        ValueError: `num_devices` is less than 1.
+    """
+    if num_devices < 1:
+        raise ValueError(f"num_devices must be at least 1, got {num_devices}")
+    views, share = facts.views, 1 / num_devices
+    features_cached, evidence_cached = (
+        _share_of(views, cached) for cached in (facts.features_kept, facts.evidence_kept)
+    )
+    new = views - features_cached
+    features = share * (new * (facts.features_s or 0.0) + features_cached * (facts.kept_features_s or 0.0))
+    features += facts.load_s if new > 0 else 0.0
+    evidence = share * ((views - evidence_cached) * facts.evidence_s + evidence_cached * facts.kept_evidence_s)
+    field_bytes = facts.field_bytes.of()
+    evidence_bytes = facts.entries * views * facts.entry_bytes
+    stages = (
+        *(PlannedStage(name, seconds) for name, seconds in facts.before_s.items()),
+        PlannedStage("features", features, _cached(features_cached, views)),
+        PlannedStage("evidence", evidence, _cached(evidence_cached, views)),
+        *(PlannedStage(name, rate.of(share)) for name, rate in facts.core_s.items()),
+        PlannedStage("write", (field_bytes + facts.run_bytes) / facts.write_bytes_s),
+    )
+    table = facts.regions * views * facts.dimension * 4
+    lift_bytes = (
+        share * (_EVIDENCE_COPIES * evidence_bytes + _DIRECTION_COPIES * facts.gaussians * facts.dimension * 4)
+        + 2 * table
+    )
+    files = (views - evidence_cached) / max(1, views) * (evidence_bytes + facts.gaussians * _OFFSET_BYTES * views / 16)
+    on_gpu = facts.device_bytes is not None
+    return Plan(
+        device=facts.device,
+        num_devices=num_devices,
+        views=views,
+        gaussians=facts.gaussians,
+        stages=stages,
+        features_kept=features_cached,
+        evidence_kept=evidence_cached,
+        host_bytes=round(facts.host_bytes + (table if on_gpu else lift_bytes)),
+        device_bytes=None if facts.device_bytes is None else round(facts.device_bytes + lift_bytes),
+        disk_bytes=round(files + new * facts.view_bytes + field_bytes + facts.run_bytes),
+        looked_at=facts.looked_at,
+    )
+
+
+def _share_of(views: int, share: float) -> int:
+    """Return the number of views in a share. It is all views only if the share is 1, and 0 only if the share is 0.
+
+    >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
+    (44, 45, 0)
+    """
+    return views if share >= 1 else min(views - 1, max(int(share > 0), round(share * views)))
+
+
+def _cached(cached: int, views: int) -> str:
+    if cached in (0, views):
+        return "" if cached == 0 else "cached"
+    return f"about {cached} of {views} views cached"
+
+
+# Cost of consensus, lift, neighbors, vote and storage, extrapolated from two samples of the Gaussians.
+
+
+Timed = Callable[[Callable[[], Any]], tuple[float, Any]]
+"""Does some work; returns its seconds and its result."""
+_LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
+"""Gaussians in the larger sample."""
+_SAMPLE_RATIO = 4
+"""Ratio of the sizes of the two samples."""
+_MAX_SAMPLE_VIEWS = 64
+"""Maximum number of views in the samples. The cost of more views is extrapolated in proportion."""
+
+
+@dataclass(frozen=True)
+class _Costs:
+    """Cost of one sample: seconds and number of items of every stage, and stored bytes."""
+
+    seconds: dict[str, float]
+    items: dict[str, float]
+    stored: int
+
+
+def measure_core(
+    gaussians: GaussianScene,
+    evidence: Evidence,
+    features: Float[Tensor, "s d"],
+    options: LiftOptions,
+    views: int,
+    timed: Timed,
+) -> tuple[dict[str, Rate], Rate]:
+    """Measure the cost of each stage of the core of a lift, and the bytes that it stores.
+
+    The evidence of a few views is repeated until there are as many as in the lift. A Gaussian of the sample then has as
+    many entries as in the lift. The cost of a stage has a fixed part and a part for each of its items.
+
+    Args:
+        evidence: evidence of a few views.
+        features: features of their regions.
+        views: number of views in the whole lift.
+    """
+    repeated = min(views, _MAX_SAMPLE_VIEWS)
+    times = max(1, round(repeated / evidence.num_views))
+    table = features.to(evidence.rows.weight).repeat(times, 1)
+    factor = views / (times * evidence.num_views)
+    most = min(len(gaussians), _LARGE_SAMPLE.get(gaussians.means.device.type, _LARGE_SAMPLE["cpu"]))
+    costs = []
+    for count in 2 * (most // _SAMPLE_RATIO, most):  # the first two only load or compile kernels for these sizes
+        rows = torch.linspace(0, len(gaussians) - 1, max(1, count), dtype=torch.float64).long()
+        rows = rows.to(gaussians.means.device)
+        parts = {"rows": evidence.rows.select_rows(rows), "unlabeled": evidence.unlabeled.select_rows(rows)}
+        sample = replace(evidence, **parts, num_excluded=0)
+        costs.append(_costs(gaussians.means[rows], sample, times, table, options, timed))
+    items = _items(evidence, times, len(gaussians), options)
+    counts = {name: value * (factor if name != "neighbors" else 1.0) for name, value in items.items()}
+    counts |= {name: float(len(gaussians)) for name in ("vote", "store")}
+    counts["consensus"] *= factor
+    small, large = costs[2:]
+    rates = {
+        name: _rate((small.items[name], seconds), (large.items[name], large.seconds[name]), counts[name])
+        for name, seconds in small.seconds.items()
+    }
+    stored = _rate((small.items["store"], small.stored), (large.items["store"], large.stored), counts["store"])
+    return rates, stored
+
+
+def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
+    """Fit a line through two costs, or one through the origin and the larger if they do not rise."""
+    (items, cost), (more, most) = small, large
+    each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
+    each = min(max(each, 0.0), most / max(1.0, more))
+    return Rate(most - each * more, each, count)
+
+
+def _costs(
+    means: Float[Tensor, "m 3"],
+    sample: Evidence,
+    times: int,
+    features: Float[Tensor, "s d"],
+    options: LiftOptions,
+    timed: Timed,
+) -> _Costs:
+    """Run all stages of a lift that follow the evidence, on some Gaussians."""
+    evidence = Evidence.merge(*[sample] * times)
+    lift_kwargs = {"beta": options.beta, "unlabeled": options.unlabeled}
+    seconds: dict[str, float] = {}
+    table, copied = features, None
+    if options.consensus:
+        kwargs = {
+            "power": options.consensus_power, "sample": options.consensus_sample, "least": options.consensus_least
+        }  # fmt: skip
+        seconds["consensus"], result = timed(lambda: consensus(evidence, features, **kwargs))
+        table = result.features
+    seconds["lift"], lifted = timed(lambda: lift(evidence, table, **lift_kwargs))
+    if options.consensus:
+        seconds["lift"] += timed(lambda: lift(evidence, features, **lift_kwargs))[0]
+    if options.refine:
+        vote = clamp_k(replace(options.vote, k=min(options.vote.k, max(1, len(means) - 1))), len(means))
+        seconds["neighbors"], neighbors = timed(lambda: nearest_neighbors(means, vote.k))
+        own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
+        seconds["vote"], copied = timed(
+            lambda: refine(means, lifted.directions, reliability, vote, own=own, neighbors=neighbors)
+        )
+    store_kwargs = {"tolerance": options.tolerance, "storage": options.storage}
+    seconds["store"], field = timed(lambda: SemanticField.build(lifted, means, copied, **store_kwargs))
+    stored_bytes = field.manifest["forms"][field.manifest["form"]]["bytes"]
+    return _Costs(seconds, _items(sample, times, len(means), options), stored_bytes)
+
+
+def _items(evidence: Evidence, times: int, gaussians: int, options: LiftOptions) -> dict[str, float]:
+    """Count the items of each stage.
+
+    They are the Gaussians sampled in every region for the consensus, evidence entries for the lift, and Gaussians for
+    the other stages.
+    """
+    per_region = torch.bincount(evidence.rows.column.long(), minlength=evidence.num_regions)
+    sampled = float(per_region.clamp(max=options.consensus_sample).sum()) * times
+    others = dict.fromkeys(("neighbors", "vote", "store"), float(gaussians))
+    return {"consensus": sampled, "lift": float(evidence.nnz * times), **others}
+
+
+# Diagnostics of a capture and a machine: one row per check, with its state (ok, warning or error) and advice.
+
+
+DiagnosticState = Literal["ok", "warning", "error"]
+_PROJECTED_GAUSSIANS = 100_000
+"""Number of Gaussians that are projected into the cameras."""
+_FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
+"""Shares of Gaussians in view below which the check warns, and fails."""
+_HIGH_SHARE = 0.8
+"""Share of free memory or disk space above which an estimate gets a warning."""
+_LIFT_LESS = "lift less: --lift-downscale 2, or --max-views 50"
+_SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """Result of one check."""
+
+    what: str
+    state: DiagnosticState
+    found: str
+    advice: str = ""
+    """Advice, such as an option to add."""
+
+
+def diagnose_views(scene: Scene) -> Diagnostic:
+    """Check how many Gaussians lie in the training views."""
+    means = scene.gaussians.means
+    means = means[:: max(1, len(means) // _PROJECTED_GAUSSIANS)]
+    visible = torch.zeros(len(means), dtype=torch.bool)
+    for camera in scene.train.cameras:
+        visible |= in_frustum(means, camera)
+    share = float(visible.float().mean())
+    message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
+    if share < _NONE_IN_VIEW:
+        return Diagnostic("in view", "error", message, "give the cameras of this splat, or --world-transform")
+    if share < _FEW_IN_VIEW:
+        return Diagnostic(
+            "in view", "warning", message, "the others get no semantics; are these the cameras of the splat?"
+        )
+    return Diagnostic("in view", "ok", message)
+
+
+def diagnose_device(device: str) -> Diagnostic:
+    """Check which device the lift will use."""
+    if torch.device(device).type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        name = torch.cuda.get_device_name(device)
+        return Diagnostic("device", "ok", f"{name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free")
+    message = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
+    if torch.cuda.is_available():
+        return Diagnostic("device", "warning", f"{message}, although one is available", "--device cuda")
+    return Diagnostic("device", "ok", message)
+
+
+def diagnose_versions() -> Diagnostic:
+    """Check which packages are installed."""
+    required = (requires("normlift-ns") or ()) if _version("normlift-ns") is not None else ()  # none in a source tree
+    specifiers = [requirement.split(";")[0].strip() for requirement in required if "extra ==" not in requirement]
+    names = ["".join(c if c.isalnum() or c in "-_." else " " for c in text).split()[0] for text in specifiers]
+    missing = [name for name in names if _version(name) is None]
+    message = ", ".join(f"{name} {_version(name) or 'absent'}" for name in _SHOWN_PACKAGES)
+    if missing == ["nerfstudio"]:
+        return Diagnostic(
+            "versions", "warning", f"{message}; ns-* commands need nerfstudio", "pip install nerfstudio==1.1.5"
+        )
+    if len(missing) > 0:
+        return Diagnostic(
+            "versions", "error", f"{message}; not installed: {', '.join(missing)}", f"pip install {missing[0]}"
+        )
+    return Diagnostic("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def missing_weights(options: SourceOptions, device: str) -> list[str]:
+    """Describe the network weights that the options need and this machine does not have."""
+    missing = []
+    if options.features == "none" and (kind := resolve_regions(options, device)) in ("sam", "sam3"):
+        model = options.sam_model or (DEFAULT_SAM if kind == "sam" else DEFAULT_SAM3)
+        if not has_local_sam_weights(model):
+            missing.append(f"those of SAM, {model}")
+    family = MODEL_FAMILIES.get(options.encoder)
+    if (
+        options.features == "none"
+        and family is not None
+        and find_local_model(resolve_model_name(options, family)) is None
+    ):
+        missing.append(f"those of {options.encoder}, {resolve_model_name(options, family)}")
+    model, weights = options.encoder_model, options.encoder_pretrained
+    if (
+        options.features == "none"
+        and options.encoder == "open_clip"
+        and has_local_clip_weights(model, weights) is False
+    ):
+        missing.append(f"those of OpenCLIP, {model} {weights}")
+    return missing
+
+
+def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
+    """Check that all weights are on this machine."""
+    if len(missing) == 0:
+        return Diagnostic("weights", "ok", "all required weights are on this machine")
+    message = f"not on this machine: {'; '.join(missing)}. They will be downloaded"
+    return Diagnostic("weights", "warning", message, "or give local files: --encoder-pretrained FILE, --sam-model FILE")
+
+
+def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
+    """Check that the lift fits into memory."""
+    rows = []
+    free = _free_memory()
+    if free is not None:
+        own = int((peak_gib() or 0.0) * 2**30)
+        rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"free memory, {_LIFT_LESS}"))
+    if plan.device_bytes is not None:
+        free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
+        rows.append(_check_capacity("GPU memory", plan.device_bytes, free, f"{_LIFT_LESS}, or --device cpu"))
+    return rows
+
+
+def diagnose_disk(plan: Plan, folder: Path) -> Diagnostic:
+    """Check that the output fits on the disk."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    advice = f"free space in {existing}, or give --output-dir"
+    return _check_capacity("disk", plan.disk_bytes, shutil.disk_usage(existing).free, advice)
+
+
+def _check_capacity(name: str, needed: int, free: int, advice: str) -> Diagnostic:
+    """Compare needed bytes with free bytes."""
+    message = f"about {needed / 2**30:.2f} GiB are needed, {free / 2**30:.1f} GiB are free"
+    state: DiagnosticState = "error" if needed > free else "warning" if needed > _HIGH_SHARE * free else "ok"
+    return Diagnostic(name, state, message, "" if state == "ok" else advice)
+
+
+def _free_memory() -> int | None:
+    """Return the bytes that this process may still allocate; None if the system does not report them."""
+    limits = []
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+        limits += [int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text())] if limit != "max" else []
+    except (OSError, ValueError, IndexError):
+        pass
+    if len(limits) == 0 and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
+        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return min(limits) if len(limits) > 0 else None
+
+
+# Short measurement of a capture: encode and rasterize a few views, and lift some Gaussians.
+#
+# The results are discarded, and nothing is downloaded. Cached views are read, not computed again.
+
+
+Clock = Callable[[], float]
+Result = TypeVar("Result")
+_MAX_VIEWS = 4
+"""Maximum number of views that are rasterized and encoded. More are encoded if several are segmented in one batch."""
+_MAX_LOAD_S = 3.0
+"""Maximum number of seconds to load kernels. If it takes longer, they were compiled, which happens only once."""
+_SLOW_FIRST_VIEW_S = 20.0
+"""If the first view takes this many seconds, only one more batch is measured.
+
+How many of these seconds were loading is unknown.
+"""
+_MAX_LOOKUPS = 16
+"""Maximum number of views that are looked up in the cache."""
+
+
+class _Observed(NamedTuple):
+    """Some views, and the seconds that it took to observe them."""
+
+    block: ViewBatch
+    seconds: float
+
+
+def time_kernel_loading(
+    scene: Scene, options: LiftOptions, *, device: str = "cpu", clock: Clock = perf_counter
+) -> float:
+    """Load or compile the kernels of a lift; return the seconds that the next process will need for it."""
+    gaussians = scene.gaussians.to(device)
+    ready = start_kernel_warm_up(scene, gaussians, options, choose_raster_config(scene, gaussians, options))
+    return min(_MAX_LOAD_S, _seconds(ready, clock=clock, device=device)[0])
+
+
+def measure_capture(
+    scene: Scene,
+    source: FeatureSource,
+    options: LiftOptions,
+    cache: Path,
+    *,
+    device: str = "cpu",
+    before: Mapping[str, float] | None = None,
+    clock: Clock = perf_counter,
+) -> Measurements:
+    """Process a few views of a scene as a lift would.
+
+    Args:
+        source: as in `lift_scene`.
+        cache: folder of 2D features and evidence, which is only read.
+        before: seconds of the steps that precede the views, by name (start, open, kernels, check).
+        clock: returns seconds; use `time.process_time` for the time of all cores.
+    Raises:
+        ValueError, FileNotFoundError, MemoryError: as `lift_scene`.
+    """
+    gaussians, views = scene.gaussians.to(device), scene.train
+    drawing = choose_raster_config(scene, gaussians, options)
+    cuda = torch.device(device).type == "cuda"
+    timed = partial(_seconds, clock=clock, device=device)
+    start_kernel_warm_up(scene, gaussians, options, drawing)()
+    names = set(source.available(views.names))
+    usable = [index for index, name in enumerate(views.names) if name in names]
+    used = [usable[i] for i in sample_evenly(len(usable), options.max_views)]
+    rendered = drawing.settings if options.image_source == "render" else None
+
+    def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:
+        kwargs = {"rendered": rendered, "divisor": options.lift_downscale, "done": lambda view: None}
+        seconds, block = timed(lambda: observe_views(scene, indices, source, **kwargs))
+        return _Observed(block, seconds)
+
+    chosen = [used[i] for i in sample_evenly(len(used), _MAX_LOOKUPS)]
+    cached: dict[int, ViewBatch] = {}
+    cached_source = cached_only(source, cache)
+    if options.reuse_evidence:
+        for index in chosen:
+            with suppress(NotCachedError):
+                cached[index] = observe([index], cached_source).block
+    new = [index for index in chosen if index not in cached]
+    batch = segmentation_workers(source)
+    encoded = [new[i] for i in sample_evenly(len(new), max(_MAX_VIEWS, 1 + 2 * batch))]
+    observed, load_s = _observe_loaded(encoded, partial(observe, source=source), batch)
+    cached_s = observe(list(cached)[:_MAX_LOOKUPS], cached_source).seconds / len(cached) if len(cached) > 0 else None
+    block = _joined([observed.block, *cached.values()], _MAX_VIEWS)
+    with tempfile.TemporaryDirectory(prefix="normlift-plan-") as folder:
+        rasterize = partial(_evidence, gaussians, block, scene, options, drawing, Path(folder))
+        if cuda:  # kernels for labels like these are compiled once for all lifts
+            _evidence(gaussians, block, scene, options, drawing, Path(folder) / "first")
+        evidence_s, evidence = timed(rasterize)
+        cached_evidence_s, _ = timed(rasterize)
+        saved_s, _ = timed(lambda: evidence.save(Path(folder) / "again.safetensors"))
+        saved = (Path(folder) / "again.safetensors").stat().st_size
+    count = len(block.cameras)
+    device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
+    rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), timed)
+    entries = evidence.nnz + evidence.unlabeled.weight.numel()
+    maps = sum(labels.numel() * 2 + rows.numel() * 4 for labels, rows in zip(block.labels, block.features))
+    return Measurements(
+        device=_device_name(device),
+        views=len(used),
+        gaussians=len(gaussians),
+        dimension=block.features[0].shape[1],
+        regions=sum(map(len, block.features)) / count,
+        entries=entries / count,
+        entry_bytes=4 + evidence.rows.weight.element_size(),
+        before_s=before or {},
+        load_s=load_s,
+        features_s=observed.seconds / len(observed.block.cameras) if len(observed.block.cameras) > 0 else None,
+        kept_features_s=cached_s,
+        features_kept=len(cached) / len(chosen),
+        evidence_s=evidence_s / count,
+        kept_evidence_s=cached_evidence_s / count,
+        evidence_kept=_evidence_cached(gaussians, observed, cached, len(chosen), scene, options, drawing, cache),
+        core_s=rates,
+        field_bytes=field_bytes,
+        run_bytes=sum(value.numel() * value.element_size() for value in scene.parameters.values()),
+        write_bytes_s=saved / max(saved_s, 1e-6),
+        view_bytes=maps / count,
+        host_bytes=round((peak_gib() or 0.0) * 2**30),
+        device_bytes=device_bytes,
+        looked_at=max(count, len(observed.block.cameras)),
+    )
+
+
+def _observe_loaded(
+    indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
+) -> tuple[_Observed, float]:
+    """Observe views. Return them, with the seconds that it takes once networks are loaded, and the loading time."""
+    if len(indices) == 0:
+        return _Observed(ViewBatch([], [], [], []), 0.0), 0.0
+    first = observe(indices[:1])
+    if len(indices) == 1:
+        return first, 0.0
+    others = indices[1 : 1 + batch if first.seconds > _SLOW_FIRST_VIEW_S else None]
+    rest = observe(others)
+    each = rest.seconds / len(others)
+    return _Observed(_joined([first.block, rest.block]), each * (1 + len(others))), max(0.0, first.seconds - each)
+
+
+def _joined(blocks: Sequence[ViewBatch], most: int | None = None) -> ViewBatch:
+    """Join the views of all blocks, up to `most` views."""
+    parts = zip(ViewBatch([], [], [], []), *blocks)
+    return ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
+
+
+def _evidence(
+    gaussians: GaussianScene, block: ViewBatch, scene: Scene, options: LiftOptions, drawing: RasterConfig, folder: Path
+) -> Evidence:
+    return batch_evidence(
+        gaussians, block, folder,
+        rasterize_mode=scene.rasterize_mode, settings=drawing.settings, backend=drawing.backend,
+        weight_power=options.weight_power, dtype=drawing.dtype, reuse=True, done=lambda: None,
+    )  # fmt: skip
+
+
+def _evidence_cached(
+    gaussians: GaussianScene,
+    observed: _Observed,
+    cached: Mapping[int, ViewBatch],
+    chosen: int,
+    scene: Scene,
+    options: LiftOptions,
+    drawing: RasterConfig,
+    cache: Path,
+) -> float:
+    """Return the share of views whose evidence is cached. Views with cached features represent all such views."""
+    if not options.reuse_evidence:
+        return 0.0
+    facts = [scene.rasterize_mode, options.weight_power, str(drawing.dtype), asdict(drawing.settings), drawing.backend]
+    share = 0.0
+    for block, views in ((_joined(list(cached.values())), len(cached)), (observed.block, chosen - len(cached))):
+        hits = views_in_cache(cache / "evidence", evidence_keys(gaussians, block, facts))
+        share += sum(hits) / max(1, len(hits)) * views / chosen
+    return share
+
+
+def _device_name(device: str) -> str:
+    if torch.device(device).type != "cuda":
+        return f"{device}, {torch.get_num_threads()} threads"
+    return torch.cuda.get_device_name(device)
+
+
+def _seconds(work: Callable[[], Result], *, clock: Clock, device: str) -> tuple[float, Result]:
+    """Return the duration of some work, until the GPU is done if there is one, and its result."""
+    start = clock()
+    result = work()
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+    return clock() - start, result

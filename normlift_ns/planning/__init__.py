@@ -1,1 +1,0 @@
-"""Estimate of the time, memory and disk space of a lift, from a short measurement on this machine."""

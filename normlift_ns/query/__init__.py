@@ -1,0 +1,1 @@
+"""normlift_ns.query"""

@@ -1,0 +1,246 @@
+"""Queries for a semantic field: prompts with their embeddings, and the rule that selects Gaussians.
+
+This module does not need torch.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
+from normlift_ns.io.manifest import MANIFEST_FILE, read_manifest
+from normlift_ns.options import RELEVANCY_RULES, RelevancyRule, check_bool, check_number, short_repr
+from normlift_ns.query.text_encoder import HasManifest, default_rule, encoder_digest
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """A query: Q prompts, their embeddings, and how they select Gaussians. Embeddings may be passed as tensors."""
+
+    texts: tuple[str, ...]
+    vectors: Float[np.ndarray, "q d"]
+    """One embedding per prompt, of any norm > 0."""
+    negatives: tuple[str, ...] = ()
+    """Negative prompts, for rules that compare with them."""
+    negative_vectors: Float[np.ndarray, "b d"] | None = None
+    rule: RelevancyRule = "cosine"
+    threshold: float = 0.5
+    """Relevancy above which a Gaussian is selected."""
+    min_reliability: float = 0.0
+    """Minimum R of a selected Gaussian, in 0..1."""
+    refined: bool = True
+    """Use refined features."""
+    encoder: str | None = None
+    """Digest of the encoder of the embeddings, see `encoder_digest`; None if unknown."""
+    suggest: bool = False
+    """Replace the threshold with the one that the histogram of all relevancies suggests, when the query runs. The query
+    stored in the result has that threshold.
+    """
+
+    def __post_init__(self) -> None:
+        for name in ("vectors", "negative_vectors"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, np.ndarray):  # a tensor on any device
+                object.__setattr__(self, name, value.detach().cpu().numpy())
+
+
+def make_query(
+    field: HasManifest,
+    read: Callable[[Sequence[str]], Any],
+    texts: Sequence[str],
+    *,
+    negatives: Sequence[str] | None = None,
+    rule: RelevancyRule | Literal["auto"] = "auto",
+    threshold: float | Literal["auto"] | None = None,
+    min_reliability: float = 0.0,
+    refined: bool = True,
+) -> Query:
+    """Encode prompts as a query for a field.
+
+    Args:
+        read: encodes prompts as one embedding each, with an encoder that fits the field.
+        texts: the prompts.
+        negatives: negative prompts (default: those of the encoder, see `default_rule`).
+        rule: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
+        threshold: "auto" is the threshold that the histogram suggests. None is the threshold of the encoder for its own
+            rule, and otherwise that of `RELEVANCY_RULES`. For the rule cosine with an encoder of another rule, None is "auto",
+            because no threshold suits all encoders.
+        min_reliability: minimum R of a selected Gaussian, in 0..1.
+        refined: use refined features.
+    Raises:
+        ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
+    """
+    if negatives is not None and not isinstance(negatives, Sequence):
+        raise InputError(f"negatives must be a list of strings, got {short_repr(negatives)}")
+    if isinstance(negatives, str):
+        raise InputError(
+            f"negatives must be a list of strings, got the single string {negatives!r}; write [{negatives!r}]"
+        )
+    if rule not in ("auto", *RELEVANCY_RULES):
+        raise InputError(f"rule must be auto, {', '.join(RELEVANCY_RULES)}; got {rule!r}")
+    min_reliability = check_number("min_reliability", min_reliability)
+    if isinstance(threshold, str):
+        if threshold != "auto":
+            raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
+    elif threshold is not None:
+        threshold = check_number("threshold", threshold)
+    check_bool("refined", refined)
+    default = default_rule(field)
+    if rule == "auto":
+        rule = default.rule if negatives is None else "cosine" if len(negatives) == 0 else "lerf"
+    if threshold is None:
+        general = RELEVANCY_RULES[rule].threshold if RELEVANCY_RULES[rule].compares else "auto"
+        threshold = default.threshold if rule == default.rule else general
+    negatives = tuple(default.negatives if negatives is None else negatives)
+    return Query(
+        texts=tuple(texts),
+        vectors=read(texts),
+        negatives=negatives,
+        negative_vectors=read(negatives) if len(negatives) > 0 else None,
+        rule=rule,
+        threshold=RELEVANCY_RULES[rule].threshold if threshold == "auto" else threshold,
+        suggest=threshold == "auto",
+        min_reliability=min_reliability,
+        refined=refined,
+        encoder=encoder_digest(field.manifest),
+    )
+
+
+# Storage of a query in a run: prompts with their embeddings, and the rule that selects Gaussians.
+#
+# Stock nerfstudio renders a run with a stored query without a text encoder.
+
+
+QUERIES_FILE = "queries.safetensors"
+"""File in the folder of the field, with embeddings as tensors and everything else as JSON in its metadata."""
+_METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
+_REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save True"
+
+NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
+
+
+class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
+    """The JSON in the file's metadata."""
+
+    texts: Annotated[tuple[NonBlankText, ...], msgspec.Meta(min_length=1)]
+    negatives: tuple[NonBlankText, ...]
+    refined: bool
+    form: RelevancyRule
+    threshold: float
+    min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)]
+    encoder: str | None = None
+
+
+def save_query(folder: Path, question: Query) -> Path:
+    """Write queries.safetensors next to the field, replacing an earlier one, and return its path.
+
+    Raises:
+        ValueError: `load_query` would raise an error for this query.
+        FileNotFoundError: the folder does not exist any more.
+        OSError: the file cannot be written.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder} does not exist any more, so nothing was stored: the run was moved or deleted while it was open. "
+            "Open it again at its new path"
+        )
+    if question.suggest:
+        raise InputError(
+            'the query cannot be stored: its threshold is "auto"; run the query, and store that of its answer'
+        )
+    metadata = _Metadata(
+        question.texts, question.negatives, question.refined, question.rule, question.threshold,
+        question.min_reliability, question.encoder,
+    )  # fmt: skip
+    vectors = {name: value for name in _VECTORS if (value := getattr(question, name)) is not None}
+    arrays = {name: value.astype(np.float32) for name, value in vectors.items()}
+    try:
+        encoded = msgspec.json.encode(metadata).decode()
+        decoded = _decode(encoded, arrays)
+        if (folder / MANIFEST_FILE).exists():
+            _check_encoder(decoded, read_manifest(folder)[0])
+    except (ValueError, TypeError) as error:
+        raise InputError(f"the query cannot be stored: {error}") from error
+    save_arrays(folder / QUERIES_FILE, arrays, {_METADATA_KEY: encoded}, overwrite=True)
+    return folder / QUERIES_FILE
+
+
+def load_query(folder: Path) -> Query | None:
+    """Load the query stored in the folder of a field; return None if there is none.
+
+    Raises:
+        ValueError: the file is damaged, or does not hold a query.
+    """
+    path = folder / QUERIES_FILE
+    if not os.path.lexists(path):
+        return None
+    try:
+        if not os.path.isfile(path):
+            raise InputError("it is not a regular file")
+        arrays, metadata, _ = load_arrays(path, undigested=(_METADATA_KEY,), remedy=_REMEDY)
+        if set(metadata) != {_METADATA_KEY}:
+            raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")
+        question = _decode(metadata[_METADATA_KEY], arrays)
+        if (folder / MANIFEST_FILE).exists():
+            _check_encoder(question, read_manifest(folder)[0])
+        return question
+    except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
+        raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
+
+
+def _decode(encoded: str, arrays: dict[str, np.ndarray]) -> Query:
+    """Return the query with this metadata and these embeddings.
+
+    Raises:
+        ValueError: the metadata or an embedding is not valid, or they do not fit together.
+    """
+    metadata = msgspec.json.decode(encoded, type=_Metadata)
+    if not math.isfinite(metadata.threshold):
+        raise InputError(f"the threshold is {metadata.threshold}, expected a finite number")
+    if not {"vectors"} <= set(arrays) <= set(_VECTORS):
+        raise InputError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
+    negative = arrays.get("negative_vectors")
+    if (negative is None) != (len(metadata.negatives) == 0):
+        raise InputError(
+            f"it has {len(metadata.negatives)} negatives, but {'no' if negative is None else 'also'} negative_vectors"
+        )
+    if RELEVANCY_RULES[metadata.form].compares and negative is None:
+        raise InputError(f"rule {metadata.form!r} needs negatives, but it has none")
+    size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
+    _check_vectors("vectors", arrays["vectors"], metadata.texts, size)
+    if negative is not None:
+        _check_vectors("negative_vectors", negative, metadata.negatives, size)
+    return Query(
+        metadata.texts, arrays["vectors"], metadata.negatives, negative, metadata.form, metadata.threshold,
+        metadata.min_reliability, metadata.refined, metadata.encoder,
+    )  # fmt: skip
+
+
+def _check_encoder(question: Query, manifest: Mapping[str, Any]) -> None:
+    """Raise ValueError if the embeddings are from a different encoder than the field."""
+    size, field_encoder = question.vectors.shape[1], encoder_digest(manifest)
+    if size != manifest["dimension"]:
+        raise InputError(
+            f"its vectors have {size} dimensions, but the features of the run have {manifest['dimension']}"
+        )
+    if question.encoder is not None and field_encoder is not None and question.encoder != field_encoder:
+        raise InputError(
+            f"its prompts were encoded by another encoder ({question.encoder}) than that of the run ({field_encoder})"
+        )
+
+
+def _check_vectors(name: str, vectors: np.ndarray, texts: Sequence[str], size: int) -> None:
+    check_array(f"{name} of {len(texts)} texts", vectors, "float32", (len(texts), max(1, size)), -math.inf)
+    for text, row in zip(texts, vectors):
+        if not np.isfinite(row).all() or not row.any():
+            raise InputError(f"the vector of {text!r} is zero or not finite")

@@ -1,0 +1,263 @@
+"""Lifting of SAM 3 masks: each prompt is one region per view, against the rest of the image.
+
+A Gaussian's relevancy for a prompt is the fraction of its weight inside the masks of the voting views,
+sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
+
+Voting views are chosen in two rounds, because such masks fail for whole views, by missing an object or by confusing it
+with another. In the first round, the views in which the prompt was found vote. In the second round, a view votes if its
+mask agrees with the Gaussians that the first round selected: their weighted intersection over union exceeds one half.
+If this leaves no view in which the prompt was found, the first round counts.
+
+A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
+eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
+two regions per view, "in" and "out", with the features (1, 0) and (0, 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int32, UInt8
+from torch import Tensor
+
+from normlift_ns.core.evidence import MASKED, Evidence
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.lift import Scalars, lift
+from normlift_ns.core.scene import Scene
+from normlift_ns.encoders.base import joint_partition
+from normlift_ns.errors import InputError
+from normlift_ns.evidence_collection import sample_evenly
+from normlift_ns.options import BackendName, RasterizeMode
+from normlift_ns.query.histogram import SelectionStats
+from normlift_ns.rasterization.rasterize import rasterize_evidence
+from normlift_ns.rasterization.settings import RasterSettings
+
+MIN_MASK_FRACTION = 0.5
+"""Relevancy above which a Gaussian is selected: more of its weight is inside the masks than outside."""
+
+
+@dataclass(frozen=True)
+class MaskResult:
+    """Result of lifting the masks of one prompt."""
+
+    relevancy: Float[Tensor, " n"]
+    """Fraction of each Gaussian's weight inside the masks, in 0..1; 0 for Gaussians that no voting view sees."""
+    scalars: Scalars
+    """Numbers of the lift with two regions per view: c_inter is the agreement of the voting views, reliability is R."""
+    voted: Bool[Tensor, " v"]
+    """Views in which the prompt was found and that vote."""
+
+    @property
+    def seen(self) -> Bool[Tensor, " n"]:
+        """Gaussians that have weight in at least one view."""
+        return self.scalars.weight > 0
+
+    @property
+    def mask(self) -> Bool[Tensor, " n"]:
+        """Gaussians with more than half of their weight inside the masks."""
+        return self.relevancy > MIN_MASK_FRACTION
+
+
+@dataclass(frozen=True)
+class MaskEvidence:
+    """Evidence of the masks of Q prompts in V views.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene
+    >>> means, quats = torch.tensor([[-0.5, 0, 1], [0.5, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> scene = GaussianScene(means, quats, scales=torch.full((2, 3), 0.01), opacities=torch.full((2,), 0.9))
+    >>> camera = Camera(torch.tensor([[32.0, 0, 32], [0, 32, 16], [0, 0, 1]]), torch.eye(4), width=64, height=32)
+    >>> left = torch.zeros(1, 32, 64, dtype=torch.bool)
+    >>> left[:, :, :32] = True
+    >>> evidence = mask_evidence(scene, [camera, camera], [left, left])
+    >>> answer = evidence.answer(0)
+    >>> answer.relevancy, answer.scalars.reliability  # two views that agree: 2 / (2 + 1)
+    (tensor([1., 0.]), tensor([0.6667, 0.6667]))
+    """
+
+    evidence: Evidence
+    """Evidence whose regions are the cells into which all masks of a view together partition it."""
+    inside: Bool[Tensor, "q s"]
+    """True for the cells inside the masks of each prompt."""
+
+    def answer(self, text: int, views: Sequence[int] | None = None, *, beta: float = 1.0) -> MaskResult:
+        """Lift the masks of one prompt.
+
+        Args:
+            text: index of the prompt.
+            views: indices of the views to use (default: all).
+            beta: as in `lift`.
+        """
+        evidence, inside = self.evidence, self.inside[text]
+        if views is not None:
+            inside = inside[evidence.columns_of(views)]
+            evidence = evidence.select_views(views)
+        column, weight = evidence.rows.column.long(), evidence.rows.weight.double()
+        row, view = evidence.rows.row_index(), evidence.region_view[column].long()
+        within = inside[column]
+
+        def share(votes: Bool[Tensor, " v"]) -> Float[Tensor, " n"]:
+            in_masks, total = weight.new_zeros(2, evidence.num_gaussians)
+            total.index_add_(0, row, weight * votes[view])
+            in_masks.index_add_(0, row, weight * (votes[view] & within))
+            return torch.where(total > 0, in_masks / total, 0.0)
+
+        has_mask = torch.zeros(evidence.num_views, dtype=torch.bool, device=inside.device)
+        has_mask[evidence.region_view[inside].long()] = True
+        selected = share(has_mask)[row] > MIN_MASK_FRACTION
+        intersection, union = weight.new_zeros(2, evidence.num_views)
+        intersection.index_add_(0, view, weight * (within & selected))
+        union.index_add_(0, view, weight * (within | selected))
+        votes = (intersection > 0.5 * union) | (union == 0)
+        votes = votes if bool((votes & has_mask).any()) else has_mask
+        sides = torch.where(votes[evidence.region_view.long()], 2 * evidence.region_view + (~inside).int(), -1)
+        side_view = torch.arange(evidence.num_views, dtype=torch.int32, device=inside.device).repeat_interleave(2)
+        table = torch.eye(2, device=inside.device, dtype=evidence.rows.weight.dtype).repeat(evidence.num_views, 1)
+        scalars = lift(evidence.regroup(sides[None], side_view), table, beta=beta, unlabeled="dilute").scalars
+        relevancy = torch.where(scalars.norm > 0, share(votes), 0.0).to(scalars.norm.dtype)
+        return MaskResult(relevancy, scalars, votes & has_mask)
+
+
+def mask_evidence(
+    scene: GaussianScene,
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[Tensor, "q h w"]],
+    *,
+    counted: Sequence[Bool[Tensor, "h w"] | None] | None = None,
+    rasterize_mode: RasterizeMode = "classic",
+    settings: RasterSettings | None = None,
+    backend: BackendName = "auto",
+    done: Callable[[], None] = lambda: None,
+) -> MaskEvidence:
+    """Rasterize the evidence of the masks of Q prompts, once for all prompts.
+
+    Args:
+        cameras: one per view.
+        masks: for each view, one mask per prompt; empty if the prompt was not found.
+        counted: for each view, the pixels to use; None for all.
+        rasterize_mode, settings, backend: as in `rasterize_evidence`.
+        done: called after each view.
+    Raises:
+        ValueError: there are no views, or the masks do not match the number or size of the cameras.
+    """
+    if len(cameras) == 0 or len(masks) != len(cameras):
+        raise InputError(
+            f"expected masks for at least one camera, one set per camera; got {len(masks)} sets for {len(cameras)} "
+            "cameras"
+        )
+    labels: list[Int32[Tensor, "h w"]] = []
+    inside: list[Bool[Tensor, "q c"]] = []
+    for index, (camera, view_masks) in enumerate(zip(cameras, masks)):
+        if view_masks.shape != (len(masks[0]), camera.height, camera.width) or len(view_masks) == 0:
+            raise InputError(
+                f"masks of view {index} have shape {tuple(view_masks.shape)}, expected [{max(1, len(masks[0]))}, "
+                f"{camera.height}, {camera.width}]: one per prompt, of the size of the camera"
+            )
+        cells, cell_values = joint_partition(view_masks.int())
+        pixels = None if counted is None else counted[index]
+        labels.append(cells if pixels is None else cells.where(pixels.to(cells.device), MASKED))
+        inside.append(cell_values == 1)
+    evidence = rasterize_evidence(
+        scene,
+        list(cameras),
+        labels,
+        num_regions=[part.shape[1] for part in inside],
+        rasterize_mode=rasterize_mode,
+        settings=settings,
+        backend=backend,
+        progress=lambda *_: done(),
+    )
+    return MaskEvidence(evidence, torch.cat(inside, dim=1).to(scene.means.device))
+
+
+class SegmentationResult(NamedTuple):
+    """Result of a SAM 3 query with Q prompts."""
+
+    answers: list[MaskResult]
+    """One result per prompt."""
+    views: list[str]
+    """Names of the images that SAM 3 segmented."""
+    found: Bool[Tensor, "q v"]
+    """True if SAM 3 found the prompt in the image."""
+    min_reliability: float = 0.0
+    """Minimum R of a selected Gaussian, in 0..1."""
+
+    def selected(self, text: int) -> Bool[Tensor, " n"]:
+        """Return the Gaussians with more than half of their weight inside the masks and enough reliability."""
+        answer = self.answers[text]
+        return answer.mask & (answer.scalars.reliability >= self.min_reliability)
+
+    def summarize(self, means: Float[Tensor, "n 3"], selected: Bool[Tensor, "n q"]) -> list[dict[str, Any]]:
+        """Return the numbers of every prompt as plain Python types.
+
+        Args:
+            means: centers of the Gaussians.
+            selected: selection of each prompt by another query, to compare with.
+        """
+        return [self._row(text, means, selected[:, text]) for text in range(len(self.answers))]
+
+    def _row(self, text: int, means: Tensor, other: Bool[Tensor, " n"]) -> dict[str, Any]:
+        answer = self.answers[text]
+        mask, scalars = self.selected(text).cpu(), answer.scalars
+        arrays = (means, scalars.reliability, scalars.weight)
+        selection = SelectionStats(len(mask), *(x.detach().cpu()[mask].numpy() for x in arrays))
+        union = int((mask | other).sum())
+        weight = scalars.weight.cpu()[mask].double()
+        agreement = float((weight * scalars.c_inter.cpu()[mask]).sum() / weight.sum()) if bool(mask.any()) else None
+        return {
+            "fraction": selection.fraction,
+            "centroid": selection.centroid,
+            "extent": selection.extent,
+            "peak": float(answer.relevancy.max()) if bool(answer.seen.any()) else None,
+            "agreement": agreement,
+            "mean_reliability": selection.mean_reliability,
+            "min_reliability": self.min_reliability,
+            "views": self.views,
+            "agree": [name for name, voted in zip(self.views, answer.voted.tolist()) if voted],
+            "found_in": [name for name, found in zip(self.views, self.found[text].tolist()) if found],
+            "iou": int((mask & other).sum()) / union if union > 0 else None,
+        }
+
+
+def query_sam3(
+    scene: Scene,
+    find: Callable[[UInt8[Tensor, "h w 3"], Sequence[str]], Bool[Tensor, "q h w"]],
+    texts: Sequence[str],
+    *,
+    views: int,
+    min_reliability: float = 0.0,
+    settings: RasterSettings | None = None,
+    device: str = "cpu",
+    done: Callable[[], None] = lambda: None,
+) -> SegmentationResult:
+    """Segment evenly spaced training views with SAM 3, and lift the masks.
+
+    Args:
+        find: returns SAM 3's mask of each prompt in an image.
+        texts: the prompts.
+        views: maximum number of views.
+        min_reliability: minimum R of a selected Gaussian, in 0..1.
+        settings: constants of the rasterizer.
+        device: device to rasterize on.
+        done: called after each view.
+    Raises:
+        FileNotFoundError: an image does not exist.
+        ValueError: an image is damaged, or a prompt is too long.
+    """
+    indices, masks, cameras, counted = sample_evenly(len(scene.train), views), [], [], []
+    for index in indices:
+        view = scene.train[index]
+        masks.append(find(view.image, texts).cpu())
+        cameras.append(view.camera)
+        counted.append(view.mask)
+        done()
+    gaussians = scene.gaussians.to(device)
+    evidence = mask_evidence(
+        gaussians, cameras, masks, counted=counted, rasterize_mode=scene.rasterize_mode, settings=settings
+    )
+    answers = [evidence.answer(text) for text in range(len(texts))]
+    found = torch.stack([view_masks.flatten(1).any(dim=1) for view_masks in masks], dim=1)
+    return SegmentationResult(answers, [scene.train.names[index] for index in indices], found, min_reliability)

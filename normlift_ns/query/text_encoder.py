@@ -1,0 +1,219 @@
+"""Text encoders for a lifted run, chosen by its manifest.
+
+This module needs torch only to encode prompts that are not in the cache.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+
+from normlift_ns.encoders.registry import EncoderKind, LazyTextEncoder, absolute_paths, encoder_kind, find_encoder_kind
+from normlift_ns.encoders.text_files import CachedTextEncoder, TextEmbeddingFile
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import text_digest
+from normlift_ns.options import RelevancyRule, SourceOptions
+
+ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
+"""Options that determine the encoder or the text embeddings of a field; its manifest records them."""
+PRECOMPUTED = "given"
+"""Value in the manifest instead of an encoder name, for features provided by the user."""
+_CHOSEN = "texts_chosen"
+"""Key in the manifest of an opened run if the user chose a file of text embeddings that replaces those of the lift."""
+
+
+class DefaultRule(NamedTuple):
+    """Default relevancy rule of an encoder, with negatives and threshold; "auto" is the suggested threshold."""
+
+    rule: RelevancyRule
+    negatives: tuple[str, ...]
+    threshold: float | Literal["auto"]
+
+
+_PLAIN_COSINE = DefaultRule("cosine", (), "auto")
+
+
+class HasManifest(Protocol):
+    """A semantic field, as tensors or NumPy arrays."""
+
+    @property
+    def manifest(self) -> Mapping[str, Any]:
+        """The metadata of the field."""
+        ...
+
+
+FieldT = TypeVar("FieldT", bound=Any)
+
+
+def encoder_settings(options: SourceOptions) -> dict[str, Any]:
+    """Return the settings that `text_encoder_for` needs, as JSON types, with absolute paths."""
+    settings = {key: getattr(options, key) for key in ENCODER_KEYS} | absolute_paths(options)
+    vectors = options.text_vectors
+    return {**settings, "text_vectors": None if vectors is None else os.path.abspath(vectors)}
+
+
+def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
+    """Return the settings that `text_encoder_for` needs for features provided by the user.
+
+    Args:
+        text_vectors: name of a file of text embeddings in the folder of the field; None if there is none.
+    """
+    return {**encoder_settings(SourceOptions()), "encoder": PRECOMPUTED, "text_vectors": text_vectors}
+
+
+def with_text_source(field: FieldT, *, vectors: Path | None = None, template: str | None = None) -> FieldT:
+    """Return the field with a different source of text embeddings.
+
+    Args:
+        vectors: file of text embeddings (default: that of the lift).
+        template: prompt template (default: that of the lift).
+    """
+    changes = {
+        "text_vectors": None if vectors is None else os.path.abspath(vectors),
+        "text_template": template,
+    }
+    changes = {key: value for key, value in changes.items() if value is not None}
+    encoder = {**(field.manifest.get("encoder") or {}), **changes}
+    chosen = {} if vectors is None else {_CHOSEN: True}
+    return replace(field, manifest={**field.manifest, "encoder": encoder, **chosen})
+
+
+def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None = None) -> LazyTextEncoder:
+    """Return the text encoder that fits a field.
+
+    Args:
+        device: device of the network, as in `choose_device`; "auto" runs a plain text tower on the CPU.
+        cache: folder that caches embeddings computed by a network.
+    Raises:
+        ValueError: the manifest names no known encoder, or the weights or text embeddings are not those of the lift.
+        FileNotFoundError: the weights or text embeddings do not exist any more.
+    """
+    options = _options(field)
+    if options.text_vectors is not None:
+        if not field.manifest.get(_CHOSEN):
+            _check_vectors(options.text_vectors, _identity(field.manifest.get("features")).get("content"))
+        vectors = TextEmbeddingFile(options.text_vectors)
+        if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
+            raise InputError(
+                f"the vectors in {vectors.file} have {vectors.dimension} dimensions, but the features of the run have "
+                f"{field.manifest['dimension']}; give a file of text vectors from the encoder of these features "
+                "(--text-vectors)"
+            )
+        return vectors
+    kind = _kind(options.encoder)
+    recorded = _identity(field.manifest.get("features"))
+    if kind.texts is not None:
+        return kind.texts(options, device, cache, recorded)
+    return _cached_texts(kind, options, device, cache, recorded)
+
+
+def _kind(name: str) -> EncoderKind:
+    try:
+        return encoder_kind(name)
+    except InputError as error:
+        raise InputError(
+            f"the run was lifted with an encoder that is not available here: {error}. Install its package, or give "
+            "a file of text vectors from that encoder (--text-vectors)"
+        ) from None
+
+
+def _cached_texts(
+    kind: EncoderKind, options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
+) -> CachedTextEncoder:
+    """Return a cached text encoder, which loads the network for new prompts and checks that it is that of the lift."""
+
+    def network() -> Any:
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415 (needs torch)
+        from normlift_ns.encoders.build import make_encoder  # noqa: PLC0415
+
+        encoder = make_encoder(options, choose_device(device))
+        if len(recorded) > 0 and json.dumps(encoder.identity, sort_keys=True) != json.dumps(recorded, sort_keys=True):
+            raise InputError(
+                f"the encoder {options.encoder} is not the one that the run was lifted with, so results would differ: "
+                f"it is {encoder.identity}, expected {dict(recorded)}. Restore its files; or give a file of text "
+                "vectors from the same network with --text-vectors; or lift again with: ns-normlift"
+            )
+        return encoder
+
+    def settings() -> dict[str, Any]:
+        identity = recorded if len(recorded) > 0 else network().identity
+        return {"encoder": identity, "template": options.text_template}
+
+    return CachedTextEncoder(settings, network, cache)
+
+
+def _identity(features: object) -> Mapping[str, Any]:
+    """Return the identity of the encoder that a manifest records with its features; an empty dict if there is none."""
+    identity = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
+    return identity if isinstance(identity, Mapping) else {}
+
+
+def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
+    """Return a digest that identifies the encoder of a field; None if the manifest does not record the encoder."""
+    features = manifest.get("features")
+    if not isinstance(features, Mapping) or len(features) == 0:
+        return None
+    return text_digest(json.dumps(features.get("texts", features.get("encoder", features)), sort_keys=True))
+
+
+def _check_vectors(path: Path, expected: object) -> None:
+    """Raise if the content of a file of text embeddings has changed since the lift; this reads the whole file."""
+    remedy = (
+        "restore the file; or give a file of text vectors from the same network with --text-vectors; or lift again "
+        "with: ns-normlift"
+    )
+    if os.path.lexists(path) and not path.is_file():
+        raise InputError(f"the run's file of text vectors {path} is not a regular file any more; {remedy}")
+    if not path.is_file():
+        raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
+    if isinstance(expected, str) and (actual := TextEmbeddingFile(path).identity["content"]) != expected:
+        raise InputError(
+            f"{path} is not the file that the run was lifted with, so results would differ: its content is {actual}, "
+            f"expected {expected}. {remedy[0].upper()}{remedy[1:]}"
+        )
+
+
+def _options(field: HasManifest) -> SourceOptions:
+    stored = field.manifest.get("encoder")
+    if not isinstance(stored, Mapping) or set(stored) != set(ENCODER_KEYS):
+        raise InputError(f"the field's manifest names no encoder (found {stored!r}); lift again with: ns-normlift")
+    vectors = stored["text_vectors"]
+    if stored["encoder"] == PRECOMPUTED and vectors is None:
+        raise InputError(
+            "this run was lifted from features of your own, without texts; give a file of texts and their vectors "
+            "(--text-vectors), or lift again with texts"
+        )
+    encoder = (
+        "open_clip" if stored["encoder"] == PRECOMPUTED else stored["encoder"]
+    )  # a placeholder that is never loaded
+    return SourceOptions(**{**stored, "encoder": encoder})
+
+
+def encoder_name(field: HasManifest) -> str | None:
+    """Return the name of the encoder of a field; None if the manifest does not record it."""
+    stored = field.manifest.get("encoder")
+    name = stored.get("encoder") if isinstance(stored, Mapping) else None
+    return name if isinstance(name, str) else None
+
+
+def default_rule(field: HasManifest) -> DefaultRule:
+    """Return the default rule, negatives and threshold of a field's encoder.
+
+    For an unknown encoder, or a file of text embeddings without the default negatives, the rule is plain cosine.
+    """
+    stored = field.manifest.get("encoder")
+    if not isinstance(stored, Mapping):
+        return _PLAIN_COSINE
+    name, vectors = stored.get("encoder"), stored.get("text_vectors")
+    kind = find_encoder_kind("open_clip" if name == PRECOMPUTED else name)
+    if kind is None:
+        return _PLAIN_COSINE
+    if vectors is not None:  # the file may not exist yet, if it is written together with the run
+        names = TextEmbeddingFile(Path(vectors)).names if Path(vectors).is_file() else ()
+        if not set(kind.negatives) <= set(names):
+            return _PLAIN_COSINE
+    return DefaultRule(kind.rule, kind.negatives, kind.threshold)

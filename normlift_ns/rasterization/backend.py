@@ -1,0 +1,120 @@
+"""Interface of the rasterization backends. `rasterization.rasterize` has the table of all backends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from normlift_ns.core.evidence import Entries
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.errors import InputError
+from normlift_ns.rasterization.projection import (
+    PreparedGaussians,
+    ProjectedGaussians,
+    TileLists,
+    assign_tiles,
+    prepare_gaussians,
+    project,
+)
+from normlift_ns.rasterization.settings import RasterSettings
+
+
+@dataclass(frozen=True)
+class RasterJob:
+    """Inputs that all views of one call share."""
+
+    scene: GaussianScene
+    antialiased: bool
+    settings: RasterSettings
+    dtype: torch.dtype
+    """Precision of the computation."""
+    weight_power: int = 1
+    """Exponent p of the evidence, the sums of A_ij ** p."""
+
+    @cached_property
+    def world(self) -> PreparedGaussians:
+        """The drawable Gaussians, prepared for any camera."""
+        return prepare_gaussians(self.scene, self.dtype)
+
+    def seen_by(self, camera: Camera) -> tuple[ProjectedGaussians, TileLists]:
+        """Project the Gaussians into a camera and list them by tile."""
+        projected = project(self.world, camera, self.settings, self.antialiased)
+        return projected, assign_tiles(projected, camera.width, camera.height, self.settings.tile_size)
+
+
+def check_gpu(backend: str, job: RasterJob) -> None:
+    """Raise ValueError if a job is not in float32 on a GPU."""
+    means = job.scene.means
+    if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
+        other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
+        raise InputError(
+            f'backend "{backend}" computes in float32 on a GPU, not in {other} on {means.device.type}; omit the '
+            "backend to use the fastest one that can"
+        )
+
+
+class RasterBatch(NamedTuple):
+    """Views of one size that are rasterized together."""
+
+    cameras: Sequence[Camera]
+    labels: Sequence[Int32[Tensor, "h w"]]
+    num_regions: Sequence[int]
+
+
+class Backend(Protocol):
+    """Rasterization backend. The modules `rasterization.numba`, `rasterization.gsplat` and `rasterization.triton` implement it directly."""
+
+    def check(self, job: RasterJob, *, pictures: bool) -> None:
+        """Raise ValueError, with an alternative, if the backend cannot do the job.
+
+        Args:
+            job: Inputs of the call.
+            pictures: Whether to composite values; False: sum evidence.
+        """
+        ...
+
+    def in_flight(self, job: RasterJob, camera: Camera) -> int:
+        """Return the best number of views of this camera's size for one call of `views_evidence`."""
+        ...
+
+    def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:
+        """Return the sums of A_ij ** weight_power by (Gaussian, region)."""
+        ...
+
+    def composite(
+        self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
+        ...
+
+
+@dataclass(frozen=True)
+class TileBackend:
+    """Backend that uses projected Gaussians and tile lists, one view at a time, in any precision."""
+
+    kernels: Any
+    """Module with `view_evidence` and `composite`."""
+
+    def check(self, job: RasterJob, *, pictures: bool) -> None:
+        """Accept every job on any device."""
+
+    def in_flight(self, job: RasterJob, camera: Camera) -> int:
+        """Return 1: views are independent of each other."""
+        return 1
+
+    def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)
+        (camera,), (labels,), (count,) = batch
+        return self.kernels.view_evidence(*job.seen_by(camera), labels, count, job.weight_power, job.settings)
+
+    def composite(  # noqa: D102 (as in the protocol)
+        self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        projected, tiles = job.seen_by(camera)
+        visible_values = values[projected.gaussian].to(projected.opacities.dtype)
+        return self.kernels.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)

@@ -1,0 +1,126 @@
+"""Compiled CPU rasterizer: the sums of the reference, one thread per tile, limited to the pixels a Gaussian reaches."""
+
+from __future__ import annotations
+
+from threading import Thread
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from normlift_ns.core.evidence import Entries
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.errors import InputError
+from normlift_ns.rasterization import numba_kernels as kernels
+from normlift_ns.rasterization import numba_kernels as lists
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.projection import ProjectedGaussians, project
+from normlift_ns.rasterization.settings import RasterSettings
+
+_Triple = tuple[Any, Any, Any]
+
+
+def check(job: RasterJob, *, pictures: bool) -> None:
+    """Raise ValueError if a scene is not on the CPU."""
+    device = job.scene.means.device
+    if device.type != "cpu":
+        raise InputError(f'backend "numba" needs a scene on the CPU, found {device}; move it, or use backend="torch"')
+
+
+def in_flight(job: RasterJob, camera: Camera) -> int:
+    """Return 1: the kernels distribute one view over all cores."""
+    return 1
+
+
+def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
+    """Return the entries of one view, bitwise the same on every run."""
+    (camera,), (labels,), (count,) = batch
+    projected = project(job.world, camera, job.settings, job.antialiased)
+    arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
+    size, label_map = job.settings.tile_size, labels.int().numpy()
+    capacity = np.diff(offsets) * kernels.count_labels(label_map, size)
+    first_slot, used = np.cumsum(capacity) - capacity, np.zeros(len(capacity), np.int64)
+    slots = tuple(
+        np.empty(capacity.sum(), dtype) for dtype in (np.int32, np.int32, np.float64)
+    )  # pages are allocated when written
+    kernels.sum_tiles(
+        *(offsets, members, *arrays, shapes, projected.gaussian.numpy(), label_map),
+        *(job.weight_power, size, limits, first_slot, used, slots, numba.get_num_threads()),
+    )
+    merged = kernels.merge_slots(first_slot, used, slots, len(job.scene), count + 1)
+    gaussian, column, weight = map(torch.from_numpy, merged)
+    return Entries(gaussian, column, weight.to(job.dtype), (count,))
+
+
+def composite(
+    job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
+    projected = project(job.world, camera, job.settings, job.antialiased)
+    arrays, limits, (offsets, members, shapes) = _tiles(projected, camera, job.settings)
+    visible_values = values[projected.gaussian].to(job.dtype).contiguous().numpy()
+    image = np.zeros((camera.height, camera.width, values.shape[1]), visible_values.dtype)
+    alpha = np.zeros((camera.height, camera.width), visible_values.dtype)
+    kernels.composite_tiles(
+        *(offsets, members, *arrays, shapes, visible_values, image, alpha),
+        *(job.settings.tile_size, limits, numba.get_num_threads()),
+    )
+    return torch.from_numpy(image), torch.from_numpy(alpha)
+
+
+def _tiles(projected: ProjectedGaussians, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
+    """Return the input of the kernels in three groups.
+
+    These are means, conics and opacities; limits of alpha and transmittance; and offsets and members of the tiles with
+    shapes of the Gaussians.
+    """
+    means, conics, opacities = (
+        x.contiguous().numpy() for x in (projected.means2d, projected.conics, projected.opacities)
+    )
+    number = means.dtype.type
+    max_alpha, min_alpha, min_transmittance = settings.max_alpha, settings.min_alpha, settings.min_transmittance
+    radii = projected.radii if projected.radii.ndim > 1 else projected.radii[:, None].expand(-1, 2)
+    sizes = (camera.width, camera.height, settings.tile_size)
+    tile_lists = lists.list_tiles(
+        means, conics, opacities, radii.contiguous().numpy(), *sizes, number(min_alpha), numba.get_num_threads()
+    )
+    return (means, conics, opacities), (number(max_alpha), number(min_alpha), number(min_transmittance)), tile_lists
+
+
+def compile_kernels(*dtypes: torch.dtype) -> Thread:
+    """Load the kernels for some precisions in the background, and compile those that are not in a cache.
+
+    Callers need not wait for the thread: a call to a kernel that is not ready waits for this kernel only.
+    """
+
+    def work() -> None:
+        for dtype in dtypes:
+            for kernel, signature in kernel_signatures(dtype):
+                kernel.compile(signature)
+
+    thread = Thread(target=work, name="warm numba", daemon=True)
+    thread.start()
+    return thread
+
+
+def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
+    """Return every kernel that this module calls with the types of its arguments; those for rendering come first."""
+    number = numba.float64 if dtype == torch.float64 else numba.float32
+    integer, integers, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
+    labels, members, limits = numba.int32[:, ::1], numba.int32[::1], numba.types.UniTuple(number, 3)
+    slots = numba.types.Tuple((numba.int32[::1], numba.int32[::1], numba.float64[::1]))
+    tile_lists = (integers, members, table, table, numbers, numba.float64[:, ::1])
+    image = number[:, :, ::1]
+    return [
+        (lists.list_tiles, (table, table, numbers, table, integer, integer, integer, number, integer)),
+        (kernels.composite_tiles, (*tile_lists, table, image, table, integer, limits, integer)),
+        (kernels.count_labels, (labels, integer)),
+        (
+            kernels.sum_tiles,
+            (*tile_lists, integers, labels, integer, integer, limits, integers, integers, slots, integer),
+        ),
+        (kernels.merge_slots, (integers, integers, slots, integer, integer)),
+    ]

@@ -1,0 +1,255 @@
+"""Projection of Gaussians to depth-sorted 2D Gaussians and tile lists, exactly as in gsplat.
+
+The gsplat sources are utils.cuh and isect_tiles.cu.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int, Int32, Int64
+from torch import Tensor
+
+from normlift_ns.core.evidence import UNLABELED, Entries
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.sparse import sum_duplicates
+from normlift_ns.rasterization.settings import RasterSettings
+
+_ENORMOUS = 2.0**60
+"""Covariances above this, in square pixels, are multiplied by 1 / _ENORMOUS."""
+
+
+class PreparedGaussians(NamedTuple):
+    """The drawable Gaussians of a scene, prepared for any camera."""
+
+    gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
+    means: Float[Tensor, "m 3"]
+    """Centers in the precision of the scene, which decides the drawing order."""
+    covariances: Float[Tensor, "m 3 3"]
+    opacities: Float[Tensor, " m"]
+
+
+class ProjectedGaussians(NamedTuple):
+    """The Gaussians visible in a camera, nearest first."""
+
+    gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
+    means2d: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    """Inverse covariance in square pixels: xx, xy, yy."""
+    opacities: Float[Tensor, " m"]
+    radii: Float[Tensor, "m 2"]
+    """Half width and height of the rectangle that selects the tiles, in whole pixels."""
+
+
+class TileLists(NamedTuple):
+    """Gaussians by tile, with tiles row by row.
+
+    Tile t has the rows members[offsets[t]:offsets[t + 1]] of `ProjectedGaussians`, nearest first.
+    """
+
+    offsets: Int64[Tensor, " tiles_plus_1"]
+    members: Int32[Tensor, " intersections"]
+
+
+def prepare_gaussians(scene: GaussianScene, dtype: torch.dtype) -> PreparedGaussians:
+    """Return the drawable Gaussians with their covariances R diag(scale ** 2) R^T."""
+    gaussian = scene.drawable.nonzero().squeeze(1)
+    quats, scales, opacities = (x[gaussian].to(dtype) for x in (scene.quats, scene.scales, scene.opacities))
+    w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True)).unbind(1)
+    rotation = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+        ],
+        1,
+    )
+    half = rotation * scales[:, None, :]
+    return PreparedGaussians(gaussian, scene.means[gaussian], half @ half.transpose(1, 2), opacities)
+
+
+def project(
+    world: PreparedGaussians, camera: Camera, settings: RasterSettings, antialiased: bool
+) -> ProjectedGaussians:
+    """Project the Gaussians, blur them by eps2d, drop invisible ones, and sort by depth (equal depths by index).
+
+    Args:
+        world: Gaussians.
+        camera: Camera of the image.
+        settings: Constants of the rasterizer.
+        antialiased: Whether to scale opacities by sqrt(det / det of the blurred covariance), like splatfacto's
+            rasterize_mode "antialiased".
+    """
+    dtype, device = world.opacities.dtype, world.opacities.device
+    pose = camera.world_to_camera.to(device)
+    fx, _, cx, _, fy, cy, *_ = camera.K.double().flatten().tolist()
+    width, height = camera.width, camera.height
+    depth = camera_depths(world.means, camera)
+    near = ((depth >= settings.near_plane) & (depth <= settings.far_plane)).nonzero().squeeze(1)
+    near = near[torch.argsort(depth[near], stable=True)]
+    means, rotation = world.means[near].to(dtype), pose[:3, :3].to(dtype)
+    x, y, z = (_camera_axis(means, row) for row in pose[:3])
+
+    margin_x, margin_y = settings.frustum_margin * 0.5 * width / fx, settings.frustum_margin * 0.5 * height / fy
+    tx = z * (x / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
+    ty = z * (y / z).clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [torch.stack([fx / z, zero, -fx * tx / z**2], 1), torch.stack([zero, fy / z, -fy * ty / z**2], 1)], 1
+    )
+    to_image = jacobian @ rotation
+    covariance = to_image @ world.covariances[near] @ to_image.transpose(1, 2)
+    # Scale down enormous Gaussians, whose determinants overflow in float32. A power of two causes no rounding.
+    unit = torch.where(covariance.diagonal(dim1=1, dim2=2).amax(dim=1) > _ENORMOUS, 1 / _ENORMOUS, 1.0).to(dtype)
+    a, b, c = (unit * x for x in (covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]))
+    det_sharp = a * c - b * b
+    a, c = a + unit * settings.eps2d, c + unit * settings.eps2d
+    det = a * c - b * b
+    opacities = world.opacities[near]
+    if antialiased:
+        opacities = opacities * (det_sharp / det).clamp(min=settings.min_compensation**2).sqrt()
+
+    if settings.per_axis:
+        # Standard deviations up to which alpha >= min_alpha; NaN if there are none, which drops the Gaussian.
+        sigmas = (2 * (opacities / settings.min_alpha).log()).sqrt().clamp(max=settings.radius_sigmas)
+        radii = (sigmas[:, None] * (torch.stack([a, c], 1) / unit[:, None]).sqrt()).ceil()
+    else:
+        mean = 0.5 * (a + c)
+        larger = mean + torch.maximum(mean * mean - det, unit * unit * settings.min_discriminant).sqrt()
+        radii = (settings.radius_sigmas * (larger / unit).sqrt()).ceil()[:, None].expand(-1, 2)
+    u, v = fx * x / z + cx, fy * y / z + cy
+    visible = (det > 0) & (radii.isfinite() & (radii > 0)).all(1)
+    visible &= (u + radii[:, 0] > 0) & (u - radii[:, 0] < width) & (v + radii[:, 1] > 0) & (v - radii[:, 1] < height)
+    conics = unit[:, None] * (torch.stack([c, -b, a], 1) / det[:, None])
+    visible = (visible & conics.isfinite().all(1)).nonzero().squeeze(1)
+    return ProjectedGaussians(
+        world.gaussian[near[visible]],
+        torch.stack([u, v], 1)[visible],
+        conics[visible],
+        opacities[visible],
+        radii[visible],
+    )
+
+
+def camera_depths(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, " m"]:
+    """Return the distance of every mean along the camera's axis, rounded as in gsplat."""
+    return _camera_axis(means, camera.world_to_camera.to(means.device)[2])
+
+
+def _camera_axis(means: Float[Tensor, "m 3"], row: Float[Tensor, " 4"]) -> Float[Tensor, " m"]:
+    """Return one camera coordinate of all means, rounded as CUDA rounds R p + t: b y, fused + a x, fused + c z, + t.
+
+    The drawing order of overlapping Gaussians at the same distance depends on the last bit. A product of two float32
+    numbers is exact in float64, so rounding its sum once is a fused multiply-add.
+    """
+    dtype, (x, y, z) = means.dtype, means.double().unbind(1)
+    a, b, c, t = row.to(dtype).double()
+    total = (b * y).to(dtype)
+    total = (a * x + total).to(dtype)
+    total = (c * z + total).to(dtype)
+    return total + t.to(dtype)
+
+
+def assign_tiles(projected: ProjectedGaussians, width: int, height: int, tile_size: int) -> TileLists:
+    """List, for every tile, the Gaussians whose rectangle touches it."""
+    columns, rows = -(-width // tile_size), -(-height // tile_size)
+    u, v = (projected.means2d / tile_size).unbind(1)
+    across, down = (projected.radii / tile_size).unbind(1)
+    x0, x1 = (u - across).floor().clamp(0, columns).long(), (u + across).ceil().clamp(0, columns).long()
+    y0, y1 = (v - down).floor().clamp(0, rows).long(), (v + down).ceil().clamp(0, rows).long()
+    wide, count = x1 - x0, (x1 - x0) * (y1 - y0)
+    member = torch.repeat_interleave(torch.arange(count.numel(), device=count.device), count)
+    step = torch.arange(member.numel(), device=count.device) - (count.cumsum(0) - count)[member]
+    tile = ((y0[member] + step // wide[member]) * columns + x0[member] + step % wide[member]).int()
+    tile, order = tile.sort(stable=True)
+    bounds = torch.arange(rows * columns + 1, dtype=tile.dtype, device=tile.device)
+    return TileLists(torch.searchsorted(tile, bounds), member[order].int())
+
+
+# Reference rasterizer in plain torch: tile by tile, on any device and in any precision.
+#
+# It is slow, and all other backends are tested against it.
+
+
+def compositing_weights(alpha: Float[Tensor, "p k"], min_transmittance: float) -> Float[Tensor, "p k"]:
+    """Return A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) of K Gaussians, nearest first, in P pixels.
+
+    A pixel stops before the first Gaussian that would leave `min_transmittance` or less.
+
+    >>> compositing_weights(torch.tensor([[0.3, 0.8, 0.5]]), 1e-4)
+    tensor([[0.3000, 0.5600, 0.0700]])
+    >>> compositing_weights(torch.tensor([[0.3, 0.8, 0.5]]), 0.1)
+    tensor([[0.3000, 0.5600, 0.0000]])
+    """
+    after = torch.cumprod(1 - alpha, dim=1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
+    return torch.where(after > min_transmittance, alpha * before, 0.0)
+
+
+def view_evidence(
+    projected: ProjectedGaussians,
+    tiles: TileLists,
+    labels: Int[Tensor, "h w"],
+    num_regions: int,
+    weight_power: int,
+    settings: RasterSettings,
+) -> Entries:
+    """Return the sums of A_ij ** weight_power by (Gaussian, region) of one view; region -1 is the unlabeled pixels."""
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
+    for member, (rows, columns), a in _tiles(projected, tiles, labels.shape[1], labels.shape[0], settings):
+        weight = torch.where(a > 0, a.double() ** weight_power, 0.0)
+        region, local = labels[rows, columns].flatten().unique(return_inverse=True)
+        sums = weight.new_zeros(region.numel(), member.numel()).index_add_(0, local, weight)
+        r, k = (sums * (region >= UNLABELED)[:, None]).nonzero(as_tuple=True)
+        parts.append((projected.gaussian[member[k]], region[r], sums[r, k]))
+    empty = torch.zeros(0, dtype=torch.int64, device=labels.device)
+    gaussian, region, weight = (torch.cat(part) for part in zip((empty, empty, empty.double()), *parts))
+    gaussian, column, weight = sum_duplicates(gaussian, region + 1, weight)
+    return Entries(gaussian, column, weight.to(projected.opacities.dtype), (num_regions,))
+
+
+def composite(
+    projected: ProjectedGaussians,
+    tiles: TileLists,
+    values: Float[Tensor, "m c"],
+    width: int,
+    height: int,
+    settings: RasterSettings,
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel i (eq. 2 of the paper without its background)."""
+    image, alpha = values.new_zeros(height, width, values.shape[1]), values.new_zeros(height, width)
+    for member, (rows, columns), weight in _tiles(projected, tiles, width, height, settings):
+        area = image[rows, columns]
+        image[rows, columns] = (weight.to(values.dtype) @ values[member]).view(area.shape)
+        alpha[rows, columns] = weight.sum(1).view(area.shape[:2]).to(values.dtype)
+    return image, alpha
+
+
+def _tiles(
+    projected: ProjectedGaussians, tiles: TileLists, width: int, height: int, settings: RasterSettings
+) -> Iterator[tuple[Tensor, tuple[slice, slice], Tensor]]:
+    """Yield the K Gaussians, the pixels as slices of the image, and A_ij [pixels, K] of every tile with Gaussians."""
+    size, device, dtype = settings.tile_size, projected.means2d.device, projected.means2d.dtype
+    across = -(-width // size)
+    bounds = tiles.offsets.tolist()
+    for tile, (start, stop) in enumerate(pairwise(bounds)):
+        if start == stop:
+            continue
+        member = tiles.members[start:stop].long()
+        top, left = tile // across * size, tile % across * size
+        rows, columns = slice(top, min(top + size, height)), slice(left, min(left + size, width))
+        dx = (
+            projected.means2d[member, 0]
+            - (torch.arange(left, columns.stop, device=device).to(dtype) + 0.5)[None, :, None]
+        )
+        dy = projected.means2d[member, 1] - (torch.arange(top, rows.stop, device=device).to(dtype) + 0.5)[:, None, None]
+        a, b, c = projected.conics[member].unbind(1)
+        sigma = (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy).flatten(0, 1)  # [P, K]
+        alpha = (projected.opacities[member] * torch.exp(-sigma)).clamp(max=settings.max_alpha)
+        alpha = torch.where((sigma >= 0) & (alpha >= settings.min_alpha), alpha, 0.0)
+        yield member, (rows, columns), compositing_weights(alpha, settings.min_transmittance)

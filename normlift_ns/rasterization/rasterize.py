@@ -1,0 +1,491 @@
+"""View-dependent colors of Gaussians, on any device."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby, islice, zip_longest
+from typing import Any, NamedTuple, cast, get_args
+
+import torch
+from jaxtyping import Float, Int, Int64, UInt8
+from torch import Tensor
+
+from normlift_ns.core.device import has_triton, retry_in_halves
+from normlift_ns.core.evidence import MASKED, UNLABELED, Entries, Evidence
+from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.scene import Scene
+from normlift_ns.errors import InputError
+from normlift_ns.options import BackendName, RasterizeMode
+from normlift_ns.rasterization.backend import Backend, RasterBatch, RasterJob, TileBackend
+from normlift_ns.rasterization.settings import RasterSettings
+
+
+def view_colors(
+    means: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n k 3"], camera: Camera, degree: int | None
+) -> Float[Tensor, "n 3"]:
+    """Return RGB >= 0 of every Gaussian, as splatfacto and gsplat.rasterization compute it.
+
+    Args:
+        means: Centers of the Gaussians.
+        coefficients: features_dc and features_rest of a checkpoint, [N, 1 + rest, 3].
+        camera: Camera that views the Gaussians.
+        degree: Degree of the spherical harmonics, with (degree + 1) ** 2 <= K; None: the coefficients are logits.
+    """
+    if degree is None:
+        return torch.sigmoid(coefficients[:, 0])
+    from gsplat.cuda._torch_impl import _spherical_harmonics  # noqa: PLC0415 (slow import)
+
+    pose = camera.world_to_camera.to(means)
+    center = -pose[:3, :3].T @ pose[:3, 3]
+    return (_spherical_harmonics(degree, means - center, coefficients) + 0.5).clamp(min=0)
+
+
+# Table of the rasterization backends, and the choice of one for a job.
+
+
+def _torch() -> Backend:
+    from normlift_ns.rasterization import projection  # noqa: PLC0415 (load each backend at its first use)
+
+    return TileBackend(projection)
+
+
+def _numba() -> Backend:
+    from normlift_ns.rasterization import numba  # noqa: PLC0415 (importing numba takes a second)
+
+    return numba
+
+
+def _gsplat() -> Backend:
+    from normlift_ns.rasterization import gsplat  # noqa: PLC0415
+
+    return gsplat
+
+
+def _triton() -> Backend:
+    if not has_triton():
+        raise InputError(
+            'backend "triton" needs Triton 3, which comes with PyTorch 2.4 on Linux; omit the backend to use another'
+        )
+    from normlift_ns.rasterization import triton  # noqa: PLC0415
+
+    return triton
+
+
+BACKENDS: dict[str, Callable[[], Backend]] = {"torch": _torch, "numba": _numba, "gsplat": _gsplat, "triton": _triton}
+"""Backends by name, from the most general to the fastest."""
+
+
+def choose_backend(name: str, job: RasterJob, *, pictures: bool) -> tuple[str, Backend]:
+    """Return a backend and its name; "auto" selects the fastest backend that can do the job.
+
+    Args:
+        name: Name of the backend, or "auto".
+        job: Inputs of the call.
+        pictures: Whether to composite values; False: sum evidence.
+
+    Raises:
+        ValueError: If the name is unknown or the backend cannot do the job.
+    """
+    if name == "auto":
+        name = _fastest(job)
+    if name not in BACKENDS:
+        raise InputError(f"unknown backend {name!r}, expected one of {', '.join(get_args(BackendName))}")
+    backend = BACKENDS[name]()
+    backend.check(job, pictures=pictures)
+    return name, backend
+
+
+def _fastest(job: RasterJob) -> str:
+    means = job.scene.means
+    if means.device.type == "cpu":
+        return "numba"
+    if not means.is_cuda or job.dtype != torch.float32 or means.dtype != torch.float32:
+        return "torch"
+    return "triton" if has_triton() else "gsplat"
+
+
+# Rasterization of evidence (`rasterize_evidence`) and of values (`render`) with a backend.
+
+
+ViewProgress = Callable[[int, int | None], None]
+_ADVICE = "rasterize at a lower resolution (ns-normlift --lift-downscale 2) or on the CPU (--device cpu)"
+
+
+def rasterize_evidence(
+    scene: GaussianScene,
+    cameras: Iterable[Camera],
+    labels: Iterable[Tensor],
+    *,
+    num_regions: Iterable[int] | None = None,
+    backend: BackendName = "auto",
+    rasterize_mode: RasterizeMode = "classic",
+    weight_power: int = 1,
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
+    progress: ViewProgress | None = None,
+) -> Evidence:
+    """Compute the evidence E_js = sum of A_ij over the pixels i of region s, for all views.
+
+    The weights A_ij are those of the rasterizer that trained the scene, including its cut-offs and its drawing order.
+
+    Views are streamed: cameras, labels and num_regions may be generators, and only the entries of a view are kept.
+
+    Args:
+        scene: N Gaussians. Those with parameters that are not finite or out of range (`GaussianScene.drawable`) are
+            not drawn; they are counted in the result, with a warning.
+        cameras: One camera per view.
+        labels: One integer tensor [height, width] per view, with region ids 0, 1, … of this view. -1 means unlabeled.
+            -2 means masked: the pixel is not an observation, whatever `lift` does with unlabeled pixels.
+        num_regions: Number of regions (columns, feature rows) per view (default: largest id + 1). Needed if a feature
+            table has rows without pixels.
+        backend: "torch" (reference; any device and precision), "numba" (compiled; CPU), "triton" (fast; GPU, float32),
+            "gsplat" (stock gsplat; GPU, float32, weight_power 1, rules of the installed version or older) or "auto"
+            (the fastest for the device of the scene and the precision).
+        rasterize_mode: `rasterize_mode` of splatfacto in the training of the scene.
+        weight_power: Exponent of the summed A_ij. 1: the paper. 2: the code of SFS. 0: number of pixels that a Gaussian
+            contributes to.
+        settings: Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`.
+        dtype: Precision of the computation and of the weights (default: that of the scene). Sums are always taken in
+            float64.
+        progress: Function called after every view with (views done, number of views or None).
+
+    Raises:
+        ValueError: If an option is unknown, labels are not integers or differ from their camera in size, or an id is
+            below -2 or not below its `num_regions`. Also if the iterables have different lengths. The message names
+            the view.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
+    >>> means, quats = torch.tensor([[0.0, 0, 1], [0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> evidence = rasterize_evidence(scene, [camera, camera], [torch.tensor([[0]]), torch.tensor([[-1]])])
+    >>> evidence.rows.row_sums().tolist(), evidence.unlabeled.row_sums().tolist()  # 0.25: behind the first one
+    ([0.5, 0.25], [0.5, 0.25])
+    """
+    if weight_power not in (0, 1, 2):
+        raise InputError(f"weight_power must be 0, 1 or 2, got {weight_power}")
+    job = _job(scene, rasterize_mode, settings, dtype, weight_power)
+    _, chosen = choose_backend(backend, job, pictures=False)
+    num_excluded = len(scene) - int(scene.drawable.sum())
+    if num_excluded > 0:
+        warnings.warn(
+            f"{num_excluded} of {len(scene)} Gaussians have parameters that are not finite or out of range, "
+            "and are not drawn",
+            stacklevel=2,
+        )
+    total = len(cameras) if isinstance(cameras, list | tuple) else None
+    parts: list[Entries] = []
+    done = 0
+    with torch.no_grad():
+        views = _zip_views(cameras, labels, num_regions)
+        for batch in _batches(views, lambda camera: chosen.in_flight(job, camera)):
+            for i, (camera, label_map, _) in enumerate(batch):
+                _check_map(done + i, camera, label_map)
+            device = scene.means.device
+            ranges = torch.stack([torch.stack(x.aminmax()).to(device, torch.int64) for _, x, _ in batch]).tolist()
+            checked = [
+                (camera, label_map, _check_range(done + i, ranges[i][0], ranges[i][1], count))
+                for i, (camera, label_map, count) in enumerate(batch)
+            ]
+
+            def sums(views: Sequence[tuple[Camera, Tensor, int]]) -> Entries:
+                view_cameras, label_maps, counts = zip(*views)
+                on_device = [labels.to(scene.means.device, torch.int32) for labels in label_maps]
+                return chosen.views_evidence(job, RasterBatch(view_cameras, on_device, counts))
+
+            parts += retry_in_halves(sums, checked, _ADVICE)
+            for _ in batch:
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+    return Evidence.from_entries(parts, len(scene), weight_power=weight_power, num_excluded=num_excluded)
+
+
+def resolve_backend(
+    scene: GaussianScene, backend: BackendName, *, settings: RasterSettings, dtype: torch.dtype, weight_power: int
+) -> BackendName:
+    """Return the name of the backend that `rasterize_evidence` would use.
+
+    Raises:
+        ValueError: If the name is unknown or the backend cannot do the job; the message names an alternative.
+    """
+    job = _job(scene, "classic", settings, dtype, weight_power)
+    return cast(BackendName, choose_backend(backend, job, pictures=False)[0])
+
+
+def render(
+    scene: GaussianScene,
+    camera: Camera,
+    values: Float[Tensor, "n c"],
+    *,
+    backend: BackendName = "auto",
+    rasterize_mode: RasterizeMode = "classic",
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Composite values of Gaussians: sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
+
+    Args:
+        scene: N Gaussians.
+        camera: Camera of the image.
+        values: Colors, relevancies, reliability, …; not premultiplied.
+        backend: As in `rasterize_evidence`.
+        rasterize_mode: As in `rasterize_evidence`.
+        settings: As in `rasterize_evidence`.
+        dtype: As in `rasterize_evidence`.
+
+    Returns:
+        The image without background (add background * (1 - alpha)), and alpha in 0..1.
+
+    Raises:
+        ValueError: If the values do not have one row per Gaussian, or an option is unknown.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, render
+    >>> means, quats = torch.tensor([[0.0, 0, 1], [0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> image, alpha = render(scene, camera, torch.tensor([[1.0, 0, 0], [0, 0, 1]]))  # red before blue
+    >>> image.tolist(), alpha.tolist()
+    ([[[0.5, 0.0, 0.25]]], [[0.75]])
+    """
+    if values.ndim != 2 or len(values) != len(scene):
+        raise InputError(f"values must be [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
+    job = _job(scene, rasterize_mode, settings, dtype)
+    _, chosen = choose_backend(backend, job, pictures=True)
+    with torch.no_grad():
+        return chosen.composite(job, camera, values)
+
+
+def render_image(
+    scene: Scene,
+    camera: Camera,
+    *,
+    settings: RasterSettings | None = None,
+    mode: RasterizeMode | None = None,
+    gaussians: GaussianScene | None = None,
+) -> UInt8[Tensor, "h w 3"]:
+    """Render the trained scene in sRGB on its background, with the scene's own renderer if it has one.
+
+    Args:
+        scene: Scene to render.
+        camera: Camera of the image.
+        settings: Constants of the rasterizer, if they differ from the training, for images of another size.
+        mode: rasterize_mode, if it differs from the training.
+        gaussians: Gaussians of the scene on the rendering device (default: on the device of the scene).
+
+    Returns:
+        The image on the CPU.
+    """
+    if scene.renderer is not None:
+        return scene.renderer(camera)
+    options = {"rasterize_mode": mode or scene.rasterize_mode, "settings": settings}
+    gaussians = gaussians or scene.gaussians
+    color, alpha = render(gaussians, camera, scene.colors(camera).to(gaussians.means.device), **options)
+    color = color + (1 - alpha)[:, :, None] * scene.background.to(color)
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def _job(
+    scene: GaussianScene,
+    rasterize_mode: str,
+    settings: RasterSettings | None,
+    dtype: torch.dtype | None,
+    weight_power: int = 1,
+) -> RasterJob:
+    if rasterize_mode not in ("classic", "antialiased"):
+        raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
+    antialiased = rasterize_mode == "antialiased"
+    return RasterJob(scene, antialiased, settings or RasterSettings(), dtype or scene.means.dtype, weight_power)
+
+
+def _batches(
+    views: Iterator[tuple[Camera, Tensor, int | None]], batch_size: Callable[[Camera], int]
+) -> Iterator[list[tuple[Camera, Tensor, int | None]]]:
+    """Yield batches of consecutive views of one size."""
+    for _, group in groupby(views, key=lambda view: (view[0].width, view[0].height)):
+        same_size = iter(group)
+        for first in same_size:
+            yield [first, *islice(same_size, batch_size(first[0]) - 1)]
+
+
+def _zip_views(
+    cameras: Iterable[Camera], labels: Iterable[Tensor], num_regions: Iterable[int] | None
+) -> Iterator[tuple[Camera, Tensor, int | None]]:
+    end: Any = object()
+    streams: list[Iterable[Any]] = [cameras, labels, *([] if num_regions is None else [num_regions])]
+    for index, items in enumerate(zip_longest(*streams, fillvalue=end)):
+        for name, item in zip(("cameras", "labels", "num_regions"), items):
+            if item is end:
+                raise InputError(
+                    f"{name} ended after {index} views, but more views follow; "
+                    "give one camera, one label map and one count per view"
+                )
+        yield items[0], items[1], items[2] if num_regions is not None else None
+
+
+def _check_map(index: int, camera: Camera, labels: Tensor) -> None:
+    if (
+        not isinstance(labels, Tensor)
+        or labels.dtype.is_floating_point
+        or labels.dtype in (torch.bool, torch.complex64)
+    ):
+        kind = labels.dtype if isinstance(labels, Tensor) else type(labels).__name__
+        raise InputError(f"labels of view {index} must be an integer tensor, got {kind}")
+    if tuple(labels.shape) != (camera.height, camera.width):
+        raise InputError(
+            f"labels of view {index} have shape {tuple(labels.shape)}, but its camera is {camera.height} x "
+            f"{camera.width} (height x width)"
+        )
+
+
+def _check_range(index: int, low: int, high: int, count: int | None) -> int:
+    """Check the range of the labels of a view, and return its number of regions."""
+    if low < MASKED:
+        raise InputError(f"labels of view {index} contain {low}; region ids start at 0, -1 means unlabeled, -2 masked")
+    if count is not None and high >= count:
+        raise InputError(f"labels of view {index} contain region {high}, but num_regions is {count}")
+    return max(high, UNLABELED) + 1 if count is None else count
+
+
+# Contributing Gaussians of pixels, with their compositing weights.
+
+
+class Contributors(NamedTuple):
+    """Gaussians that contribute to P pixels: entries offsets[p] to offsets[p + 1] belong to pixel p, nearest first.
+
+    >>> import torch
+    >>> result = Contributors(torch.tensor([0, 2, 3]), torch.tensor([4, 7, 4]), torch.tensor([0.5, 0.25, 0.9]))
+    >>> result.gaussian[result.offsets[0] : result.offsets[1]].tolist()  # of the first pixel
+    [4, 7]
+    """
+
+    offsets: Int64[Tensor, " p_plus_1"]
+    gaussian: Int64[Tensor, " m"]
+    """Rows of the scene."""
+    weight: Float[Tensor, " m"]
+    """Weights A_pj in 0..1; those of a pixel add up to its alpha."""
+
+
+def contributors(
+    scene: GaussianScene,
+    camera: Camera,
+    pixels: Int[Tensor, "p 2"],
+    *,
+    backend: BackendName = "auto",
+    rasterize_mode: RasterizeMode = "classic",
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
+) -> Contributors:
+    """Return the Gaussians that contribute to pixels, with their compositing weights A_pj (eq. 1 of the paper).
+
+    The weights are exact: each pixel is a region of its own, and its evidence is returned. So the sum of A_pj over the
+    pixels of a region is the region's evidence. The sum over j of A_pj times any value of the Gaussians is the result
+    of `render` in the pixel.
+
+    Args:
+        scene: N Gaussians; those out of range (`GaussianScene.drawable`) contribute nothing.
+        camera: Camera of the image.
+        pixels: (column, row) from the upper left corner; a pixel may occur twice.
+        backend: As in `rasterize_evidence`.
+        rasterize_mode: As in `rasterize_evidence`.
+        settings: As in `rasterize_evidence`.
+        dtype: As in `rasterize_evidence`.
+
+    Returns:
+        One list per pixel, in the order of the pixels, on the device of the scene.
+
+    Raises:
+        ValueError: If the pixels are not integers or not in the image, or an option is unknown.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, contributors
+    >>> means, quats = torch.tensor([[0.0, 0, 2], [0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(2, 3), opacities=torch.tensor([0.5, 0.5]))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> result = contributors(scene, camera, torch.tensor([[0, 0]]))
+    >>> result.offsets.tolist(), result.gaussian.tolist(), result.weight.tolist()
+    ([0, 2], [1, 0], [0.5, 0.25])
+    """
+    device = scene.means.device
+    pixels = _check_pixels(pixels, camera).to(device)
+    position, region = (pixels[:, 1] * camera.width + pixels[:, 0]).unique(return_inverse=True)
+    labels = torch.full((camera.height * camera.width,), MASKED, dtype=torch.int32, device=device)
+    labels[position] = torch.arange(len(position), dtype=torch.int32, device=device)
+    options = {"backend": backend, "rasterize_mode": rasterize_mode, "settings": settings, "dtype": dtype}
+    shape = (camera.height, camera.width)
+    rows = rasterize_evidence(scene, [camera], [labels.view(shape)], num_regions=[len(position)], **options).rows
+    pose = camera.world_to_camera.to(scene.means)
+    depth = scene.means @ pose[2, :3] + pose[2, 3]
+    gaussian, column = rows.row_index(), rows.column.long()
+    order = depth[gaussian].argsort(stable=True)
+    order = order[column[order].argsort(stable=True)]
+    bounds = torch.searchsorted(column[order], torch.arange(len(position) + 1, device=device))
+    start, count = bounds[:-1][region], bounds.diff()[region]
+    offsets = torch.cat([count.new_zeros(1), count.cumsum(0)])
+    entry = torch.arange(int(offsets[-1]), device=device) + (start - offsets[:-1]).repeat_interleave(count)
+    return Contributors(offsets, gaussian[order[entry]], rows.weight[order[entry]])
+
+
+def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or pixels.dtype.is_floating_point or pixels.dtype == torch.bool:
+        raise InputError(f"pixels must be integers [P, 2], (column, row), got {pixels.dtype} {tuple(pixels.shape)}")
+    size = pixels.new_tensor([camera.width, camera.height])
+    outside = ((pixels < 0) | (pixels >= size)).any(dim=1).nonzero()
+    if len(outside) > 0:
+        first = int(outside[0])
+        raise InputError(
+            f"pixels[{first}] is {tuple(pixels[first].tolist())}, but the camera has {camera.width} columns and "
+            f"{camera.height} rows, counted from 0"
+        )
+    return pixels.long()
+
+
+# Compositing weights of Gaussians along a ray, computed in 3D without an image.
+
+
+_MAX_ALPHA, _MIN_ALPHA = 0.999, 1 / 255
+"""Same values as in the rasterizer: alpha is capped, and alpha below one step of a byte is ignored."""
+_MIN_SCALE_RATIO = 1e-4
+"""Least ratio of the smallest to the largest standard deviation, so that rays from all sides hit flat Gaussians."""
+
+
+def ray_weights(
+    scene: GaussianScene, origin: Float[Tensor, " 3"], direction: Float[Tensor, " 3"]
+) -> Float[Tensor, " n"]:
+    """Return the weight alpha_j prod_{k<j} (1 - alpha_k) of every Gaussian for a ray; 0 if the ray misses it.
+
+    alpha_j is the opacity times the largest value of the Gaussian along the ray. The distance of this maximum decides
+    the order, nearest first. Nothing is blurred, and the result does not depend on the size of an image.
+
+    Args:
+        scene: N Gaussians.
+        origin: Start of the ray in world units; Gaussians behind it are not hit.
+        direction: Direction of the ray, of any length > 0.
+    """
+    out = scene.means.new_zeros(len(scene))
+    rows = scene.drawable.nonzero().squeeze(1)
+    means, quats, scales = (x[rows].double() for x in (scene.means, scene.quats, scene.scales))
+    scales = scales.clamp(min=1e-12).maximum(_MIN_SCALE_RATIO * scales.amax(dim=1, keepdim=True))
+    forward = torch.nn.functional.normalize(direction.to(means), dim=0)
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    start = _to_axes(origin.to(means) - means, quats) / scales  # in standard deviations along each Gaussian's axes
+    step = _to_axes(forward.expand_as(means), quats) / scales
+    distance = -(start * step).sum(1) / (step * step).sum(1)
+    square = (start + distance[:, None] * step).square().sum(1)
+    alpha = (scene.opacities[rows].double() * torch.exp(-square / 2)).clamp(max=_MAX_ALPHA)
+    hit = ((alpha >= _MIN_ALPHA) & (distance > 0)).nonzero().squeeze(1)
+    hit = hit[distance[hit].argsort(stable=True)]
+    transmittance = (1 - alpha[hit]).cumprod(0)
+    before = torch.cat([transmittance.new_ones(1), transmittance])[: len(hit)]
+    out[rows[hit]] = (alpha[hit] * before).to(out)
+    return out
+
+
+def _to_axes(vectors: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
+    """Rotate world vectors into the axes of Gaussians with unit quaternions (w, x, y, z): the inverse rotation."""
+    real, imaginary = quats[:, :1], -quats[:, 1:]
+    turn = 2 * torch.linalg.cross(imaginary, vectors)
+    return vectors + real * turn + torch.linalg.cross(imaginary, turn)

@@ -1,0 +1,88 @@
+"""Constants of the rasterizer that trained the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from normlift_ns.errors import InputError
+from normlift_ns.options import GSPLAT_VERSIONS
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """Constants of gsplat's kernels, as splatfacto calls them; the defaults are those of gsplat 1.4.0.
+
+    The gsplat sources are fully_fused_projection_fwd.cu, isect_tiles.cu and rasterize_to_pixels_fwd.cu.
+
+    >>> import torch
+    >>> from normlift_ns import Camera, GaussianScene, RasterSettings, render
+    >>> means, quats = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]])
+    >>> scene = GaussianScene(means, quats, scales=torch.ones(1, 3), opacities=torch.ones(1))
+    >>> camera = Camera(torch.tensor([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), torch.eye(4), width=1, height=1)
+    >>> choices = RasterSettings(), RasterSettings(max_alpha=0.75), RasterSettings(near_plane=2.0)
+    >>> [render(scene, camera, torch.ones(1, 1), settings=settings)[1] for settings in choices]
+    [tensor([[0.9990]]), tensor([[0.7500]]), tensor([[0.]])]
+    >>> RasterSettings.of_gsplat("1.5").per_axis
+    True
+    """
+
+    near_plane: float = 0.01
+    """Gaussians with a center nearer than this (world units) are not drawn."""
+    far_plane: float = 1e10
+    """Gaussians with a center farther than this (world units) are not drawn."""
+    eps2d: float = 0.3
+    """Added to the diagonal of the projected covariance, in square pixels."""
+    frustum_margin: float = 0.3
+    """Margin around the image as a share of half the field of view. The Jacobian is constant outside this margin."""
+    min_discriminant: float = 0.01
+    """Lower bound of b ** 2 - det in the larger eigenvalue of the projected covariance."""
+    min_compensation: float = 0.0
+    """Lower bound of the factor by which antialiasing scales an opacity."""
+    per_axis: bool = False
+    """Shape that selects the tiles of a Gaussian. False: a square around its longer axis. True, from gsplat 1.5 on: a
+    rectangle around its extent along each axis of the image, limited to alpha >= `min_alpha`."""
+    radius_sigmas: float = 3.0
+    """Half side of the square, or greatest half side of the rectangle, in standard deviations."""
+    tile_size: int = 16
+    """Side of a tile in pixels. Gaussians are drawn in whole tiles only, so this changes the result."""
+    max_alpha: float = 0.999
+    """Upper bound of alpha."""
+    min_alpha: float = 1 / 255
+    """A pixel skips a Gaussian with a smaller alpha."""
+    min_transmittance: float = 1e-4
+    """A pixel stops before the first Gaussian that would leave this or less transmittance."""
+
+    @staticmethod
+    def of_gsplat(version: str) -> RasterSettings:
+        """Return the constants of gsplat 1.4, 1.5 or 1.6; the last is not released yet and may change.
+
+        Args:
+            version: Two or more numbers with dots, such as "1.5" or "1.5.3".
+
+        Raises:
+            ValueError: If the version is unknown.
+
+        >>> RasterSettings.of_gsplat("1.4.0") == RasterSettings(), RasterSettings.of_gsplat("1.6").max_alpha
+        (True, 0.99)
+        """
+        minor = ".".join(version.split(".")[:2])
+        if minor not in GSPLAT_VERSIONS:
+            raise InputError(f"unknown gsplat version {version}, expected one of {', '.join(GSPLAT_VERSIONS)}")
+        if minor == "1.4":
+            return RasterSettings()
+        rectangle = RasterSettings(per_axis=True, radius_sigmas=3.33)
+        return rectangle if minor == "1.5" else replace(rectangle, max_alpha=0.99, min_compensation=0.005)
+
+    @staticmethod
+    def recorded(manifest: Mapping[str, Any]) -> RasterSettings:
+        """Return the constants of the `gsplat_rules` in a manifest; without this entry, those of gsplat 1.4.
+
+        Raises:
+            ValueError: If the recorded version is unknown.
+
+        >>> RasterSettings.recorded({"gsplat_rules": "1.5"}).per_axis, RasterSettings.recorded({}).per_axis
+        (True, False)
+        """
+        return RasterSettings.of_gsplat(str(manifest.get("gsplat_rules", GSPLAT_VERSIONS[0])))

@@ -1,0 +1,115 @@
+"""Fast GPU backend with Triton kernels for projection, exact lists of cells, sums and compositing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from normlift_ns.core.evidence import Entries
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.sparse import sum_equal_keys
+from normlift_ns.errors import InputError
+from normlift_ns.kernels import compositing as kernel
+from normlift_ns.kernels.compositing import AlphaLimits, CellGrid, CellLists, build_cell_lists, decode_keys, sum_regions
+from normlift_ns.kernels.projection import ProjectedSplats, ProjectionSettings, project_gaussians
+from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
+from normlift_ns.rasterization.settings import RasterSettings
+
+CELL, SMALL_CELL = (16, 16), (16, 8)
+"""Largest width and height in pixels of the cells that have their own lists.
+
+With many Gaussians, few pixels of a cell share the same ones, and smaller cells are faster.
+"""
+_MANY = 4_000_000
+"""Number of Gaussians from which on small cells are used."""
+_ELEMENTS, _MAX_VIEWS = 2**26, 16
+"""Largest number of views in a batch times Gaussians, and of views in a batch.
+
+A view takes a byte per Gaussian, and 120 bytes per visible Gaussian.
+"""
+_SHORT = 2**15
+"""Largest number of cells in a batch that int16 can index, which takes half the time of int32 to sort."""
+
+
+def check(job: RasterJob, *, pictures: bool = False) -> None:
+    """Raise ValueError if a scene is not float32 on a GPU, or tiles cannot be divided into cells."""
+    size = job.settings.tile_size
+    check_gpu("triton", job)
+    if size < 1 or size & (size - 1) != 0:
+        raise InputError(f'backend "triton" needs a tile_size that is a power of two, got {size}; use backend="torch"')
+
+
+def project_and_bin(
+    job: RasterJob, cameras: Sequence[Camera], *, cull: bool = True
+) -> tuple[CellGrid, ProjectedSplats, CellLists]:
+    """Project the Gaussians into cameras of one size, and list them by cell.
+
+    Args:
+        job: Inputs of the call.
+        cameras: Cameras of one size.
+        cull: See `build_cell_lists`.
+    """
+    scene, settings = job.scene, job.settings
+    rows = [
+        torch.cat([camera.world_to_camera[:3].flatten(), camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]]).float()
+        for camera in cameras
+    ]
+    views = torch.stack(rows).to(scene.means.device)
+    width, height = cameras[0].width, cameras[0].height
+    grid = _grid(job, cameras[0])
+    projected = project_gaussians(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.drawable, views, width, height,
+        ProjectionSettings(*(getattr(settings, name) for name in ProjectionSettings._fields)),
+        antialiased=job.antialiased, per_axis=settings.per_axis,
+    )  # fmt: skip
+    return grid, projected, build_cell_lists(projected, len(cameras), grid, settings.min_alpha, cull=cull)
+
+
+def in_flight(job: RasterJob, camera: Camera) -> int:
+    """Return the best number of views of one size in a batch."""
+    cells = _grid(job, camera).cells
+    return max(1, min(_ELEMENTS // max(1, len(job.scene)), (_SHORT - 1) // max(1, cells), _MAX_VIEWS))
+
+
+def _grid(job: RasterJob, camera: Camera) -> CellGrid:
+    tile = job.settings.tile_size
+    across, down = CELL if len(job.scene) < _MANY else SMALL_CELL
+    return CellGrid(camera.width, camera.height, tile, min(across, tile), min(down, tile))
+
+
+def views_evidence(job: RasterJob, batch: RasterBatch, *, cull: bool = True) -> Entries:
+    """Return the entries of views of one size, rasterized together; bitwise the same on every run.
+
+    Args:
+        job: Inputs of the call.
+        batch: Views.
+        cull: See `build_cell_lists`; the entries do not depend on it.
+    """
+    grid, projected, lists = project_and_bin(job, batch.cameras, cull=cull)
+    columns = max(batch.num_regions) + 1
+    labels = torch.stack(list(batch.labels))
+    sums = sum_regions(
+        projected.splats, lists, labels, grid, columns=columns, limits=_limits(job.settings),
+        weight_power=job.weight_power,
+    )  # fmt: skip
+    key, weight = sum_equal_keys(*sums)
+    # Splats are sorted by Gaussian and then by view, so ascending keys have the order of entries.
+    first = torch.tensor([0, *(count + 1 for count in batch.num_regions)]).cumsum(0).int().to(key.device)
+    return Entries(*decode_keys(key, projected.seen, first, columns), weight, tuple(batch.num_regions))
+
+
+def composite(
+    job: RasterJob, camera: Camera, values: Float32[Tensor, "n c"]
+) -> tuple[Float32[Tensor, "h w c"], Float32[Tensor, "h w"]]:
+    """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
+    grid, projected, lists = project_and_bin(job, [camera])
+    return kernel.composite(
+        projected.splats, lists, projected.seen, values.to(job.scene.means), grid, _limits(job.settings)
+    )
+
+
+def _limits(settings: RasterSettings) -> AlphaLimits:
+    return AlphaLimits(*(getattr(settings, name) for name in AlphaLimits._fields))

@@ -1,0 +1,615 @@
+"""Rendered outputs of an answer: which scalars of the Gaussians are rendered, and how their images are colored."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFilter
+from torch import Tensor
+
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.scene import Scene
+from normlift_ns.errors import InputError
+from normlift_ns.evidence_collection import sample_evenly
+from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
+from normlift_ns.options import RELEVANCY_RULES
+from normlift_ns.query.engine import Answer, Finding, pixel_relevancy
+from normlift_ns.rasterization.rasterize import render, render_image
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.rendering.colors import (
+    COLORMAPS,
+    MAX_OVERLAY_OPACITY,
+    RELIABILITY_COLORMAP,
+    Colormap,
+    add_color_bar,
+    add_prompt_legend,
+    apply_colormap,
+    clip_text,
+    colormap_rgb,
+    load_font,
+    prompt_colors,
+)
+from normlift_ns.session.state import WEAK_RELIABILITY
+
+_MIN_SPAN = 0.05
+"""Smallest difference between the relevancies at the ends of a color scale."""
+SEGMENTATION_OPACITY = 0.8
+"""Opacity of the prompt colors over the scene."""
+MANUAL_SELECTION_COLOR = prompt_colors([""])[0]
+"""RGB of Gaussians selected by clicks without a query."""
+
+
+@dataclass(frozen=True)
+class Display:
+    """Scalars that are rendered in addition to the colors, and their color scales.
+
+    Immutable, because the viewer renders in other threads. Q is the number of prompts; without prompts, nothing is
+    selected.
+    """
+
+    values: Float[Tensor, "n q_plus_5"]
+    """Columns: relevancy of each prompt, relevancy shown in the overlay, selected (0 or 1), selected by any prompt
+    (0 or 1), R, N_eff."""
+    scale: tuple[float, float]
+    """Relevancies at the two ends of the overlay's colors."""
+    whole: tuple[float, float]
+    """Relevancies at the two ends of the colors in maps of the whole scene."""
+    colormap: Colormap
+    """Colormap of the overlay."""
+    texts: tuple[str, ...]
+    """The prompts."""
+    palette: Float[Tensor, "q 3"]
+    """Colors of the prompts in the segmentation, RGB in 0..1."""
+    shown: int | None = None
+    """Index of the prompt in the overlay; None: the most relevant of all prompts."""
+    drawn: Bool[Tensor, " n"] | None = None
+    """Gaussians that are drawn at all; None: all."""
+    by_hand: bool = False
+    """Whether the selection was made by hand, in which case the overlay has a single color."""
+
+    @property
+    def num_prompts(self) -> int:
+        """Number of prompts, Q."""
+        return len(self.palette)
+
+    @property
+    def title(self) -> str:
+        """Title of the overlay's color bar."""
+        index = self.shown if self.num_prompts > 1 else 0
+        return "relevancy, all prompts" if index is None else f"relevancy: {self.texts[index]}"
+
+
+def make_display(
+    field: SemanticField,
+    answer: Answer | None = None,
+    *,
+    shown: int | None = None,
+    colormap: Colormap = COLORMAPS[0],
+    chosen: Bool[Tensor, " n"] | None = None,
+    drawn: Bool[Tensor, " n"] | None = None,
+    by_hand: bool = False,
+) -> Display:
+    """Make the display of an answer, on the field's device.
+
+    Args:
+        shown: index of the prompt whose relevancy is in the overlay and whose selection counts; None: all prompts.
+        chosen: mask of the selection; None: the selection of the answer.
+        drawn: mask of the Gaussians that are drawn at all; None: all.
+        by_hand: whether `chosen` is independent of the answer.
+    """
+    scalars = field.scalars
+    zeros = torch.zeros_like(scalars.reliability)
+    relevancy = zeros[:, None][:, :0] if answer is None else answer.relevancy
+    explicit, selected = chosen is not None, selection_mask(answer, shown) if chosen is None else chosen
+    selected = zeros.bool() if selected is None else selected
+    count, shown_relevancy, selected_by_any = relevancy.shape[1], zeros, zeros
+    scale = whole = (0.0, 1.0)
+    if answer is not None and count > 0:
+        shown_relevancy = relevancy.amax(dim=1) if shown is None else relevancy[:, shown]
+        selected_by_any = selected if explicit else answer.selected.any(dim=1)
+        scale, whole = color_scale(shown_relevancy[answer.valid], answer.question.threshold), map_scale(answer)
+    columns = (shown_relevancy, selected, selected_by_any, scalars.reliability, scalars.n_eff)
+    values = torch.cat([relevancy.float(), torch.stack([c.float() for c in columns], dim=1)], dim=1)
+    texts = () if answer is None else answer.texts
+    return Display(values, scale, whole, colormap, texts, prompt_colors(texts).to(values), shown, drawn, by_hand)
+
+
+def selection_mask(answer: Answer | None, shown: int | None) -> Bool[Tensor, " n"] | None:
+    """Return the mask of Gaussians selected by prompt `shown` (None: by any prompt); None without an answer."""
+    if answer is None:
+        return None
+    return answer.selected.any(dim=1) if shown is None else answer.selected[:, shown]
+
+
+def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float, float]:
+    """Return a scale from the threshold to the largest relevancy in the scene, at least 0.05 wide."""
+    peak = float(relevancy.max()) if len(relevancy) > 0 else threshold
+    return threshold, max(peak, threshold + _MIN_SPAN)
+
+
+def map_scale(answer: Answer) -> tuple[float, float]:
+    """Return the scale of all maps: from the rule's faintest colored relevancy to the largest of any prompt."""
+    peak = color_scale(answer.relevancy[answer.valid].flatten(), answer.question.threshold)[1]
+    low = RELEVANCY_RULES[answer.question.rule].faintest
+    return low, max(peak, low + _MIN_SPAN)
+
+
+def output_names(texts: tuple[str, ...]) -> list[str]:
+    """Return the name of each prompt's output in a viewer. They are valid file names, since ns-render writes files.
+
+    >>> output_names(("sky blue", "sky/blue", "fox"))
+    ['relevancy_sky_blue', 'relevancy_sky_blue_2', 'relevancy_fox']
+    """
+    names: list[str] = []
+    for text in texts:
+        name = f"relevancy_{safe_file_name(text)}"
+        names.append(next(path.name for path in numbered_paths(Path(name)) if path.name not in names))
+    return names
+
+
+def render_outputs(
+    display: Display,
+    rgb: Float[Tensor, "h w 3"],
+    image: Float[Tensor, "h w c"],
+    alpha: Float[Tensor, "h w"],
+    *,
+    by_text: bool = False,
+) -> dict[str, Tensor]:
+    """Return the semantic outputs of one image, each [H, W, 1] or [H, W, 3], the overlay last.
+
+    Overlay, segmentation and reliability are finished images with legends: the scene in gray under colors of fixed
+    scales. The other outputs are scalars sum_j A_ij value_j, 0 for empty pixels.
+
+    Args:
+        rgb: rendered scene, 0..1.
+        image: composited `display.values`.
+        alpha: opacity of every pixel.
+        by_text: return relevancies as finished images with the names of `output_names`, for a viewer. Otherwise they
+            are scalars named relevancy_0, relevancy_1, …
+    """
+    count, colors = display.num_prompts, colormap_rgb(display.colormap).to(rgb)
+    pixel = pixel_relevancy(image[:, :, : count + 1], alpha)
+    _, selected, selected_by_any, reliability, n_eff = image[:, :, count:].split(1, dim=2)
+    opacity = SEGMENTATION_OPACITY * selected.clamp(0, 1).sqrt()  # makes faint selections visible, such as floaters
+    overlaid, segmented = _over_gray(rgb, MANUAL_SELECTION_COLOR.to(rgb), opacity), _gray(rgb)
+    outputs = {f"relevancy_{i}": image[:, :, i : i + 1] for i in range(count)}
+    if count > 0:
+        segmented = segmentation(rgb, pixel[:, :, :count].argmax(dim=2), selected_by_any, display.palette)
+        segmented = add_prompt_legend(segmented, display.texts, display.palette)
+    if count > 0 and not display.by_hand:
+        overlaid = overlay(rgb, pixel[:, :, count], selected, colors, display.scale)
+        overlaid = add_color_bar(overlaid, display.colormap, display.scale, display.title)
+    if by_text:
+        outputs = {
+            name: add_color_bar(
+                relevancy_map(display, rgb, pixel[:, :, i], alpha), display.colormap, display.whole, text
+            )
+            for i, (name, text) in enumerate(zip(output_names(display.texts), display.texts))
+        }
+    return {
+        **outputs,
+        "reliability": reliability_map(rgb, reliability, alpha),
+        "reliability_value": reliability,
+        "n_eff": n_eff,
+        "selection": selected,
+        "segmentation": segmented,
+        "overlay": overlaid,
+    }
+
+
+def overlay(
+    rgb: Float[Tensor, "h w 3"],
+    relevancy: Float[Tensor, "h w"],
+    share: Float[Tensor, "h w 1"],
+    colors: Float[Tensor, "256 3"],
+    scale: tuple[float, float],
+) -> Float[Tensor, "h w 3"]:
+    """Return the scene in gray, with the selection colored by relevancy and more opaque for higher relevancies.
+
+    Args:
+        share: selected fraction of each pixel, 0..1.
+        scale: relevancies of the first and the last color.
+    """
+    color, opacity = apply_colormap(relevancy, scale, colors)
+    return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
+
+
+def relevancy_map(
+    display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Return the scene in gray, colored by relevancy everywhere, from transparent to opaque."""
+    color, opacity = apply_colormap(relevancy, display.whole, colormap_rgb(display.colormap).to(rgb), faint=0.0)
+    return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
+
+
+def segmentation(
+    rgb: Float[Tensor, "h w 3"],
+    labels: Int[Tensor, "h w"],
+    share: Float[Tensor, "h w 1"],
+    palette: Float[Tensor, "q 3"],
+) -> Float[Tensor, "h w 3"]:
+    """Return the scene in gray, with the selection in the color of the most relevant prompt.
+
+    Args:
+        labels: index of the most relevant prompt of each pixel.
+        share: selected fraction of each pixel, 0..1.
+        palette: colors of the prompts, RGB in 0..1.
+    """
+    return _over_gray(rgb, palette[labels], SEGMENTATION_OPACITY * share.clamp(0, 1))
+
+
+def reliability_map(
+    rgb: Float[Tensor, "h w 3"], reliability: Float[Tensor, "h w 1"], alpha: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Return a map of R on a fixed scale from 0 to 1, with its legend.
+
+    Args:
+        reliability: composited R.
+    """
+    pixel = pixel_relevancy(reliability, alpha)[:, :, 0]
+    color = colormap_rgb(RELIABILITY_COLORMAP).to(rgb)[(pixel.clamp(0, 1) * 255).round().long()]
+    image = _over_gray(rgb, color, MAX_OVERLAY_OPACITY * alpha.clamp(0, 1)[:, :, None])
+    return add_color_bar(image, RELIABILITY_COLORMAP, (0.0, 1.0), "reliability R (high is good)")
+
+
+def _over_gray(rgb: Tensor, color: Tensor, opacity: Tensor) -> Tensor:
+    return (1 - opacity) * _gray(rgb) + opacity * color
+
+
+def _gray(rgb: Tensor) -> Tensor:
+    return rgb.mean(dim=2, keepdim=True).expand_as(rgb)
+
+
+# Layout of figures of answers: titles, panels, outlines and the color bar.
+
+
+_PANEL_WIDTH, _THUMBNAIL_WIDTH, _MAX_WIDTH = 640, 420, 4096
+"""Width in pixels of the panels of a figure, of those of a contact sheet, and largest width of a contact sheet."""
+_MAX_SINGLE_ROW = 3
+"""Largest number of panels for which a contact sheet has a single row."""
+_MAX_ASPECT = 1.5
+"""Largest height of a panel, as a multiple of its width."""
+_MARGIN, _FONT_SIZE = 16, 17
+_BACKGROUND, _TEXT_COLOR, _CAPTION_COLOR = (255, 255, 255), (20, 20, 20), (95, 95, 95)
+
+
+@dataclass(frozen=True)
+class FigureStyle:
+    """Settings that all figures of an answer share."""
+
+    colormap: Colormap
+    scale: tuple[float, float]
+    """Relevancies at the ends of the color bar."""
+    threshold: float
+    """Relevancy above which Gaussians are selected."""
+
+
+@dataclass(frozen=True)
+class FigureHeader:
+    """Title and summary above a figure."""
+
+    text: str
+    """The prompt."""
+    summary: str
+    """Size of the selection and strength of its evidence."""
+    absent: bool = False
+    """Whether the prompt is probably not in the scene."""
+
+    @property
+    def title(self) -> str:
+        """The prompt, and a note if it is probably not in the scene."""
+        return clip_text(self.text, 60) + self.absent * "   ·   probably not in this scene"
+
+    @staticmethod
+    def of(finding: Finding) -> FigureHeader:
+        """Summarize the answer to one prompt."""
+        mask, scalars = finding.mask, finding.answer.field.scalars
+        threshold, absent = finding.answer.question.threshold, finding.stands_out is False
+        if not bool(mask.any()):
+            peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
+            return FigureHeader(finding.text, f"nothing is above {threshold:g}{peak}", absent)
+        weight = scalars.weight[mask].double() + 1e-12
+        views = float((weight * scalars.n_eff[mask].double()).sum() / weight.sum())
+        weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
+        evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
+        below = f" (R < {WEAK_RELIABILITY:g})"
+        return FigureHeader(finding.text, f"{100 * finding.fraction:.1f} % of the Gaussians; {evidence}{below}", absent)
+
+
+def view_figure(
+    sheet: FigureStyle,
+    header: FigureHeader,
+    view: str,
+    image: UInt8[Tensor, "h w 3"] | None,
+    overlay: UInt8[Tensor, "h w 3"],
+    selected: Bool[Tensor, "h w"],
+) -> Image.Image:
+    """Draw a figure of one view: the training image next to the overlay.
+
+    Args:
+        header: title and summary above the figure.
+        view: name of the view.
+        image: training image; None: it is not available, and the figure shows the overlay alone.
+        overlay: rendered overlay of the same view.
+        selected: mask of the selected pixels, which are outlined.
+    """
+    panel = _outlined(overlay, selected, _PANEL_WIDTH)
+    panels = [panel] if image is None else [Image.fromarray(image.cpu().numpy()).resize(panel.size), panel]
+    captions = ["answer"] if image is None else ["training image", "answer"]
+    summary = f"{100 * float(selected.float().mean()):.1f} % of this view, {header.summary}"
+    if not bool(selected.any()):
+        summary = header.summary
+    return _page(sheet, [f"{header.title}   ·   {clip_text(view, 40)}", summary], panels, captions, 2)
+
+
+def contact_sheet(
+    sheet: FigureStyle, header: FigureHeader, overlays: Sequence[tuple[str, Tensor, Tensor]]
+) -> Image.Image:
+    """Draw a figure of all views for one prompt.
+
+    Args:
+        header: title and summary above the figure.
+        overlays: name, overlay [H, W, 3] and mask of selected pixels [H, W] of each view.
+    """
+    columns = len(overlays) if len(overlays) <= _MAX_SINGLE_ROW else math.ceil(math.sqrt(len(overlays)))
+    width = min(_THUMBNAIL_WIDTH, _MAX_WIDTH // columns)
+    panels = [_outlined(overlay, selected, width) for _, overlay, selected in overlays]
+    return _page(sheet, [header.title, header.summary], panels, [view for view, _, _ in overlays], columns)
+
+
+def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
+    """Return the overlay, at most `width` wide, with a white line on a black one around the selection."""
+    scale = min(width / overlay.shape[1], _MAX_ASPECT * width / overlay.shape[0])
+    size = (max(1, round(scale * overlay.shape[1])), max(1, round(scale * overlay.shape[0])))
+    image = Image.fromarray(overlay.cpu().numpy()).resize(size, Image.Resampling.BICUBIC)
+    mask = Image.fromarray(selected.cpu().numpy() * np.uint8(255)).resize(size, Image.Resampling.BILINEAR)
+    mask = mask.point(lambda value: 255 * (value > 127))  # pyright: ignore[reportOperatorIssue]
+    for color, thickness in (((0, 0, 0), 5), ((255, 255, 255), 3)):
+        dilated, eroded = mask.filter(ImageFilter.MaxFilter(thickness)), mask.filter(ImageFilter.MinFilter(thickness))
+        image.paste(color, mask=Image.fromarray(np.asarray(dilated) != np.asarray(eroded)))
+    return image
+
+
+def _page(
+    sheet: FigureStyle, titles: Sequence[str], panels: Sequence[Image.Image], captions: Sequence[str], columns: int
+) -> Image.Image:
+    """Lay out panels in rows of `columns`, with titles above and the color bar below."""
+    columns, line = min(columns, len(panels)), round(1.5 * _FONT_SIZE)
+    width, height = (max(panel.size[i] for panel in panels) for i in (0, 1))
+    rows = math.ceil(len(panels) / columns)
+    inner = max(columns * (width + _MARGIN) - _MARGIN, 560)
+    top = _MARGIN + line * len(titles)
+    bottom = top + rows * (height + line + _MARGIN)
+    page = Image.new("RGB", (inner + 2 * _MARGIN, bottom + 3 * line), _BACKGROUND)
+    draw = ImageDraw.Draw(page)
+    for i, title in enumerate(titles):
+        typeface, color = load_font(_FONT_SIZE if i == 0 else _FONT_SIZE - 2), _TEXT_COLOR if i == 0 else _CAPTION_COLOR
+        fitting = next(n for n in range(len(title), -1, -1) if typeface.getlength(title[:n]) <= inner)
+        draw.text((_MARGIN, _MARGIN // 2 + i * line), title[:fitting], fill=color, font=typeface)
+    for i, (panel, caption) in enumerate(zip(panels, captions)):
+        x, y = _MARGIN + (i % columns) * (width + _MARGIN), top + (i // columns) * (height + line + _MARGIN)
+        page.paste(panel, (x, y + line))
+        most = max(4, int(width / (0.6 * (_FONT_SIZE - 4))))
+        draw.text((x, y + 4), clip_text(caption, most), fill=_CAPTION_COLOR, font=load_font(_FONT_SIZE - 4))
+    _draw_color_bar(draw, page, sheet, (_MARGIN, bottom, inner))
+    return page
+
+
+def _draw_color_bar(
+    draw: ImageDraw.ImageDraw, page: Image.Image, sheet: FigureStyle, position: tuple[int, int, int]
+) -> None:
+    """Draw the color bar with the values at its ends and a mark at the threshold.
+
+    Args:
+        position: x, y and width in pixels.
+    """
+    (x, y, width), typeface = position, load_font(_FONT_SIZE - 4)
+    (low, high), height = sheet.scale, _FONT_SIZE
+    ramp = (colormap_rgb(sheet.colormap).numpy() * 255).round().astype(np.uint8)[None]
+    page.paste(Image.fromarray(ramp).resize((width, height)), (x, y))
+    mark = x + round(width * min(max((sheet.threshold - low) / (high - low), 0.0), 1.0))
+    for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        draw.line((mark, y - 3, mark, y + height + 3), fill=color, width=thickness)
+    label = f"selected above {sheet.threshold:.3g}"
+    length = typeface.getlength(label)
+    ends = [f"{low:g}", f"{high:.2f}"]
+    left, right = x + typeface.getlength(ends[0]) + 10, x + width - typeface.getlength(ends[1]) - 10 - length
+    draw.text((x, y + height + 5), ends[0], fill=_TEXT_COLOR, font=typeface)
+    draw.text((x + width - typeface.getlength(ends[1]), y + height + 5), ends[1], fill=_TEXT_COLOR, font=typeface)
+    draw.text((min(max(mark - length / 2, left), right), y + height + 5), label, fill=_TEXT_COLOR, font=typeface)
+    draw.text((x, y + height + 5 + round(1.2 * _FONT_SIZE)), "relevancy", fill=_CAPTION_COLOR, font=typeface)
+
+
+# Figures of answers: training images next to renders of the answer, in the colors of the viewers, and masks.
+
+
+CONTACT_SHEET_PREFIX = "contact_sheet"
+"""Beginning of the file names of contact sheets; those of other figures begin with the name of their view."""
+_ZLIB_LEVEL = 4
+"""PIL's default, 6, takes twice as long for files that are 6% smaller."""
+
+
+def save_overlays(
+    scene: Scene,
+    answer: Answer,
+    cameras: dict[str, Camera],
+    folder: Path,
+    *,
+    settings: RasterSettings | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write one PNG per camera and prompt, and for several cameras one contact sheet per prompt.
+
+    Each figure shows the training image next to the rendered scene with the relevancy and the outline of the selection.
+    All figures share one color scale.
+
+    Args:
+        cameras: training cameras by the names for the files, as from `training_cameras`.
+        settings: rasterizer settings; None: those of gsplat 1.4.
+        overwrite: replace existing files.
+    Returns:
+        Paths of the files.
+    Raises:
+        FileExistsError: a file exists, and `overwrite` is False.
+        OSError: a file cannot be written.
+        ValueError: two figures would have the same name.
+    """
+    files = {
+        view: [f"{view}_{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)] for view in cameras
+    }
+    sheets = (
+        [f"{CONTACT_SHEET_PREFIX}_{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
+        if len(cameras) > 1
+        else []
+    )
+    counts = Counter([*sheets, *(name for names in files.values() for name in names)])
+    duplicates = [name for name, count in counts.items() if count > 1]
+    if len(duplicates) > 0:
+        raise InputError(f"two figures would have the name {folder / duplicates[0]}; render their views one at a time")
+    headers = [FigureHeader.of(finding) for finding in answer]
+    sheet = FigureStyle(COLORMAPS[0], make_display(answer.field, answer).whole, answer.question.threshold)
+    paths, overlays = [], [[] for _ in answer.texts]
+    for view, camera in cameras.items():
+        image = _training_image(scene, view)
+        for q, overlay in enumerate(_overlays(scene, answer, camera, settings)):
+            overlays[q].append((view, *overlay))
+            paths.append(folder / files[view][q])
+            with atomic_file(paths[-1], overwrite=overwrite) as draft:
+                view_figure(sheet, headers[q], view, image, *overlay).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+    for q, name in enumerate(sheets):
+        paths.append(folder / name)
+        with atomic_file(paths[-1], overwrite=overwrite) as draft:
+            contact_sheet(sheet, headers[q], overlays[q]).save(draft, "PNG", compress_level=_ZLIB_LEVEL)
+    return paths
+
+
+def _overlays(
+    scene: Scene, answer: Answer, camera: Camera, settings: RasterSettings | None
+) -> list[tuple[UInt8[Tensor, "h w 3"], Tensor]]:
+    """Return, for each prompt, the scene in gray under its relevancy, and the mask of selected pixels [H, W]."""
+    count, display = len(answer.texts), make_display(answer.field, answer)
+    values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1)
+    image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
+    pixel = pixel_relevancy(image, alpha)
+    rgb = render_image(scene, camera, settings=settings).float() / 255
+    maps = [relevancy_map(display, rgb, pixel[:, :, q], alpha) for q in range(count)]
+    return [((map_ * 255).round().to(torch.uint8), pixel[:, :, count + q] > 0.5) for q, map_ in enumerate(maps)]
+
+
+def _training_image(scene: Scene, view: str) -> UInt8[Tensor, "h w 3"] | None:
+    """Return the training image of a view, or None if it cannot be read any more."""
+    names = unique_file_names(list(scene.train.names))
+    try:
+        return scene.train[names.index(view)].image
+    except (FileNotFoundError, InputError):
+        return None
+
+
+def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camera]:
+    """Return training cameras by the names for their files.
+
+    Args:
+        names: names as from `unique_file_names`, or image paths with or without suffix; empty: three evenly spaced views.
+    Raises:
+        ValueError: a name matches no training image, or several.
+    """
+    images, cameras = list(scene.train.names), scene.train.cameras
+    unique = unique_file_names(images)
+    if len(names) == 0:
+        return {unique[i]: cameras[i] for i in sample_evenly(len(images), 3)}
+    selected = {}
+    for name in names:
+        matches = [i for i, image in enumerate(images) if name in (unique[i], image, _without_suffix(image))]
+        matches = matches or [i for i, image in enumerate(images) if PurePosixPath(image).stem == name]
+        if len(matches) == 0:
+            raise InputError(
+                f"--render-views: there is no training image {name!r}. Expected one of {len(images)} names from "
+                f"{unique[0]!r} to {unique[-1]!r}, without suffix; other images are held out for evaluation."
+            )
+        if len(matches) > 1:
+            raise InputError(
+                f"--render-views: {len(matches)} training images match {name!r}; choose one of: "
+                f"{', '.join(unique[i] for i in matches)}"
+            )
+        selected[unique[matches[0]]] = cameras[matches[0]]
+    return selected
+
+
+def write_masks(
+    scene: Scene,
+    selected: Bool[Tensor, " n"],
+    folder: Path,
+    *,
+    rest: bool = False,
+    settings: RasterSettings | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write one PNG per training image, of its size: 255 for pixels that show the selection, else 0.
+
+    Either all files are written or none. Objects in front of the selection occlude it. The masks fit images without
+    lens distortion, on which the scene was trained.
+
+    Args:
+        rest: invert the masks: 255 for pixels that show anything else, or nothing.
+        settings: rasterizer settings; None: those of gsplat 1.4.
+        overwrite: replace existing files.
+    Returns:
+        Paths of the files.
+    Raises:
+        FileExistsError: a file exists, and `overwrite` is False.
+        OSError: a file cannot be written.
+    """
+    files = mask_files(scene, folder)
+    with atomic_files(*files, overwrite=overwrite) as drafts:
+        for camera, draft in zip(scene.train.cameras, drafts):
+            mask = view_mask(scene, camera, selected, settings=settings) != rest
+            Image.fromarray((mask.to(torch.uint8) * 255).cpu().numpy()).save(draft, "PNG")
+    return files
+
+
+def mask_files(scene: Scene, folder: Path) -> list[Path]:
+    """Return the paths of the masks of a scene's training images."""
+    return [folder / f"{name}.png" for name in unique_file_names(list(scene.train.names))]
+
+
+def view_mask(
+    scene: Scene, camera: Camera, selected: Bool[Tensor, " n"], *, settings: RasterSettings | None = None
+) -> Bool[Tensor, "h w"]:
+    """Return the mask of pixels in which the selection makes up more than half of the opacity."""
+    values = selected.to(scene.gaussians.means)[:, None]
+    image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
+    return pixel_relevancy(image, alpha)[:, :, 0] > 0.5
+
+
+def unique_file_names(images: Sequence[str]) -> list[str]:
+    """Return a unique file name for each image: its stem, or its path in the dataset if several share the stem.
+
+    >>> unique_file_names(["a/0.png", "b/0.png", "b/1.png", "c/2.png", "c/2.jpg"])
+    ['a_0', 'b_0', '1', 'c_2.png', 'c_2.jpg']
+    """
+    names = [PurePosixPath(image).stem for image in images]
+    for longer in (_without_suffix, str):
+        counts = Counter(map(str.casefold, names))
+        duplicate = [counts[name.casefold()] > 1 for name in names]
+        names = [longer(image).replace("/", "_") if x else name for image, name, x in zip(images, names, duplicate)]
+    taken: set[str] = set()
+    return [_unique_name(name, taken) for name in names]
+
+
+def _unique_name(name: str, taken: set[str]) -> str:
+    """Return the first of the `numbered_paths` names that is not taken, and add it to the taken ones."""
+    unique = next(path.name for path in numbered_paths(Path(name)) if path.name.casefold() not in taken)
+    taken.add(unique.casefold())
+    return unique
+
+
+def _without_suffix(image: str) -> str:
+    return str(PurePosixPath(image).with_suffix(""))

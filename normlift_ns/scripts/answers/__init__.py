@@ -1,1 +1,0 @@
-"""Tables and files of ns-normlift-query and ns-normlift-export."""

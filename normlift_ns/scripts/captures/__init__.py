@@ -1,1 +1,0 @@
-"""Parts of ns-normlift-batch: capture list, shards, workers, processes and results."""

@@ -1,0 +1,504 @@
+"""Detection and loading of networks from model folders in the format of transformers.
+
+Only the sizes of the parts are read from config.json, so it cannot name code, kernels or other weights.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from normlift_ns.encoders.registry import check_server, summarize_error
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import file_digest
+from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3
+
+WEIGHTS_FILE = "model.safetensors"
+_MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
+"""Upper bounds of layers, labels and entries; of every other number in a config; and of the nesting depth."""
+_MIN_TORCH = (2, 6)
+_ALTERNATIVE = (
+    "the first SAM works with this version: --regions sam --sam-model sam_vit_h_4b8939.pth, a file published by Meta"
+)
+_SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
+_NOT_SIZES = ("auto_map", "quantization_config", "architectures", "dtype", "torch_dtype", "transformers_version")
+
+
+@dataclass(frozen=True)
+class SamFamily:
+    """Network that transformers implements."""
+
+    name: str
+    model: str
+    """Name of its model class in transformers."""
+    config: str
+    """Name of its config class in transformers."""
+    parts: tuple[str, ...]
+    """Names of the configs in its config."""
+    nested: tuple[tuple[str, str], ...] = ()
+    """Dotted paths of more deeply nested configs, with the model type that each must have."""
+    within: str | None = None
+    """Entry of config.json that holds its config; None: the whole file."""
+    since: str = "4.50"
+    """First version of transformers that has it."""
+
+
+_SAM2_NESTED = (("vision_config.backbone_config", "sam2_hiera_det_model"),)
+_SAM3_CONFIGS = ("vision_config", "text_config", "geometry_encoder_config", "detr_encoder_config",
+                 "detr_decoder_config", "mask_decoder_config")  # fmt: skip
+_SAM3_NESTED = (("vision_config.backbone_config", "sam3_vit_model"), ("text_config", "clip_text_model"))
+SAM = SamFamily("SAM", "SamModel", "SamConfig", _SAM_CONFIGS)
+_SAM2 = SamFamily("SAM 2", "Sam2Model", "Sam2Config", _SAM_CONFIGS, _SAM2_NESTED, since="4.56")
+POINT_PROMPT_FAMILIES: dict[str, SamFamily] = {
+    "sam": SAM,
+    "sam2": _SAM2,
+    "sam2_video": _SAM2,  # in the checkpoints of SAM 2 and 2.1, which contain the image model
+    "sam_hq": SamFamily("HQ-SAM", "SamHQModel", "SamHQConfig", _SAM_CONFIGS, since="4.52"),
+}
+"""Networks that turn points into masks, by the model type of config.json."""
+TEXT_PROMPT_FAMILIES: dict[str, SamFamily] = {
+    "sam3": SamFamily("SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, since="5.0"),
+    "sam3_video": SamFamily(
+        "SAM 3", "Sam3Model", "Sam3Config", _SAM3_CONFIGS, _SAM3_NESTED, "detector_config", since="5.0"
+    ),
+}
+"""Networks that turn text prompts into masks, by the model type of config.json."""
+
+
+def import_transformers() -> Any:
+    """Import transformers at the first use, because this takes seconds.
+
+    Raises:
+        ValueError: If transformers is not installed.
+    """
+    try:
+        return importlib.import_module("transformers")
+    except ImportError as error:
+        raise InputError(
+            f"--regions sam needs the package transformers ({summarize_error(error)}); install it with: "
+            'pip install "normlift-ns[sam]", or segment without SAM: --regions patches or superpixel'
+        ) from None
+
+
+def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
+    """Return the network that the config.json of a folder describes.
+
+    Raises:
+        ValueError: If it is not one of `kinds`, or if the installed torch or transformers cannot run it.
+        OSError: If config.json is missing.
+    """
+    model_type = _config(folder).get("model_type")
+    kind = kinds.get(model_type) if isinstance(model_type, str) else None
+    if kind is None:
+        other = (TEXT_PROMPT_FAMILIES if kinds is POINT_PROMPT_FAMILIES else POINT_PROMPT_FAMILIES).get(str(model_type))
+        hint = (
+            ""
+            if other is None
+            else f" ({other.name} takes {'text prompts' if kinds is POINT_PROMPT_FAMILIES else 'points'}: "
+        )
+        hint += "" if other is None else f"--regions {'sam3' if kinds is POINT_PROMPT_FAMILIES else 'sam'})"
+        expected = ", ".join(f"{name!r}" for name in kinds)
+        raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
+    _check_supported(kind)
+    return kind
+
+
+def _check_supported(kind: SamFamily) -> None:
+    """Raise InputError if the installed torch or transformers cannot run a network."""
+    if kind is SAM:
+        return
+    installed = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
+    if installed < _MIN_TORCH:
+        raise InputError(
+            f"{kind.name} needs torch {'.'.join(map(str, _MIN_TORCH))} or newer, found {torch.__version__}; "
+            f"{_ALTERNATIVE}"
+        )
+    transformers = import_transformers()
+    if not hasattr(transformers, kind.model):
+        raise InputError(
+            f"{kind.name} needs transformers {kind.since} or newer, found {transformers.__version__}; {_ALTERNATIVE}"
+        )
+
+
+def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
+    """Return the transformers model with the weights of a folder, in float32 on the CPU.
+
+    Raises:
+        ValueError: If weights are missing or do not fit, or if the config does not fit the network. Other damage can
+            raise other exceptions of the libraries that read the folder.
+    """
+    transformers = import_transformers()
+    if not (folder / WEIGHTS_FILE).is_file():
+        raise InputError(f"the folder has no {WEIGHTS_FILE}")
+    config = getattr(transformers, kind.config)(**_sizes(_config(folder), kind))
+    with _quiet(transformers):
+        model, report = getattr(transformers, kind.model).from_pretrained(
+            None,
+            config=config,
+            state_dict=load_file(folder / WEIGHTS_FILE),
+            dtype=torch.float32,
+            attn_implementation="sdpa",
+            output_loading_info=True,
+        )
+    missing = sorted(map(str, [*report["missing_keys"], *report["mismatched_keys"]]))
+    if len(missing) > 0:
+        raise InputError(f"{WEIGHTS_FILE} lacks {len(missing)} parameters, the first is {missing[0]}")
+    return model.eval().requires_grad_(False)
+
+
+@contextmanager
+def _quiet(transformers: Any) -> Iterator[None]:
+    """Silence the progress bar of transformers and its report on every parameter."""
+    logging = transformers.utils.logging
+    level, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bar:
+            logging.enable_progress_bar()
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    config = json.loads((folder / "config.json").read_text("utf8"))
+    if not isinstance(config, dict):
+        raise InputError(f"config.json holds {type(config).__name__}, expected an object")
+    return config
+
+
+def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
+    """Return the parts of a config without the entries that are not sizes."""
+    own = config if kind.within is None else config.get(kind.within)
+    parts = {name: own.get(name) for name in kind.parts} if isinstance(own, Mapping) else {}
+    for name, part in parts.items():
+        if not isinstance(part, Mapping):
+            raise InputError(f"{name} of config.json is {type(part).__name__}, expected an object")
+    check_config_sizes(parts)
+    sizes = _drop_other_entries(parts)
+    for path, expected in kind.nested:
+        part: Any = sizes
+        for name in path.split("."):
+            part = part.get(name) if isinstance(part, Mapping) else None
+        model_type = part.get("model_type", expected) if isinstance(part, Mapping) else None
+        if model_type != expected:
+            raise InputError(f"{path} of config.json has the model type {model_type!r:.60}, expected {expected!r}")
+    return sizes
+
+
+def _drop_other_entries(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        dropped = [name for name in value if str(name).startswith("_") or "attn_impl" in str(name)]
+        return {name: _drop_other_entries(x) for name, x in value.items() if name not in (*_NOT_SIZES, *dropped)}
+    return [_drop_other_entries(x) for x in value] if isinstance(value, list) else value
+
+
+def check_config_sizes(values: Any, name: str = "config.json", depth: int = 0) -> None:
+    """Raise InputError for implausible sizes, because transformers builds a network of any size from its config."""
+    if depth > _MAX_DEPTH or (isinstance(values, Mapping | list) and len(values) > _MAX_PARTS):
+        raise InputError(f"{name} is nested too deeply, or has more than {_MAX_PARTS} entries")
+    if isinstance(values, Mapping):
+        for key, value in values.items():
+            check_config_sizes(value, str(key), depth + 1)
+    elif isinstance(values, list):
+        for value in values:
+            check_config_sizes(value, name, depth + 1)
+    elif isinstance(values, int | float):
+        limit = _MAX_PARTS if name.startswith("num_") or name.endswith("depth") else _MAX_SIZE
+        if not -1 <= values <= limit:
+            raise InputError(f"{name} of config.json is {values!r:.40}, expected at most {limit:,}")
+
+
+# SAM checkpoints: a folder in the format of transformers, a file published by Meta, or a name on the hub.
+
+
+SAM_REMEDY = (
+    f"give --sam-model a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a file such "
+    "as sam_vit_h_4b8939.pth; or segment without SAM: --regions patches or --regions superpixel"
+)
+SAM3_REMEDY = (
+    f"give a name such as {DEFAULT_SAM3}, or a folder with config.json, model.safetensors and a tokenizer, to "
+    "--sam-model in a lift or to --segment-model in a query; or choose other --regions and omit --segment"
+)
+_REMEDIES = {"SAM": SAM_REMEDY, "SAM 3": SAM3_REMEDY}
+_FILES = (WEIGHTS_FILE, "pytorch_model.bin")
+_FIRST = "the first SAM, ViT-B, -L or -H"
+_AS_FOLDER = "; SAM 2 and HQ-SAM need a folder in the format of transformers"
+_OTHERS = {
+    "image_encoder.trunk.": "SAM 2",
+    "image_encoder.layers.": "MobileSAM",
+    "mask_decoder.hf_token": "HQ-SAM",
+    "mask_decoder.compress_vit_feat": "HQ-SAM",
+}
+"""Prefixes of parameter names in other networks."""
+_MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
+_SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
+_NAMES = {
+    r"^image_encoder\.": "vision_encoder.",
+    r"\.patch_embed\.proj\.": ".patch_embed.projection.",
+    r"\.blocks\.(\d+)\.norm(\d)\.": r".layers.\1.layer_norm\2.",
+    r"\.blocks\.": ".layers.",
+    r"\.neck\.0\.": ".neck.conv1.",
+    r"\.neck\.1\.": ".neck.layer_norm1.",
+    r"\.neck\.2\.": ".neck.conv2.",
+    r"\.neck\.3\.": ".neck.layer_norm2.",
+    r"\.pe_layer\.positional_encoding_gaussian_matrix$": ".shared_embedding.positional_embedding",
+    r"\.point_embeddings\.": ".point_embed.",
+    r"\.mask_downscaling\.0\.": ".mask_embed.conv1.",
+    r"\.mask_downscaling\.1\.": ".mask_embed.layer_norm1.",
+    r"\.mask_downscaling\.3\.": ".mask_embed.conv2.",
+    r"\.mask_downscaling\.4\.": ".mask_embed.layer_norm2.",
+    r"\.mask_downscaling\.6\.": ".mask_embed.conv3.",
+    r"\.norm_final_attn\.": ".layer_norm_final_attn.",
+    r"\.layers\.(\d+)\.norm(\d)\.": r".layers.\1.layer_norm\2.",
+    r"\.output_upscaling\.0\.": ".upscale_conv1.",
+    r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
+    r"\.output_upscaling\.3\.": ".upscale_conv2.",
+}
+"""Patterns of Meta's parameter names, with the names in transformers."""
+
+
+def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT_PROMPT_FAMILIES) -> None:
+    """Check a checkpoint by name, without loading or downloading anything.
+
+    Raises:
+        ValueError: If transformers is not installed, or the checkpoint is neither a path nor a name of the form
+            OWNER/NAME. Also if its folder is of another network, or the installed torch cannot run it.
+        FileNotFoundError: If the checkpoint looks like a path but does not exist.
+    """
+    import_transformers()
+    title, example = _title(kinds), DEFAULT_SAM if kinds is POINT_PROMPT_FAMILIES else DEFAULT_SAM3
+    remedy = _REMEDIES[title]
+    path = Path(checkpoint)
+    if os.path.isfile(path) or os.path.isdir(path):
+        folder = transformers_folder(path)
+        if folder is not None and not (folder / "config.json").is_file():
+            raise InputError(f"{title} checkpoint {path} is a folder without config.json; {remedy}")
+        if folder is not None:
+            with checkpoint_errors(path, title):
+                read_sam_family(folder, kinds)
+        return
+    if os.path.lexists(path):
+        raise InputError(f"{title} checkpoint {checkpoint} is neither a file nor a folder; {remedy}")
+    if path.is_absolute() or len(path.parts) > 2 or path.suffix in (".pth", ".pt", ".bin", ".safetensors"):
+        raise FileNotFoundError(f"{title} checkpoint {checkpoint} does not exist; check the path, or {remedy}")
+    if len(path.parts) != 2:
+        raise InputError(
+            f"{title} checkpoint {checkpoint!r} is neither a path nor a name on the hub such as {example}; {remedy}"
+        )
+
+
+def _title(kinds: Mapping[str, SamFamily]) -> str:
+    """Return the name of the networks in messages."""
+    return "SAM" if kinds is POINT_PROMPT_FAMILIES else "SAM 3"
+
+
+def find_local_sam(checkpoint: str) -> Path | None:
+    """Return the path of a checkpoint on this machine, including the cache of the hub; None if there is none."""
+    if os.path.exists(checkpoint):
+        return Path(checkpoint).resolve()
+    hub = importlib.import_module("huggingface_hub")
+    for file in _FILES:
+        config, weights = (hub.try_to_load_from_cache(checkpoint, name) for name in ("config.json", file))
+        if isinstance(config, str) and isinstance(weights, str):
+            return Path(weights).parent
+    return None
+
+
+def sam_identity(checkpoint: str) -> str:
+    """Return the digest of local files, or the name of a checkpoint on the hub."""
+    path = Path(checkpoint)
+    if not os.path.exists(path):
+        return checkpoint
+    return file_digest(*(file for file in (path, path / "config.json", *_weight_files(path)) if file.is_file()))
+
+
+def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
+    """Return the network of a checkpoint, and its transformers model with weights, in float32 on the CPU.
+
+    Raises:
+        FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
+        ValueError: If the checkpoint is damaged, its network does not take points, or the installed torch cannot run
+            it.
+    """
+    path = find_local_sam(checkpoint) or download_sam(checkpoint, POINT_PROMPT_FAMILIES)
+    folder = transformers_folder(path)
+    if folder is None:
+        return SAM, load_sam(str(path))
+    with checkpoint_errors(path):
+        kind = read_sam_family(folder, POINT_PROMPT_FAMILIES)
+        if kind is not SAM:
+            return kind, load_pretrained_sam(folder, kind)
+    return kind, load_sam(str(path))
+
+
+def transformers_folder(path: Path) -> Path | None:
+    """Return the folder of a checkpoint in the format of transformers; None for a file published by Meta."""
+    if path.is_dir():
+        return path
+    return path.parent if path.suffix == ".safetensors" and (path.parent / "config.json").is_file() else None
+
+
+@contextmanager
+def checkpoint_errors(path: Path, title: str = "SAM") -> Iterator[None]:
+    """Turn errors of other libraries into an InputError that names the checkpoint."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # the configs of transformers raise their own exception types for invalid values
+        reason = str(error) if isinstance(error, InputError) else summarize_error(error)
+        raise InputError(
+            f"{title} checkpoint {path} is damaged or not a checkpoint of {title} ({reason}); {_REMEDIES[title]}"
+        ) from None
+
+
+def load_sam(checkpoint: str) -> Any:
+    """Return the SamModel of transformers with the weights of a checkpoint of the first SAM, in float32 on the CPU.
+
+    Raises:
+        FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
+        ValueError: If the checkpoint is damaged or not of the first SAM.
+    """
+    path = find_local_sam(checkpoint) or download_sam(checkpoint, POINT_PROMPT_FAMILIES)
+    with checkpoint_errors(path):
+        config, state = _read_folder(path) if path.is_dir() else _read_file(path)
+        for name, other in (_SHARED, _SHARED[::-1]):  # the same tensor; a file may hold only one copy
+            if other in state:
+                state.setdefault(name, state[other])
+        with torch.device("meta"):
+            model = import_transformers().SamModel(config)
+        model.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
+    return model.eval().requires_grad_(False)
+
+
+def download_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[str] = ()) -> Path:
+    """Download a checkpoint from the hub: config.json first, the weights only if it names one of `kinds`.
+
+    Args:
+        checkpoint: Name on the hub.
+        kinds: Networks by the model type of config.json.
+        more: Patterns of further files.
+
+    Returns:
+        The folder of the checkpoint.
+
+    Raises:
+        FileNotFoundError: If the checkpoint cannot be downloaded.
+    """
+    hub = importlib.import_module("huggingface_hub")
+    try:
+        check_server(hub.constants.ENDPOINT)
+        folder = Path(hub.snapshot_download(checkpoint, allow_patterns=["config.json"]))
+        known = json.loads((folder / "config.json").read_text("utf8")).get("model_type") in kinds
+        patterns = ["config.json", WEIGHTS_FILE, *more] if known else ["config.json"]
+        return Path(hub.snapshot_download(checkpoint, allow_patterns=patterns))
+    except Exception as error:  # the download client raises unrelated exception types
+        title = _title(kinds)
+        raise FileNotFoundError(
+            f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded "
+            f"({summarize_error(error)}); go online once, or {_REMEDIES[title]}"
+        ) from None
+
+
+def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
+    if read_sam_family(folder, POINT_PROMPT_FAMILIES) is not SAM:
+        raise InputError(f"the folder does not hold {_FIRST}")
+    files = _weight_files(folder)
+    if len(files) == 0:
+        raise InputError(f"the folder has no {_FILES[0]}")
+    config = json.loads((folder / "config.json").read_text())
+    check_config_sizes(config)
+    return import_transformers().SamConfig.from_dict(config), _read_tensors(files[0])
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    """Return the weight file of a folder, or an empty list."""
+    return [folder / name for name in _FILES if (folder / name).is_file()][:1]
+
+
+def _read_file(path: Path) -> tuple[Any, dict[str, Tensor]]:
+    state = _read_tensors(path)
+    for name in [*state, *(state["model"] if isinstance(state.get("model"), Mapping) else [])]:
+        for part, kind in _OTHERS.items():
+            if str(name).startswith(part):
+                raise InputError(f"its parameter {name} is of {kind}, expected {_FIRST}{_AS_FOLDER}")
+    if "image_encoder.pos_embed" not in state:
+        if (path.parent / "config.json").is_file():
+            return _read_folder(path.parent)
+        raise InputError(f"it has no image_encoder.pos_embed, expected a file published by Meta for {_FIRST}")
+    return config_from_weights(state), {transformers_name(name): value for name, value in state.items()}
+
+
+def _read_tensors(path: Path) -> dict[str, Tensor]:
+    if path.suffix == ".safetensors":
+        return load_file(path)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def transformers_name(name: str) -> str:
+    """Return the name in transformers of a parameter in Meta's files.
+
+    >>> transformers_name("mask_decoder.iou_prediction_head.layers.2.weight")
+    'mask_decoder.iou_prediction_head.proj_out.weight'
+    """
+    for pattern, replacement in _NAMES.items():
+        name = re.sub(pattern, replacement, name)
+    mlp = re.match(r"(.*(?:hypernetworks_mlps\.\d+|prediction_head))\.layers\.(\d)\.(.*)", name)
+    return name if mlp is None else f"{mlp[1]}.{_MLP[mlp[2]]}.{mlp[3]}"
+
+
+def config_from_weights(state: Mapping[str, Tensor]) -> Any:
+    """Return the SamConfig of transformers for a file published by Meta, from the shapes of its parameters.
+
+    Values that shapes do not determine are the same in all of Meta's files: eight heads in the mask decoder, and its
+    epsilon.
+    """
+    shape = {name: tuple(value.shape) for name, value in state.items()}
+    _, grid, _, width = shape["image_encoder.pos_embed"]
+    patch = shape["image_encoder.patch_embed.proj.weight"][-1]
+    blocks = sum(name.endswith(".attn.rel_pos_h") for name in shape)
+    extent, head = zip(*(shape[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(blocks)))
+    global_blocks = [i for i in range(blocks) if extent[i] == 2 * grid - 1]
+    channels = shape["image_encoder.neck.0.weight"][0]
+    layer = "mask_decoder.transformer.layers.0"
+    transformers = import_transformers()
+    vision = transformers.SamVisionConfig(
+        hidden_size=width,
+        output_channels=channels,
+        num_hidden_layers=blocks,
+        num_attention_heads=width // head[0],
+        image_size=grid * patch,
+        patch_size=patch,
+        window_size=(min(extent) + 1) // 2,
+        global_attn_indexes=global_blocks,
+        num_pos_feats=channels // 2,
+        mlp_dim=shape["image_encoder.blocks.0.mlp.lin1.weight"][0],
+    )
+    prompt = transformers.SamPromptEncoderConfig(
+        hidden_size=channels,
+        image_size=grid * patch,
+        patch_size=patch,
+        mask_input_channels=shape["prompt_encoder.mask_downscaling.3.weight"][0],
+    )
+    decoder = transformers.SamMaskDecoderConfig(
+        hidden_size=channels,
+        mlp_dim=shape[f"{layer}.mlp.lin1.weight"][0],
+        num_hidden_layers=sum(name.endswith("self_attn.q_proj.weight") for name in shape),
+        attention_downsample_rate=channels // shape[f"{layer}.cross_attn_token_to_image.q_proj.weight"][0],
+        iou_head_hidden_dim=shape["mask_decoder.iou_prediction_head.layers.0.weight"][0],
+        layer_norm_eps=1e-5,
+    )
+    return transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder)

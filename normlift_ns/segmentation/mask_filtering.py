@@ -1,0 +1,311 @@
+"""Operations on binary masks: boxes, LangSplat's suppression, and label maps of overlapping masks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int32, Int64
+from torch import Tensor
+from torch.nn.functional import pad
+
+_CHUNK = {"cuda": 2**29, "cpu": 2**26}
+"""Elements of the largest temporary array."""
+_MIN_KEPT = 3
+"""Number of masks, best first, that are kept if no score is high enough."""
+
+
+@dataclass(frozen=True)
+class Suppression:
+    """Thresholds of LangSplat's mask suppression; the defaults are its settings."""
+
+    iou: float = 0.8
+    """Drop a mask if its IoU with a mask of higher score is above this."""
+    score: float = 0.7
+    """Drop a mask if its score is not above this. If this would drop all masks, the best three are kept."""
+    outer: float = 0.5
+    """A mask lies inside another one if it covers less than this share of the other one and meets `inner`."""
+    inner: float = 0.85
+    """Least share of a mask that must lie in the other one. Masks inside others are dropped, whatever their score."""
+
+
+class MaskMeasurements(NamedTuple):
+    """Areas and boxes of masks."""
+
+    inner: Int32[Tensor, " m"]
+    """Pixels with a logit above the offset."""
+    outer: Int32[Tensor, " m"]
+    """Pixels with a logit above minus the offset."""
+    boxes: Int64[Tensor, "m 4"]
+    """Boxes of the pixels with a positive logit, as `masks_to_boxes` returns them."""
+
+    @property
+    def stability(self) -> Float[Tensor, " m"]:
+        """IoU of each mask at the two thresholds; NaN if it is empty at both."""
+        return self.inner / self.outer
+
+
+def measure_logits(logits: Float[Tensor, "m h w"], offset: float) -> MaskMeasurements:
+    """Return the areas of masks at two thresholds of the logits, 0 plus and minus the offset, and their boxes."""
+    inner, outer = ((logits > bound).flatten(1).view(torch.uint8) for bound in (offset, -offset))
+    return MaskMeasurements(
+        inner.sum(dim=1, dtype=torch.int32), outer.sum(dim=1, dtype=torch.int32), masks_to_boxes(logits > 0)
+    )
+
+
+def mask_nms(
+    masks: Bool[Tensor, "m h w"], scores: Float[Tensor, " m"], rules: Suppression | None = None
+) -> Bool[Tensor, " m"]:
+    """Select the masks to keep by LangSplat's rules.
+
+    A mask is kept if its score is high enough, and it neither repeats a better mask nor lies inside a larger one. Every
+    mask is compared with all others, including dropped ones. Intersections are counted exactly and their ratios
+    compared in float64. Among equal scores, the earlier mask is the better one.
+
+    LangSplat also requires 1 - (inter/area_i)(inter/area_j) > 0.5 of a mask inside another one. Every pair that passes
+    the tests of `outer` and `inner` fulfills this.
+
+    Args:
+        scores: Stability times predicted IoU.
+        rules: Thresholds; LangSplat's by default.
+    """
+    rules = Suppression() if rules is None else rules
+    if len(masks) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=masks.device)
+    order = torch.sort(scores, descending=True, stable=True).indices
+    both = _intersections(masks)[order][:, order]
+    area = both.diagonal()
+    iou = both / (area[:, None] + area - both)
+    repeats = (iou.triu(diagonal=1) > rules.iou).any(dim=0)
+    inside = ((both / area[:, None] < rules.outer) & (both / area >= rules.inner)).any(dim=0)
+    confident = scores[order] > rules.score
+    if not bool(confident.any()):
+        confident[:_MIN_KEPT] = True
+    keep = torch.empty_like(confident)
+    keep[order] = confident & ~repeats & ~inside
+    return keep
+
+
+def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
+    """Stack masks as label maps: the first map has the last mask of each pixel, the next map the one before it.
+
+    The remaining entries are -1. The depth of the stack is the largest number of masks that share a pixel, at least 1.
+    """
+    flat = masks.flatten(1)
+    depth = max(1, int(flat.sum(dim=0).max()))
+    labels = torch.full((depth, flat.shape[1]), -1, dtype=torch.int32, device=masks.device)
+    for columns in _column_chunks(flat):
+        part = flat[:, columns].flip(0)
+        pixel, flipped = part.T.nonzero(as_tuple=True)  # by pixel, with the last mask of each pixel first
+        count = part.sum(dim=0)
+        layer = torch.arange(len(pixel), device=masks.device) - (count.cumsum(0) - count)[pixel]
+        labels[layer, columns.start + pixel] = (len(masks) - 1 - flipped).int()
+    return labels.reshape(depth, *masks.shape[1:])
+
+
+def masks_to_boxes(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
+    """Return the box (x0, y0, x1, y1) of each mask, with x1 and y1 inclusive; zeros for an empty mask."""
+    ends = []
+    for line in (masks.any(dim=1), masks.any(dim=2)):
+        index = torch.arange(line.shape[1], device=masks.device)
+        ends.append((torch.where(line, index, line.shape[1]).amin(dim=1), torch.where(line, index, -1).amax(dim=1)))
+    (x0, x1), (y0, y1) = ends
+    return torch.stack([x0, y0, x1, y1], dim=1) * (x1 >= 0)[:, None]
+
+
+def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
+    """Return the number of pixels that each pair of masks shares; float32 sums of ones are exact below 2^24 pixels."""
+    flat = masks.flatten(1)
+    both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
+    for columns in _column_chunks(flat):
+        both += _row_products(flat[:, columns])
+    return both
+
+
+def _row_products(part: Bool[Tensor, "m p"]) -> Tensor:
+    """Return the products of all pairs of rows.
+
+    On a GPU, tensor cores multiply int8 and add in int32 if torch supports this.
+    """
+    if part.is_cuda and hasattr(torch, "_int_mm"):
+        count, pixels = part.shape
+        padded = pad(part.view(torch.int8), (0, -pixels % 16, 0, max(32 - count, -count % 16)))  # tensor core sizes
+        return torch._int_mm(padded, padded.T)[:count, :count]  # pyright: ignore[reportPrivateImportUsage]
+    exact = part.float()
+    return exact @ exact.T
+
+
+def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
+    step = min(2**24, max(1, _CHUNK[flat.device.type] // max(1, len(flat))))
+    return (slice(start, start + step) for start in range(0, flat.shape[1], step))
+
+
+# Removal of small holes and pieces, for all masks at once and on their device.
+#
+# A mask is represented by its edges: the positions, row by row, where it changes, including at the borders of the
+# image. Each row has an even number of edges. The first two enclose a run of pixels, the third and fourth the next
+# run. Pixels are read once, to find the edges, and written only where they change. Components are those of a graph of
+# runs.
+
+
+_REGION_CHUNK = {"cuda": 2**29, "cpu": 2**25}
+"""Pixels per chunk."""
+
+
+def remove_small_regions(masks: Bool[Tensor, "m h w"], least: int) -> tuple[Bool[Tensor, "m h w"], Bool[Tensor, " m"]]:
+    """Fill holes, then drop pieces, of fewer than `least` pixels, 8-connected; the largest piece is always kept.
+
+    An area between a mask and the border of the image is also a hole.
+
+    Returns:
+        The cleaned masks, and a flag for each mask that had such holes or pieces.
+    """
+    cleaned = masks.clone(memory_format=torch.contiguous_format)
+    changed = torch.zeros(len(masks), dtype=torch.bool, device=masks.device)
+    step = max(1, _REGION_CHUNK[masks.device.type] // masks[0].numel()) if len(masks) > 0 else 1
+    for part, flags in zip(cleaned.split(step), changed.split(step)):
+        grid = _Grid(*part.shape)
+        edges = grid.edges(part)
+        holes = _runs(_symmetric_difference(edges, *grid.row_bounds(edges, least)), grid, least)
+        holes = holes.at(holes.area < least)
+        pieces = _runs(_symmetric_difference(edges, holes.start, holes.stop), grid, least)
+        small = pieces.area < least
+        for runs in (holes, pieces.at(small)):
+            flags[runs.start // grid.size] = True
+        grid.paint(part, holes, True)
+        grid.paint(part, pieces.at(small & ~_in_largest(pieces, grid)), False)
+    return cleaned, changed
+
+
+class _Runs(NamedTuple):
+    """Runs of neighboring pixels in a row, in ascending order."""
+
+    start: Int64[Tensor, " n"]
+    stop: Int64[Tensor, " n"]
+    """First position after the run."""
+    piece: Int64[Tensor, " n"]
+    """Number of the component; large components may share a number."""
+    area: Int64[Tensor, " n"]
+    """Pixels of the component if it is small, else a number that is not small."""
+
+    def at(self, index: Tensor) -> _Runs:
+        return _Runs(*(value[index] for value in self))
+
+
+class _Grid(NamedTuple):
+    """Numbering of pixel positions in all masks.
+
+    Rows are wider than the image, so no row begins where another one ends. An empty row follows each mask.
+    """
+
+    masks: int
+    height: int
+    width: int
+
+    @property
+    def row(self) -> int:
+        """Positions per row, a multiple of eight."""
+        return 8 * (self.width // 8 + 1)
+
+    @property
+    def size(self) -> int:
+        """Positions per mask."""
+        return (self.height + 1) * self.row
+
+    def edges(self, masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, " e"]:
+        """Return the edges of masks."""
+        changes = masks.new_zeros(self.masks, self.height + 1, self.row)
+        inside = changes[:, :-1]
+        inside[:, :, 0], inside[:, :, self.width] = masks[:, :, 0], masks[:, :, -1]
+        torch.ne(masks[:, :, 1:], masks[:, :, :-1], out=inside[:, :, 1 : self.width])
+        word = changes.view(torch.int64).flatten().nonzero()[:, 0]  # eight positions at a time
+        index, offset = changes.view(-1, 8)[word].nonzero(as_tuple=True)
+        return 8 * word[index] + offset
+
+    def row_bounds(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
+        """Return the first position of rows, and the position after their last pixel.
+
+        A whole row of at least `least` pixels is large by itself. In this case, only rows with edges and their
+        neighbors above and below are returned, else all rows.
+        """
+        near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
+        near.view(-1)[edges // self.row] = True
+        near[:, :-1] |= near[:, 1:].clone()
+        near[:, 1:] |= near[:, :-1].clone()
+        near[:, self.height] = False
+        first = near.view(-1).nonzero()[:, 0] * self.row
+        return first, first + self.width
+
+    def paint(self, masks: Bool[Tensor, "m h w"], runs: _Runs, value: bool) -> None:
+        """Set the pixels of runs to a value."""
+        line, column = runs.start // self.row, runs.start % self.row
+        first = (line - line // (self.height + 1)) * self.width + column
+        masks.view(-1)[_spans(first, runs.stop - runs.start)[1]] = value
+
+
+def _symmetric_difference(edges: Int64[Tensor, " e"], *others: Int64[Tensor, " n"]) -> Int64[Tensor, " f"]:
+    """Return the edges of the symmetric difference of two masks."""
+    positions, counts = torch.cat([edges, *others]).sort().values.unique_consecutive(return_counts=True)
+    return positions[counts == 1]
+
+
+def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
+    """Return the runs between edges; those of at least `least` pixels are a single node of the graph."""
+    start, stop = edges[0::2].contiguous(), edges[1::2].contiguous()
+    first = torch.searchsorted(stop, start - grid.row)  # in the row above, including diagonal neighbors
+    last = torch.searchsorted(start, stop - grid.row, right=True)
+    lower, upper = _spans(first, last - first)
+    short = stop - start < least
+    relevant = short[lower] | short[upper]
+    node = short.cumsum(0) * short
+    pairs = torch.stack([node[lower[relevant]], node[upper[relevant]]])
+    nodes = 1 + int(short.sum())
+    piece = (_components_by_torch if edges.is_cuda else _components_by_scipy)(nodes, pairs)[node]
+    area = stop.new_zeros(nodes).index_add(0, piece, stop - start)
+    return _Runs(start, stop, piece, area[piece])
+
+
+def _components_by_scipy(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
+    """Return the component of every node of a graph; components are numbered in the order of their first nodes."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 (not needed on a GPU)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    ones = np.ones(pairs.shape[1], dtype=bool)
+    graph = coo_array((ones, tuple(pairs.numpy())), shape=(nodes, nodes))
+    return torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+
+
+def _components_by_torch(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tensor, " nodes"]:
+    """Return the component of every node on any device; components are numbered by their first node.
+
+    Every node points to itself or to an earlier node, at first to itself. In each round, an edge redirects its two
+    nodes, and the nodes that they point to, to the lesser of their grandparents. Rounds end when no pointer changes.
+    """
+    one, other = pairs
+    parent = torch.arange(nodes, device=pairs.device)
+    while True:
+        grandparent = parent[parent]
+        least = torch.minimum(grandparent[one], grandparent[other])
+        updated = grandparent.clone()
+        for index in (parent[one], parent[other], one, other):
+            updated.scatter_reduce_(0, index, least, "amin")
+        if torch.equal(updated, parent):
+            return parent
+        parent = updated
+
+
+def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
+    """Return a mask of the runs in the largest piece of their mask."""
+    mask, none = runs.start // grid.size, len(runs.piece)
+    area = mask.new_zeros(grid.masks).scatter_reduce(0, mask, runs.area, "amax")
+    piece = torch.where(runs.area == area[mask], runs.piece, none)
+    return runs.piece == mask.new_full((grid.masks,), none).scatter_reduce(0, mask, piece, "amin")[mask]
+
+
+def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
+    """Return (owner, number) of `length[i]` consecutive numbers from `first[i]` on, for each owner i."""
+    owner = torch.repeat_interleave(length)
+    return owner, torch.arange(len(owner), device=first.device) + (first - length.cumsum(0) + length)[owner]

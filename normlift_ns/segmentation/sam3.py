@@ -1,0 +1,207 @@
+"""SAM 3: text prompts to masks, with the unchanged model, processor and post-processing of transformers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int32, UInt8
+from torch import Tensor
+
+from normlift_ns.encoders.batching import AdaptiveBatches
+from normlift_ns.errors import InputError
+from normlift_ns.io.atomic import file_digest
+from normlift_ns.options import DEFAULT_SAM3, SamPrecision, check_prompt_list, short_repr
+from normlift_ns.segmentation.checkpoint import (
+    TEXT_PROMPT_FAMILIES,
+    WEIGHTS_FILE,
+    check_sam_checkpoint,
+    checkpoint_errors,
+    download_sam,
+    find_local_sam,
+    import_transformers,
+    load_pretrained_sam,
+    read_sam_family,
+    transformers_folder,
+)
+from normlift_ns.segmentation.mask_filtering import stack_masks
+from normlift_ns.segmentation.sam import resolve_precision
+
+SCORE_THRESHOLD = 0.5
+"""Keep masks with a score above this, the threshold of the model card.
+
+The score is that of the instance times the presence score of the prompt.
+"""
+_MASK_THRESHOLD = 0.5
+"""Probability above which a pixel is in a mask."""
+_TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
+_MAX_TOKENS = 32
+_TOGETHER = 16
+"""Masks per batch at the size of the image."""
+
+
+class TextMasks(NamedTuple):
+    """Instances of one text prompt in one image."""
+
+    masks: Bool[Tensor, "m h w"]
+    scores: Float[Tensor, " m"]
+    """Scores in 0..1."""
+
+    @property
+    def union(self) -> Bool[Tensor, "h w"]:
+        """Union of all masks."""
+        return self.masks.any(dim=0)
+
+
+class Sam3Network:
+    """SAM 3 on one device and in one precision; half precision uses autocast."""
+
+    def __init__(self, model: Any, tokenizer: Any, device: str, precision: SamPrecision = "auto") -> None:
+        self._model, self._device = model.to(device), torch.device(device)
+        self._dtype: torch.dtype = getattr(torch, resolve_precision(precision, device))
+        side = model.config.vision_config.image_size
+        image_processor = import_transformers().Sam3ImageProcessor(size={"height": side, "width": side})
+        self._processor = import_transformers().Sam3Processor(image_processor, tokenizer)
+        self._batches = AdaptiveBatches(_TOGETHER)
+        self._text_features: dict[str, tuple[Any, Tensor]] = {}
+
+    @classmethod
+    def load(cls, checkpoint: str, device: str, precision: SamPrecision = "auto") -> Sam3Network:
+        """Load the network of a checkpoint, which is a folder or a name on the Hugging Face hub.
+
+        Raises:
+            FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
+            ValueError: If the checkpoint is damaged or of another network, or if the installed torch or transformers
+                cannot run it.
+        """
+        path = find_local_sam(checkpoint) or download_sam(checkpoint, TEXT_PROMPT_FAMILIES, _TOKENIZER_FILES)
+        with checkpoint_errors(path, "SAM 3"):
+            folder = transformers_folder(path)
+            if folder is None:
+                raise InputError("found a file, expected a folder with config.json, model.safetensors and a tokenizer")
+            model = load_pretrained_sam(folder, read_sam_family(folder, TEXT_PROMPT_FAMILIES))
+            if not any((folder / name).is_file() for name in ("tokenizer.json", "vocab.json")):
+                raise InputError("the folder has no tokenizer.json and no vocab.json with merges.txt")
+            tokenizer = import_transformers().CLIPTokenizer.from_pretrained(folder, local_files_only=True)
+        return cls(model, tokenizer, device, precision)
+
+    @torch.no_grad()
+    def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> list[TextMasks]:
+        """Return the instances of every text prompt, on the device.
+
+        Raises:
+            ValueError: If a prompt has more than 32 tokens.
+        """
+        channels_first = image.to(self._device).permute(2, 0, 1)
+        pixels = self._processor(images=channels_first, return_tensors="pt")["pixel_values"]
+        with self._autocast():
+            vision = self._model.get_vision_features(pixels.to(self._device))
+        return [self._instances(vision, text, (image.shape[0], image.shape[1])) for text in texts]
+
+    def _instances(self, vision: Any, text: str, size: tuple[int, int]) -> TextMasks:
+        with self._autocast():
+            features, mask = self._encode_text(text)
+            output = self._model(vision_embeds=vision, text_embeds=features, attention_mask=mask)
+        logits, presence = output.pred_logits[0].float(), output.presence_logits[0].float()
+        rows = (logits.sigmoid() * presence.sigmoid() > SCORE_THRESHOLD).nonzero()[:, 0]
+
+        def post_process(index: Tensor) -> tuple[Tensor, Tensor]:
+            part = SimpleNamespace(
+                pred_logits=logits[None, index],
+                presence_logits=presence[None],
+                pred_boxes=output.pred_boxes[:, index].float(),
+                pred_masks=output.pred_masks[:, index].float(),
+            )
+            (result,) = self._processor.image_processor.post_process_instance_segmentation(
+                part, threshold=SCORE_THRESHOLD, mask_threshold=_MASK_THRESHOLD, target_sizes=[size]
+            )
+            return result["masks"].bool(), result["scores"]
+
+        parts = [(logits.new_zeros(0, *size).bool(), logits.new_zeros(0)), *self._batches(post_process, rows)]
+        return TextMasks(*map(torch.cat, zip(*parts)))
+
+    def _encode_text(self, text: str) -> tuple[Any, Tensor]:
+        if text not in self._text_features:
+            tokens = self._processor(text=text, return_tensors="pt").to(self._device)
+            count = tokens["input_ids"].shape[1]
+            if count > _MAX_TOKENS:
+                raise InputError(
+                    f"SAM 3 reads at most {_MAX_TOKENS} tokens of a prompt, but {short_repr(text)} has {count}"
+                )
+            self._text_features[text] = self._model.get_text_features(**tokens), tokens["attention_mask"]
+        return self._text_features[text]
+
+    def _autocast(self) -> Any:
+        return torch.autocast(self._device.type, self._dtype, enabled=self._dtype != torch.float32)
+
+
+def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto") -> dict[str, Any]:
+    """Return everything except the prompt that changes the masks of SAM 3; files are identified by their content."""
+    path = Path(checkpoint)
+    files = (path / name for name in ("config.json", WEIGHTS_FILE, *_TOKENIZER_FILES))
+    content = file_digest(*(file for file in files if file.is_file())) if path.is_dir() else checkpoint
+    resolved = resolve_precision(precision, device)
+    return {"kind": "sam3", "checkpoint": content, "precision": resolved, "score": SCORE_THRESHOLD}
+
+
+@dataclass(frozen=True)
+class Sam3Masks:
+    """Regions that SAM 3 finds for text prompts; every instance is a region. The weights are loaded at the first use.
+
+    If instances overlap, the one with the higher score counts. Pixels without an instance are unlabeled.
+
+    Raises:
+        ValueError: If no prompt is given, a prompt is empty or given twice, transformers is not installed, or the
+            checkpoint is of another network.
+        FileNotFoundError: If the checkpoint is a path that does not exist.
+    """
+
+    texts: tuple[str, ...]
+    checkpoint: str = DEFAULT_SAM3
+    """Folder with weights, or a name on the Hugging Face hub."""
+    device: str = "cpu"
+    precision: SamPrecision = "auto"
+    """Precision of the network. auto: float16 on a GPU, float32 elsewhere."""
+
+    def __post_init__(self) -> None:
+        if len(self.texts) == 0:
+            raise InputError('regions "sam3" need text prompts: give them with --queries, such as --queries mug plate')
+        check_prompt_list("queries", self.texts)
+        check_sam_checkpoint(self.checkpoint, TEXT_PROMPT_FAMILIES)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Result of `sam3_identity` plus the prompts."""
+        return {**self._network_identity, "texts": list(self.texts)}
+
+    @property
+    def at_once(self) -> int:
+        return 1
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        return ()
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        return ()
+
+    def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
+        """Return label maps as in `Regions`; raises like `Sam3Network.load` and `Sam3Network.find`."""
+        masks, scores = (torch.cat(parts) for parts in zip(*self.network.find(image, self.texts)))
+        rows = masks.flatten(1).any(dim=1).nonzero()[:, 0]
+        ascending = rows[torch.sort(scores[rows], stable=True).indices]
+        return stack_masks(masks[ascending])[None]
+
+    @cached_property
+    def _network_identity(self) -> dict[str, Any]:
+        return sam3_identity(self.checkpoint, self.device, self.precision)
+
+    @cached_property
+    def network(self) -> Sam3Network:
+        """Network with its weights, loaded at the first use."""
+        return Sam3Network.load(self.checkpoint, self.device, self.precision)

@@ -1,0 +1,208 @@
+"""Objects of a selection: a row for each, with what a panel shows and what its buttons need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from normlift_ns.analysis.objects import connected_components
+from normlift_ns.core.gaussians import GaussianScene
+from normlift_ns.options import OBJECT_MIN_GAUSSIANS
+from normlift_ns.rasterization.rasterize import ray_weights
+from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
+from normlift_ns.session.state import WEAK_RELIABILITY, State
+
+_STRONG = 0.8
+"""R from which on evidence is strong."""
+_BY_HAND = "selected by hand"
+_BY_HAND_COLOR = (1.0, 0.75, 0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRow:
+    """One object: a connected component of the Gaussians that one prompt selects."""
+
+    text: str
+    """The prompt."""
+    number: int
+    """1 for the largest object of its prompt."""
+    colour: RGB
+    """Color of the prompt, for the swatch."""
+    mask: Bool[Tensor, " n"]
+    """Gaussians of the object, for the buttons only, hide and export."""
+    size: int
+    """Number of Gaussians."""
+    reliability: float
+    """Mean R, weighted by the total evidence of each Gaussian."""
+    views: float
+    """Mean N_eff, weighted in the same way."""
+    centre: tuple[float, float, float]
+    """Point that the camera looks at, for the button go to."""
+    extent: float
+    """Diagonal of the box around the central 90 % of the Gaussian centers, for the button go to."""
+
+    @property
+    def name(self) -> str:
+        """The prompt and the number. `io.atomic.safe_file_name` makes a file name of it."""
+        return f"{self.text} {self.number}"
+
+    @property
+    def evidence(self) -> str:
+        """Strength of the evidence in words, with R and the number of views."""
+        grade = "strong" if self.reliability >= _STRONG else "fair" if self.reliability >= WEAK_RELIABILITY else "weak"
+        return f"{grade} evidence (R {self.reliability:.2f}, {self.views:.1f} views)"
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectList:
+    """The objects of a selection."""
+
+    objects: tuple[ObjectRow, ...]
+    """Listed objects, by prompt, the largest first."""
+    left_out: int
+    """Number of objects that are large enough but not listed, because there are too many."""
+    in_smaller_parts: int
+    """Number of Gaussians in components too small to be objects."""
+
+
+def list_objects(state: State, *, most: int = 12, min_size: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
+    """Return the objects that are selected and drawn, of each prompt that selects or of the selection by hand.
+
+    Args:
+        most: largest number of objects listed; each prompt gets its largest object before any gets a second.
+        min_size: fewest Gaussians of an object; those in smaller components are only counted.
+    """
+    selected, answer = state.selection & state.drawn, state.answer
+    if answer is None or not state.from_answer:
+        groups = [(_BY_HAND, _BY_HAND_COLOR, selected)]
+    else:
+        prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
+        colors = prompt_rgb_tuples(answer.texts)
+        groups = [(answer.texts[q], colors[q], selected & answer.selected[:, q]) for q in prompts]
+    rows, small = [], 0
+    for group, (text, color, mask) in enumerate(groups):
+        labels = connected_components(state.space.means, mask)
+        sizes = torch.bincount(labels[labels >= 0].long()).tolist()
+        count = sum(size >= min_size for size in sizes)
+        small += sum(sizes[count:])
+        rows += [(number, group, text, color, labels, size) for number, size in enumerate(sizes[:count])]
+    listed = sorted(sorted(rows, key=lambda row: row[:2])[:most], key=lambda row: (row[1], row[0]))
+    objects = [_object(state, text, n, color, labels == n, size) for n, _, text, color, labels, size in listed]
+    return ObjectList(tuple(objects), len(rows) - len(listed), small)
+
+
+def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size: int) -> ObjectRow:
+    scalars = state.space.field.scalars
+    weight = scalars.weight[mask].double() + 1e-12
+    weight = weight / weight.sum()
+    means = state.space.means[mask].double()
+    center = (weight[:, None] * means).sum(dim=0).tolist()
+    low, high = np.quantile(means.cpu().numpy(), (0.05, 0.95), axis=0)
+    reliability, views = (float((weight * x[mask].double()).sum()) for x in (scalars.reliability, scalars.n_eff))
+    extent = float(np.linalg.norm(high - low))
+    return ObjectRow(text, number + 1, color, mask, size, reliability, views, tuple(center), extent)
+
+
+# Camera positions to look at an object from.
+
+
+Position = tuple[float, float, float]
+"""x, y, z in scene units."""
+_MAX_OCCLUSION = 0.25
+"""Opacity in front of the object up to which the view counts as clear."""
+_AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
+"""Degrees around the vertical and above the current height."""
+
+
+@dataclass(frozen=True)
+class LookAtTarget:
+    """Point to look at that is not an object."""
+
+    centre: Position
+    extent: float
+    """Size of the region around the point that is to be visible."""
+
+
+def unoccluded_viewpoint(
+    target: ObjectRow | LookAtTarget,
+    scene: GaussianScene,
+    drawn: Bool[Tensor, " n"] | None,
+    camera_position: Sequence[float] | np.ndarray,
+    up: Sequence[float] | np.ndarray,
+    field_of_view: float = 0.9,
+) -> Position:
+    """Return the first camera position with a clear view of an object, or the one with the least occlusion.
+
+    Candidates start from the current side of the camera: turned around the vertical, first at its height, then from
+    above.
+
+    Args:
+        target: object or point to look at.
+        scene: Gaussians that may occlude it.
+        drawn: mask of the Gaussians that are drawn; None: all.
+        camera_position: current position of the camera.
+        up: direction of the vertical.
+        field_of_view: of the camera, in radians.
+    """
+    first = viewpoint(target, camera_position, field_of_view)
+    center = torch.tensor(target.centre, dtype=torch.float64)
+    distance = float(np.linalg.norm(np.asarray(first) - np.asarray(target.centre)))
+    means = scene.means.detach().double().cpu()
+    near = (means - center).norm(dim=1) - 3 * scene.scales.detach().double().cpu().amax(dim=1) < distance
+    near = near if drawn is None else near & drawn.cpu()
+    parts = (x.detach().cpu()[near] for x in (scene.means, scene.quats, scene.scales, scene.opacities))
+    occluders, best, least = GaussianScene(*parts), first, np.inf
+    for position in _candidates(np.asarray(first), np.asarray(target.centre), np.asarray(up, float)):
+        occlusion = _occlusion(occluders, torch.from_numpy(position), center, target.extent / 2)
+        if occlusion < least:
+            best, least = (float(position[0]), float(position[1]), float(position[2])), occlusion
+        if least <= _MAX_OCCLUSION:
+            break
+    return best
+
+
+def viewpoint(
+    target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
+) -> Position:
+    """Return the camera position on the current side of an object from which it fills half of the image.
+
+    Args:
+        target: object or point to look at.
+        camera_position: current position of the camera.
+        field_of_view: of the camera, in radians.
+    """
+    center = np.asarray(target.centre)
+    offset = np.asarray(camera_position, float) - center
+    length = float(np.linalg.norm(offset))
+    offset = offset / length if length > 0 else np.array([0.0, -1.0, 0.0])
+    distance = max(target.extent, 1e-6) / np.tan(field_of_view / 2)
+    position = center + offset * distance
+    return float(position[0]), float(position[1]), float(position[2])
+
+
+def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield positions at the same distance around a center, the given one first."""
+    offset = position - center
+    distance, up = np.linalg.norm(offset), up / max(float(np.linalg.norm(up)), 1e-12)
+    along = (offset @ up) * up
+    level, across = offset - along, np.cross(up, offset)
+    for elevation in _ELEVATIONS:
+        for azimuth in _AZIMUTHS:
+            turned = np.cos(np.radians(azimuth)) * level + np.sin(np.radians(azimuth)) * across + along
+            turned = turned + np.tan(np.radians(elevation)) * distance * up
+            yield center + turned * (distance / max(float(np.linalg.norm(turned)), 1e-12))
+
+
+def _occlusion(
+    scene: GaussianScene, position: Float[Tensor, " 3"], center: Float[Tensor, " 3"], margin: float
+) -> float:
+    """Return the opacity between a position and a center, without the last `margin` in front of the center."""
+    direction = center - position
+    length = direction.norm().clamp(min=1e-12)
+    before = (scene.means.double() - position) @ (direction / length) < length - margin
+    return float(ray_weights(scene, position, direction)[before].sum())

@@ -1,0 +1,204 @@
+"""Selection in space: the field, the centers of its Gaussians, their neighbor graph, and boxes to cut with."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from normlift_ns.analysis.objects import connected_components
+from normlift_ns.core.field import SemanticField
+from normlift_ns.core.neighbors import nearest_neighbors
+from normlift_ns.options import OBJECT_MAX_GAP
+from normlift_ns.query.engine import Answer, apply_threshold, resolve_threshold, run_query
+from normlift_ns.query.question import Query
+from normlift_ns.session.prompts import CLICK_THRESHOLD
+
+_NEIGHBORS = 8
+_CACHED_ANSWERS = 4
+_MAX_SAMPLES = 4096
+"""Largest number of directions that are averaged."""
+_FRACTIONS = 11
+"""One more than the number of shrinking steps, so that the last step leaves Gaussians over."""
+_COSINE_STEP = 0.05
+"""Decrease of the minimum cosine per step of growth."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelectionContext:
+    """A field and the centers of its Gaussians. Users can share it: its caches do not change any answer."""
+
+    field: SemanticField
+    means: Float[Tensor, "n 3"]
+    _answers: OrderedDict[Any, Answer] = dataclasses.field(default_factory=OrderedDict, repr=False)
+    _lock: Lock = dataclasses.field(default_factory=Lock, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def none(self) -> Bool[Tensor, " n"]:
+        """Return an empty mask."""
+        return torch.zeros(len(self), dtype=torch.bool, device=self.means.device)
+
+    def answer(self, question: Query) -> Answer:
+        """Answer a query as `asking.answer` does; the relevancies of the last four queries are cached.
+
+        Raises:
+            ValueError: the vectors differ in length from the field's, or the rule lacks its negatives.
+        """
+        negative = None if question.negative_vectors is None else question.negative_vectors.tobytes()
+        key = (question.texts, question.vectors.tobytes(), negative, question.rule, question.refined)
+        with self._lock:
+            result = self._answers.pop(key, None)
+        result = run_query(self.field, self.means, question) if result is None else result
+        with self._lock:
+            self._answers[key] = result
+            while len(self._answers) > _CACHED_ANSWERS:
+                self._answers.popitem(last=False)
+        question = resolve_threshold(question, result.relevancy, result.valid)
+        return apply_threshold(result, question.threshold, question.min_reliability)
+
+    def alike(
+        self, vector: Float[Tensor, " d"], least: float = CLICK_THRESHOLD, *, refined: bool = True
+    ) -> Bool[Tensor, " n"]:
+        """Return the mask of Gaussians whose cosine to a direction is at least `least`."""
+        cosine = self.field.query(vector[None], refined=refined)[:, 0]
+        return (cosine >= least) & self.field.valid(refined=refined)
+
+    def object_at(self, gaussian: int, selected: Bool[Tensor, " n"], *, refined: bool = True) -> Bool[Tensor, " n"]:
+        """Return the mask of the connected object around a Gaussian.
+
+        The object is a component of the selection if the Gaussian is selected, else of all Gaussians similar to it.
+
+        Args:
+            gaussian: index of the Gaussian.
+            selected: mask of the selection.
+        """
+        if not bool(selected[gaussian]):
+            (direction,) = self.field.directions(torch.tensor([gaussian], device=self.means.device), refined=refined)
+            selected = self.alike(direction, refined=refined)
+        labels = connected_components(self.means, selected)
+        mask = labels == labels[gaussian] if int(labels[gaussian]) >= 0 else self.none()
+        mask[gaussian] = True
+        return mask
+
+    def resized(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
+        """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
+
+        Growing adds Gaussians that are connected to the selection and similar to its mean direction. Their cosine is at
+        least 0.95 at the first step, and 0.05 less at each further step. Shrinking keeps the middle of each connected
+        component: Gaussians within a fraction of the largest graph distance from the middle. The fraction is 10/11 at
+        the first step, and 1/11 less at each further step. The results are nested: more steps of growth never remove
+        a Gaussian, and more steps of shrinking never add one.
+        """
+        if steps == 0 or not bool(selected.any()):
+            return selected
+        return self._grown(selected, steps, refined) if steps > 0 else self._shrunk(selected, -steps)
+
+    def _grown(self, selected: Bool[Tensor, " n"], steps: int, refined: bool) -> Bool[Tensor, " n"]:
+        rows = (selected & self.field.valid(refined=refined)).nonzero().squeeze(1)
+        if len(rows) == 0:
+            return selected
+        mean = self.field.directions(rows[:: 1 + len(rows) // _MAX_SAMPLES], refined=refined).mean(dim=0)
+        if not bool(mean.any()):
+            return selected
+        seeds = selected.cpu().numpy()
+        candidates = seeds | self.alike(mean, 1 - _COSINE_STEP * steps, refined=refined).cpu().numpy()
+        _, labels = _components(self._graph(candidates))
+        reached = np.zeros(labels.max() + 1, bool)
+        reached[labels[seeds]] = True
+        return torch.from_numpy(reached[labels] & candidates).to(selected.device)
+
+    def _shrunk(self, selected: Bool[Tensor, " n"], steps: int) -> Bool[Tensor, " n"]:
+        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415 (a lift does not need it)
+
+        rows = np.flatnonzero(selected.cpu().numpy())
+        graph = self._graph(selected.cpu().numpy())[rows][:, rows]
+        count, labels = _components(graph)
+        means = np.nan_to_num(self.means.detach().double().cpu().numpy()[rows])
+        size = np.bincount(labels, minlength=count)
+        center = np.stack([np.bincount(labels, x, count) / size for x in means.T], axis=1)
+        order = np.lexsort((((means - center[labels]) ** 2).sum(axis=1), labels))
+        middles = order[np.unique(labels[order], return_index=True)[1]]
+        hops = dijkstra(graph, directed=False, indices=middles, unweighted=True, min_only=True)
+        farthest = np.zeros(count)
+        np.maximum.at(farthest, labels, hops)
+        inner = torch.from_numpy(rows[hops * _FRACTIONS <= farthest[labels] * (_FRACTIONS - steps)])
+        mask = self.none()
+        mask[inner.to(mask.device)] = True
+        return mask
+
+    def _graph(self, mask: np.ndarray) -> Any:
+        """Return the neighbor graph restricted to a mask of Gaussians, as a sparse matrix."""
+        from scipy.sparse import csr_array  # noqa: PLC0415 (a lift does not need it)
+
+        first, second = self._edges
+        inside = mask[first] & mask[second]
+        pairs = (first[inside], second[inside])
+        return csr_array((np.ones(len(pairs[0])), pairs), shape=(len(mask), len(mask)))
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of neighbors: the 8 nearest, within `OBJECT_MAX_GAP` times the median distance to the 8th neighbor."""
+        neighbors = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
+        last = neighbors.distance[:, -1]
+        last = last[last.isfinite()]
+        limit = OBJECT_MAX_GAP * float(last.median()) if len(last) > 0 else np.inf
+        near = ((neighbors.index >= 0) & (neighbors.distance <= limit)).numpy()
+        first, slot = np.nonzero(near)
+        return first.astype(np.int32), neighbors.index.numpy()[first, slot]
+
+
+def _components(graph: Any) -> tuple[int, np.ndarray]:
+    from scipy.sparse.csgraph import connected_components as components_of_graph  # noqa: PLC0415 (as above)
+
+    return components_of_graph(graph, directed=False)
+
+
+@dataclass(frozen=True)
+class SelectionBox:
+    """Box that cuts a selection, in scene units."""
+
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+    """Side lengths, > 0."""
+    wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Rotation as a quaternion."""
+    keeps_inside: bool = True
+    """Whether Gaussians inside the box stay selected; False: those outside."""
+
+    @property
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """Corners. Bit i of a corner's index says on which side it lies along axis i of the box.
+
+        >>> SelectionBox((0, 0, 0), (2, 4, 6)).corners[[0, 1, 7]].tolist()
+        [[-1.0, -2.0, -3.0], [1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
+        """
+        signs = np.array([[1 if number >> axis & 1 else -1 for axis in range(3)] for number in range(8)])
+        w, *imaginary = np.array(self.wxyz) / np.linalg.norm(self.wxyz)
+        local, axis = signs * np.array(self.size) / 2, np.array(imaginary)
+        turn = 2 * np.cross(axis, local)
+        return np.array(self.centre) + local + w * turn + np.cross(axis, turn)
+
+    def kept(self, means: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """Return the mask of Gaussians whose centers the box keeps.
+
+        >>> SelectionBox((0, 0, 0), (2, 2, 2)).kept(torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.0, 0.0]])).tolist()
+        [True, False]
+        """
+        w, *imaginary = torch.nn.functional.normalize(torch.tensor(self.wxyz, dtype=torch.float64), dim=0)
+        axis = -torch.stack(imaginary).to(means.device)
+        offset = means.double() - torch.tensor(self.centre, dtype=torch.float64, device=means.device)
+        turn = 2 * torch.linalg.cross(axis.expand_as(offset), offset)
+        local = offset + w.to(means.device) * turn + torch.linalg.cross(axis.expand_as(offset), turn)
+        half = torch.tensor(self.size, dtype=torch.float64, device=means.device) / 2
+        inside = (local.abs() <= half).all(dim=1)
+        return inside if self.keeps_inside else ~inside

@@ -1,1 +1,0 @@
-"""Browsers without WebGL: how viser's page lives in them, and the pictures that they get."""

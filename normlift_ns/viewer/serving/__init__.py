@@ -1,1 +1,0 @@
-"""How pages are served: the door where they wait, and what is served at all."""

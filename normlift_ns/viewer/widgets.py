@@ -1,0 +1,270 @@
+"""Escaped text and color swatches as MDX, which the viewer compiles."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Sequence
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+from PIL import Image
+from torch import Tensor
+
+from normlift_ns.analysis.explain import ViewVote
+from normlift_ns.analysis.vote_records import RecordedVotes
+from normlift_ns.errors import InputError, escape_unprintable
+from normlift_ns.query.histogram import Histogram
+from normlift_ns.rendering.colors import clip_text
+from normlift_ns.session.actions import diagnose_prompts
+from normlift_ns.session.objects import ObjectList, ObjectRow
+from normlift_ns.session.state import RequestToken, RequestTokens, State
+from normlift_ns.viewer.adapter import add_button_group
+
+
+def escape_mdx(text: str) -> str:
+    """Escape a text so that MDX shows it literally.
+
+    Possible markup or code becomes character references, and unprintable characters become escape sequences.
+
+    >>> escape_mdx("a {b}")
+    'a &#123;b&#125;'
+    """
+    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in escape_unprintable(text, keep="\n"))
+
+
+def color_swatch(color: Sequence[float]) -> str:
+    """Return a colored square as MDX.
+
+    Args:
+        color: RGB in 0..1.
+    """
+    red, green, blue = (round(255 * x) for x in color)
+    return f'<span style={{{{color: "rgb({red},{green},{blue})"}}}}>■</span>'
+
+
+# List of found objects in a panel: a row with buttons for each object.
+
+
+MAX_OBJECT_ROWS = 8
+OBJECT_ACTIONS = ("go to", "only", "hide", "export")
+
+
+class ObjectRows:
+    """List of found objects, added to the container of the panel that is open when it is created.
+
+    Args:
+        gui: viser's `GuiApi`.
+        act: called with the action (one of `OBJECT_ACTIONS`), its object, and viser's event.
+    """
+
+    def __init__(self, gui: Any, act: Callable[[str, ObjectRow, Any], None]) -> None:
+        self._objects: tuple[ObjectRow, ...] = ()
+        with gui.add_folder("Found objects"):
+            self._summary = gui.add_markdown("Nothing is selected.")
+            # created once: viser never frees what is added to or removed from a panel that all pages share
+            self._rows = [self._row(gui, i, act) for i in range(MAX_OBJECT_ROWS)]
+
+    def show(self, object_list: ObjectList) -> None:
+        """Replace the listed objects; at most `MAX_OBJECT_ROWS` are shown."""
+        self._objects, small = tuple(object_list.objects), object_list.in_smaller_parts
+        unlisted = [f"{object_list.left_out:,} smaller objects are not listed"] * (object_list.left_out > 0)
+        unlisted += [f"Gaussians in smaller components: {small:,}"] * (small > 0)
+        empty = "" if len(self._objects) > 0 else "Nothing that is drawn is selected."
+        self._summary.content = escape_mdx("; ".join(unlisted) or empty)
+        for i, (text, buttons) in enumerate(self._rows):
+            if i < len(self._objects):
+                row = self._objects[i]
+                details = escape_mdx(f"object {row.number}: {row.size:,} Gaussians, {row.evidence}")
+                text.content = f"{color_swatch(row.colour)} **{escape_mdx(clip_text(row.text, 40))}** {details}"
+            text.visible = buttons.visible = i < len(self._objects)
+
+    def _row(self, gui: Any, i: int, act: Callable[[str, ObjectRow, Any], None]) -> tuple[Any, Any]:
+        def pressed(action: str, event: Any) -> None:
+            if i < len(self._objects):
+                act(action, self._objects[i], event)
+
+        text = gui.add_markdown("")
+        buttons = add_button_group(gui, "", OBJECT_ACTIONS, pressed)
+        text.visible = buttons.visible = False
+        return text, buttons
+
+
+# Histograms and images as MDX, for the panels of both viewers.
+
+
+_WIDTH, _HEIGHT, _TOP, _BOTTOM = 280, 70, 14, 14
+"""Size of a histogram in pixels, and margins above and below its bars."""
+_BACKGROUND, _INK, _BAR = "#141414", "#ffffff", "#8c8c8c"
+_MAX_SIDE, _QUALITY = 480, 80
+"""Longer side of an image in pixels, and its JPEG quality."""
+
+
+def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
+    """Draw the histogram of one prompt.
+
+    The heights of the bars are logarithmic. A solid line marks the threshold, and a dashed line the suggested one.
+
+    Args:
+        color: color of the bars above the threshold, RGB in 0..1.
+
+    >>> values = np.array([0.1] * 60 + [0.9] * 10)
+    >>> from normlift_ns.query.histogram import relevancy_histogram
+    >>> counts = relevancy_histogram(values, np.ones(70, bool), threshold=0.5, limit=None)
+    >>> histogram_svg(counts, (1, 0, 0)).count("#ff0000")
+    1
+    """
+    low, high = float(histogram.edges[0]), float(histogram.edges[-1])
+    step, height_of_bars = _WIDTH / len(histogram.counts), _HEIGHT - _TOP - _BOTTOM
+    heights = np.log1p(histogram.counts) / np.log1p(max(1, histogram.counts.max())) * height_of_bars
+    selected = "#" + "".join(f"{round(255 * x):02x}" for x in color)
+    parts = [f'<rect width="{_WIDTH}" height="{_HEIGHT}" rx="4" fill="{_BACKGROUND}"/>']
+    for i, height in enumerate(heights):
+        if height > 0:
+            middle = (histogram.edges[i] + histogram.edges[i + 1]) / 2
+            fill = selected if middle > histogram.threshold else _BAR
+            position = f'x="{i * step + 0.5:.1f}" y="{_TOP + height_of_bars - height:.1f}"'
+            parts.append(f'<rect {position} width="{step - 1:.1f}" height="{height:.1f}" fill="{fill}"/>')
+    for value, dash in ((histogram.suggested, "3 3"), (histogram.threshold, "")):
+        x = (value - low) / (high - low) * _WIDTH
+        if 0 <= x <= _WIDTH:
+            x, dashed = min(max(x, 1), _WIDTH - 1), f' stroke-dasharray="{dash}"' if dash else ""
+            parts.append(f'<path d="M{x:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{_INK}" stroke-width="1.5"{dashed}/>')
+    x = min(max((histogram.threshold - low) / (high - low) * _WIDTH, 30), _WIDTH - 30)
+    parts.append(_text(x, _TOP - 3, "middle", f"> {histogram.threshold:.2f}"))
+    parts.append(_text(4, _HEIGHT - 3, "start", f"{round(low, 2) + 0.0:.2f}"))
+    parts.append(_text(_WIDTH - 4, _HEIGHT - 3, "end", f"{high:.2f}"))
+    box = f'width="{_WIDTH}" height="{_HEIGHT}" viewBox="0 0 {_WIDTH} {_HEIGHT}"'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {box}>{"".join(parts)}</svg>'
+
+
+def _text(x: float, y: float, anchor: str, text: str) -> str:
+    font = f'font-family="sans-serif" font-size="10" text-anchor="{anchor}"'
+    return f'<text x="{x:.1f}" y="{y}" {font} fill="{_INK}">{text.replace(">", "&gt;")}</text>'
+
+
+def diagnostics_mdx(state: State) -> str:
+    """Return histograms and warnings of the prompts that select; empty if no prompt selects."""
+    diagnostics, lines = diagnose_prompts(state), []
+    for one in diagnostics:
+        lines += [f"{color_swatch(one.colour)} {escape_mdx(clip_text(one.text, 40))}"] * (len(diagnostics) > 1)
+        lines.append(_image("image/svg+xml", histogram_svg(one.histogram, one.colour).encode()))
+        lines += [escape_mdx(clip_text(one.words, 400))] * (one.words != "")
+    count = 0 if state.answer is None or state.shown is not None else len(state.answer.texts)
+    if 0 < len(diagnostics) < count:
+        lines.append(f"and {count - len(diagnostics)} more; choose one to see its histogram.")
+    return "\n\n".join(lines)
+
+
+def image_mdx(image: UInt8[Tensor, "h w 3"]) -> str:
+    """Return an image as MDX, scaled down for a panel."""
+    thumbnail, buffer = Image.fromarray(image.cpu().numpy()), io.BytesIO()
+    thumbnail.thumbnail((_MAX_SIDE, _MAX_SIDE))
+    thumbnail.save(buffer, "JPEG", quality=_QUALITY)
+    return _image("image/jpeg", buffer.getvalue())
+
+
+def _image(media_type: str, content: bytes) -> str:
+    data = base64.b64encode(content).decode()
+    return f'<img src="data:{media_type};base64,{data}" style={{{{width: "100%", borderRadius: "4px"}}}} />'
+
+
+# Explanation of a selection for a panel: the training images that voted for it, and those that disagree most.
+
+
+MAX_EXPLAIN_IMAGES = 3
+"""Number of images shown with the largest weight, and of those shown with the largest disagreement."""
+_BUSY = "Looking for the training images that voted."
+_explain_lock = Lock()
+"""Held while votes are read and cached, so that two threads do not do both twice."""
+
+
+def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refined: bool = True) -> str:
+    """Return the agreement of the images in words, and the images with the regions that voted for a selection.
+
+    If the images cannot be shown, for instance because features were passed from Python, a sentence gives the reason.
+
+    Raises:
+        ValueError: nothing is selected, or the cache lacks the votes.
+        FileNotFoundError: an image needed to count the votes is missing.
+    """
+    why = votes.explain(selected.cpu(), refined=refined)
+    heaviest, different = why.views[:MAX_EXPLAIN_IMAGES], why.most_different[:MAX_EXPLAIN_IMAGES]
+    images, problem = {}, ""
+    try:
+        for picture in votes.pictures(dict.fromkeys((*heaviest, *different))):
+            images[picture.vote.view] = image_mdx(picture.image)
+    except (InputError, OSError) as error:
+        problem = f"The images cannot be shown: {error}"
+    lines = [escape_mdx(why.sentence), *filter(None, [escape_mdx(clip_text(problem, 400))])]
+    for title, view_votes in (("Images that weigh most:", heaviest), ("Images that disagree most:", different)):
+        if len(view_votes) > 0:
+            lines += [f"**{title}**", *_list_votes(view_votes, votes.names, images)]
+    return "\n\n".join(lines)
+
+
+def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[int, str]) -> list[str]:
+    """List each view with its numbers, and with its image at the first mention."""
+    lines = []
+    for vote in votes:
+        regions = "1 region" if len(vote.regions) == 1 else f"{len(vote.regions)} regions"
+        numbers = f"{vote.share:.0%} of the weight ({vote.weight:,.0f} pixels, {regions}), cosine {vote.agreement:.2f}"
+        if vote.disagreement >= 0.005:
+            numbers += f", {vote.disagreement:.0%} of the disagreement"
+        lines.append(f"{escape_mdx(clip_text(names[vote.view], 60))}: {escape_mdx(numbers)}")
+        lines += filter(None, [images.pop(vote.view, "")])
+    return lines
+
+
+class Explanation:
+    """Explanation shown to one user. It is dropped when the selection changes.
+
+    Args:
+        votes: returns the votes of the run; called at the first explanation.
+    """
+
+    def __init__(self, votes: Callable[[], RecordedVotes]) -> None:
+        self._votes, self._turns = votes, RequestTokens()
+        self._selection: Bool[Tensor, " n"] | None = None
+        self.content = ""
+        """MDX of the explanation; empty if there is none."""
+
+    @property
+    def busy(self) -> str:
+        """Description of the running work; empty if there is none."""
+        return self._turns.busy
+
+    def start(self, state: State) -> RequestToken:
+        """Return a token to `find` the explanation of a selection; the previous explanation is dropped."""
+        self._selection, self.content = state.selection, ""
+        return self._turns.start(_BUSY)
+
+    def find(self, token: RequestToken, state: State) -> None:
+        """Compute the explanation of a selection. This can take seconds: call it without a lock, from any thread.
+
+        Raises:
+            ValueError, FileNotFoundError: as `explanation_mdx`, unless the request is stale.
+        """
+        content = ""
+        try:
+            with _explain_lock:
+                if self._turns.wanted(token):
+                    content = explanation_mdx(self._votes(), state.selection, refined=state.refined)
+        except Exception:
+            if self._turns.finish(token):
+                raise
+        if self._turns.finish(token):
+            self.content = content
+
+    def follow(self, state: State) -> None:
+        """Drop the explanation if the selection of this state is another one."""
+        if self._selection is not None and not torch.equal(self._selection, state.selection):
+            self.forget()
+
+    def forget(self) -> None:
+        """Drop the explanation and any running computation."""
+        self._turns.cancel()
+        self._selection, self.content = None, ""
