@@ -23,8 +23,8 @@ from normlift_ns.data.open_splat import is_saved_splat, open_saved_splat
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.io.atomic import complete_interrupted_writes
-from normlift_ns.io.run_dir import check_run, load_field, recorded_gsplat_version
-from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.io.run_dir import check_run, recorded_gsplat_version
+from normlift_ns.lifted_run import LiftedRun, load_field
 from normlift_ns.options import LiftOptions, SourceOptions, check_number, check_path
 from normlift_ns.pipeline import lift_run_distributed
 from normlift_ns.query.text_encoder import with_text_source
@@ -186,9 +186,9 @@ def lift_run(
     if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
         raise InputError("data and load_step apply to a config only; pass them to open_scene")
     run = lift_run_distributed(
-        SINGLE_PROCESS, scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts, lift=lift,
-        queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check, device=device,
-        export=export, report=report, say=say,
+        SINGLE_PROCESS, scene_opener(config_or_scene, data, load_step), source=source, features=features, texts=texts,
+        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite, check=check,
+        device=device, export=export, report=report, say=say,
     )  # fmt: skip
     assert run is not None
     return run

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from plyfile import PlyData, PlyElement, PlyParseError
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from normlift_ns.analysis.objects import Instances, find_instances
@@ -247,8 +246,10 @@ def nearest_gaussians(
         most: maximum distance, inclusive.
 
     >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), most=2.0)
-    Nearest(row=array([1, 0]), near=array([ True, False]))
+    NearestGaussians(row=array([1, 0]), near=array([ True, False]))
     """
+    from scipy.spatial import KDTree  # noqa: PLC0415 (nothing else here needs it)
+
     finite = np.asarray(np.isfinite(points).all(axis=1))
     distance, row = (np.asarray(x) for x in KDTree(means).query(np.nan_to_num(points, posinf=0.0, neginf=0.0)))
     has_row = np.isfinite(distance)  # the tree returns no row if the squared distance overflows

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -36,7 +36,7 @@ from normlift_ns.exports import (
     write_splat_ply,
 )
 from normlift_ns.io.atomic import refuse_run_files
-from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder, text_cache_folder
+from normlift_ns.io.run_dir import FIELD_FOLDER, cache_folder, field_folder, resolve_manifest_paths, text_cache_folder
 from normlift_ns.options import (
     FLOATER_THRESHOLD,
     MAX_TRANSFER_DISTANCE,
@@ -488,3 +488,23 @@ def _as_tensor(values: Any) -> Tensor | None:
         return torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return None
+
+
+def load_field(
+    run_dir: Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
+) -> SemanticField:
+    """Load the semantic field of a lifted run.
+
+    Args:
+        means, checkpoint: as in `SemanticField.load`.
+    Raises:
+        FileNotFoundError: the run has no semantic field.
+        ValueError: the field is damaged, or belongs to other Gaussians than `means`.
+    """
+    folder = field_folder(run_dir)
+    return resolve_field_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
+
+
+def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
+    """Return the field with the absolute paths of `resolve_manifest_paths` in its manifest."""
+    return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))

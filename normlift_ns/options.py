@@ -364,6 +364,8 @@ MAX_TRANSFER_DISTANCE = 6.0
 """Largest distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
 CATALOG_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
 """Files of an object catalog: everything, its table, and its boxes in capture and in scene coordinates."""
+WEAK_RELIABILITY = 0.6
+"""R below which the evidence of a Gaussian is weak."""
 FLOATER_THRESHOLD = 1.9
 """Score above which a Gaussian is a likely floater, see `analysis.objects`."""
 

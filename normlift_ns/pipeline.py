@@ -58,11 +58,10 @@ from normlift_ns.io.run_dir import (
     cache_folder,
     complete_interrupted_lifts,
     refuse_existing_run,
-    resolve_field_paths,
     run_directory,
     run_file_digests,
 )
-from normlift_ns.lifted_run import LiftedRun
+from normlift_ns.lifted_run import LiftedRun, resolve_field_paths
 from normlift_ns.options import (
     CANONICAL_NEGATIVES,
     BackendName,

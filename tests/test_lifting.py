@@ -203,7 +203,7 @@ def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:
     for name in ("b_0000", "b/0000", "b/0000.png"):
         assert list(training_cameras(made, [name])) == ["b_0000"]
     assert list(training_cameras(made, ["0001", "a_0000"])) == ["0001", "a_0000"]
-    for name, message in (("0000", "2 .*'0000'.* a_0000, b_0000"), ("c", "'c'.* 3, from 'a_0000' to '0001'")):
+    for name, message in (("0000", "2 .*'0000'.* a_0000, b_0000"), ("c", "'c'.* 3 names from 'a_0000' to '0001'")):
         with pytest.raises(InputError, match=message):
             training_cameras(made, [name])
 

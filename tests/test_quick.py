@@ -125,7 +125,7 @@ def test_lines_become_lines_of_json(lifted, monkeypatch, capsys):
         if code == 1:
             red, wooden, blue = map(json.loads, shown.out.splitlines())
             assert red["text"] == "red" and 0.005 < red["fraction"] < 0.1 and red["rule"] == "cosine"
-            assert "colour" in wooden["error"]
+            assert "color name" in wooden["error"]
             assert blue["threshold"] == 0.5
             assert "1 of 3" in shown.err
     assert run_entry(monkeypatch, query.entrypoint, "--load-config", lifted, "--text", "red") == 0

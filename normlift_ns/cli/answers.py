@@ -201,7 +201,7 @@ def segment_with_sam3(
     Returns:
         The lifted masks, and their summary for every prompt.
     Raises:
-        FileNotFoundError, ValueError: Same as in `check_sam_checkpoint`, `open_run`, `query_sam3` and `Sam3Network.load`.
+        FileNotFoundError, ValueError: as in `check_sam_checkpoint`, `open_run`, `query_sam3` and `Sam3Network.load`.
     """
     device = choose_device(device)
     check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)

@@ -244,8 +244,8 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     match = re.fullmatch(r"(\d{1,7})/(\d{1,7})", word, re.ASCII)
     if match is None or not 1 <= int(match[1]) <= int(match[2]) <= _MAX_SHARDS:
         raise InputError(
-            f"--shard must be auto, none, or i/n for the i-th of n parts, from 1/n to n/n; got {short_repr(word)}. For the "
-            "second of four workers, give --shard 2/4."
+            f"--shard must be auto, none, or i/n for the i-th of n parts, from 1/n to n/n; got {short_repr(word)}. For "
+            "the second of four workers, give --shard 2/4."
         )
     return Shard(int(match[1]) - 1, int(match[2]))
 

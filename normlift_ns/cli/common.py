@@ -120,7 +120,7 @@ def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]
         InputError: --log-file has no file, or --quiet is neither True nor False.
 
     >>> split_output_flags(["--k", "8", "--quiet", "--log-file", "a.log"])
-    (['--k', '8'], Terminal(quiet=True, log_file=PosixPath('a.log')))
+    (['--k', '8'], OutputSettings(quiet=True, log_file=PosixPath('a.log')))
     """
     rest, quiet, log_file = [], False, None
     indices = iter(range(len(words)))

@@ -73,10 +73,7 @@ class NormLiftEval:
         info_opening(*self.load_config)
         from normlift_ns.api import open_run  # noqa: PLC0415
         from normlift_ns.core.device import choose_device  # noqa: PLC0415 (--help should not wait for torch)
-        from normlift_ns.evaluation.coverage import (
-            coverage_of,  # noqa: PLC0415
-            write_poses,  # noqa: PLC0415
-        )
+        from normlift_ns.evaluation.coverage import coverage_of, write_poses  # noqa: PLC0415
         from normlift_ns.evaluation.options import write_evaluation  # noqa: PLC0415
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.evaluation.studies import (  # noqa: PLC0415
@@ -84,7 +81,7 @@ class NormLiftEval:
             study_baselines,
             study_timing,
             study_votes,
-            sweeps,  # noqa: PLC0415
+            sweeps,
         )
         from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
 

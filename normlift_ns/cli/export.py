@@ -102,11 +102,7 @@ class NormLiftExport:
         from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
         from normlift_ns.api import open_run  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.cli import answers  # noqa: PLC0415
-        from normlift_ns.exports import (  # noqa: PLC0415
-            answer_instances,  # noqa: PLC0415
-            check_no_properties,
-            read_cloud,
-        )
+        from normlift_ns.exports import answer_instances, check_no_properties, read_cloud  # noqa: PLC0415
         from normlift_ns.rendering.figures import mask_files  # noqa: PLC0415
 
         cloud = None if self.transfer is None else read_cloud(self.transfer)

@@ -335,10 +335,7 @@ def check_unused_options(lift: LiftOptions) -> None:
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
     """Check the folders, weights, levels and prompts of 2D features."""
-    from normlift_ns.encoders.registry import (
-        encoder_kind,  # noqa: PLC0415 (not needed for --help)
-        is_local_path,  # noqa: PLC0415
-    )
+    from normlift_ns.encoders.registry import encoder_kind, is_local_path  # noqa: PLC0415 (not needed for --help)
 
     texts = tuple(queries)
     check_prompt_list("queries", texts)

@@ -73,10 +73,7 @@ class NormLiftView:
         from normlift_ns.api import open_run  # noqa: PLC0415 (pages load while torch is imported)
         from normlift_ns.session.selection import SelectionContext  # noqa: PLC0415
         from normlift_ns.viewer.person import People  # noqa: PLC0415
-        from normlift_ns.viewer.shared import (
-            Run,  # noqa: PLC0415
-            make_records,  # noqa: PLC0415
-        )
+        from normlift_ns.viewer.shared import Run, make_records  # noqa: PLC0415
 
         run = open_run(
             self.load_config,

@@ -19,8 +19,8 @@ The factor c_ts limits the influence of a region t that covers several objects. 
 cells of an arbitrary partition, whose overlaps only average neighboring cells. For example, a square of one grid and
 the best match in a randomly shifted copy of that grid share 9/16 of their area on average, which is J = 0.39.
 
-Directions come from the lift of F'. R stays that of the lift of F (see `with_original_reliability`), because it measures how
-far the regions disagreed before the consensus. It ranks the answers of F' better than the R of F' does.
+Directions come from the lift of F'. R stays that of the lift of F (see `with_original_reliability`): it measures
+how far the regions disagreed before the consensus. It ranks the answers of F' better than the R of F' does.
 """
 
 from __future__ import annotations

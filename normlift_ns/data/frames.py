@@ -81,7 +81,7 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
         file: file of its image, for messages.
         size: width and height of the image.
     Raises:
-        FileNotFoundError, ValueError: as in `read_image_header`, or if the mask does not fit; the message names both files.
+        FileNotFoundError, ValueError: as in `read_image_header`, or if the mask does not fit. The message names both.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):

@@ -161,12 +161,13 @@ class PeerFailureError(RuntimeError):
 
 
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return rank and world size from the variables that torchrun and `launch_processes` set, or None for a single process.
+    """Return rank and world size from the variables that torchrun and `launch_processes` set; None: a single process.
 
     Raises:
         InputError: if the values are not valid numbers.
 
-    >>> rank_and_world_size({"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}), rank_and_world_size({})
+    >>> address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
+    >>> rank_and_world_size({"RANK": "1", "WORLD_SIZE": "2", **address}), rank_and_world_size({})
     ((1, 2), None)
     """
     if any(name not in environment for name in TORCHRUN_VARIABLES):
@@ -402,7 +403,8 @@ def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) ->
         if waited > _QUIET_WAIT and not warned:
             warned = True
             log(
-                f"Waiting for {target}. If this command should not wait for other processes, unset {', '.join(TORCHRUN_VARIABLES)}."
+                f"Waiting for {target}. If this command should not wait for other processes, unset "
+                f"{', '.join(TORCHRUN_VARIABLES)}."
             )
         time.sleep(0.1)
 

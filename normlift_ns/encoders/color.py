@@ -31,9 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, Int32, UInt8
-from torch import Tensor
 
 from normlift_ns.encoders.prompts import check_prompts
 from normlift_ns.errors import InputError, truncate_text
@@ -188,8 +186,8 @@ def _no_color_message(prompt: str) -> str:
     near = [name for name in near if _NOT_SUGGESTED.isdisjoint(name.split())]
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["red", "dark green", "sky blue"])
     return (
-        f"text {truncate_text(prompt)!r} contains no color name; the color encoder only knows the names of the XKCD color "
-        f"survey, such as {suggestions}: use one of them, or lift with --encoder open_clip for other words"
+        f"text {truncate_text(prompt)!r} contains no color name; the color encoder only knows the names of the XKCD "
+        f"color survey, such as {suggestions}: use one of them, or lift with --encoder open_clip for other words"
     )
 
 
@@ -202,6 +200,7 @@ class ColorEncoder(ColorTextEncoder):
     a GPU."""
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
+        import torch  # noqa: PLC0415 (as above)
         from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
 
         labels = labels.cpu()

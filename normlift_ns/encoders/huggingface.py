@@ -484,6 +484,6 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 def _unreachable(model: str, family: ModelFamily, error: Exception) -> FileNotFoundError:
     return FileNotFoundError(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded "
-        f"({registry.summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder that "
-        "needs no weights: --encoder colour"
+        f"({registry.summarize_error(error)}); go online once, give a folder with --encoder-model, or use the encoder "
+        "that needs no weights: --encoder colour"
     )

@@ -104,7 +104,8 @@ class HuggingFaceNetwork:
         vocab_size, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
         if largest >= vocab_size:
             raise InputError(
-                f"{TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network only has {vocab_size} tokens"
+                f"{TOKENIZER_FILE} in {self.folder.path} has the token {largest}, but the network only has "
+                f"{vocab_size} tokens"
             )
         inputs = {"input_ids": torch.tensor([text.ids for text in encoded], device=self.mean.device)}
         if self.folder.tokens.masked:

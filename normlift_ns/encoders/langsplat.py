@@ -266,8 +266,8 @@ class LangSplat:
         invalid = rows[(rows >= 0) & ~valid[rows.long()]].unique().tolist()
         if len(invalid) > 0:
             warnings.warn(
-                f"{files.features}: rows {shorten_list(invalid)} of the table are zero or not finite; their pixels count as "
-                "unlabeled",
+                f"{files.features}: rows {shorten_list(invalid)} of the table are zero or not finite; their pixels "
+                "count as unlabeled",
                 stacklevel=2,
             )
             rows = torch.where(valid[rows.long()], rows, -1)
@@ -321,7 +321,8 @@ def is_same_image(map_width: int, map_height: int, width: int, height: int) -> b
     """Return whether a map can show the same image at another resolution. The two sizes must differ by one factor,
     except for rounding of the smaller one to whole pixels.
 
-    >>> is_same_image(606, 1080, 1079, 1921), is_same_image(1080, 1920, 1079, 1919), is_same_image(606, 1090, 1079, 1921)
+    >>> sizes = [(606, 1080, 1079, 1921), (1080, 1920, 1079, 1919), (606, 1090, 1079, 1921)]
+    >>> tuple(is_same_image(*size) for size in sizes)
     (True, False, False)
     """
     x_scale, y_scale = width / map_width, height / map_height

@@ -68,8 +68,8 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
         )
     except THIRD_PARTY_ERRORS as error:
         raise InputError(
-            f"OpenCLIP model {model} cannot be built with the packages installed here ({summarize_error(error)}); choose "
-            f"another with --encoder-model, such as {DEFAULT_MODEL}"
+            f"OpenCLIP model {model} cannot be built with the packages installed here ({summarize_error(error)}); "
+            f"choose another with --encoder-model, such as {DEFAULT_MODEL}"
         ) from None
     try:
         open_clip.load_checkpoint(network, str(path), weights_only=True)

@@ -276,8 +276,8 @@ def encoder_kind(name: str) -> EncoderKind:
         kind = point.load()
     except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
         raise InputError(
-            f"encoder {name!r} of {_package(point)} cannot be loaded ({summarize_error(error)}); repair or uninstall that "
-            "package, or use another encoder, such as --encoder open_clip"
+            f"encoder {name!r} of {_package(point)} cannot be loaded ({summarize_error(error)}); repair or uninstall "
+            "that package, or use another encoder, such as --encoder open_clip"
         ) from error
     if not isinstance(kind, EncoderKind):
         raise InputError(

@@ -1,8 +1,8 @@
-"""Safetensors files with a digest of their whole content, which is checked before any of it is used.
+"""Files of arrays: safetensors with a digest of their whole content, and NPY files of other programs.
 
-This module does not need torch. The digest is the 128-bit XXH3. It detects damaged and misplaced files, but it does not
-protect against forgery. One core of an AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b. For a field of
-44 MB, this is 1.5 ms instead of 50 ms.
+The digest is checked before any content is used. NumPy arrays need no torch. The digest is the 128-bit XXH3: it detects
+damaged and misplaced files, but it does not protect against forgery. One core of an AMD EPYC hashes 31 GB/s with XXH3
+and 0.9 GB/s with BLAKE2b. For a field of 44 MB, this is 1.5 ms instead of 50 ms.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
-from safetensors.torch import save_file
-from torch import Tensor
 from xxhash import xxh3_128
 
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest number allowed in a file."""
@@ -273,9 +274,6 @@ def read_npy_bytes(data: bytes) -> np.ndarray:
     return values.reshape(header.shape, order=header.order)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
-# Safetensors files of torch tensors with a digest of their whole content; `disk.arrays` is the NumPy counterpart.
-
-
 class TensorFile(NamedTuple):
     """Content of a file."""
 
@@ -289,6 +287,7 @@ class TensorFile(NamedTuple):
 def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: str = "") -> str:
     """Return the digest of metadata, a key, and the names, types, shapes and values of tensors.
 
+    >>> import torch
     >>> table = {"a": torch.eye(2)}
     >>> tensor_digest(table, {}) == tensor_digest({"a": torch.eye(2)}, {})
     True
@@ -300,6 +299,8 @@ def tensor_digest(tensors: Mapping[str, Tensor], facts: Mapping[str, str], key: 
 
 
 def _bytes(tensor: Tensor) -> memoryview:
+    import torch  # noqa: PLC0415 (a query without torch loads this module)
+
     flat = tensor.detach().cpu().reshape(-1).contiguous()
     return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single element may have any stride
 
@@ -321,11 +322,13 @@ def save_tensors(
     Raises:
         FileExistsError, OSError: as in `atomic_files`.
     """
+    from safetensors.torch import save_file as save_tensor_file  # noqa: PLC0415 (as above)
+
     metadata = dict(facts or {})
     content = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
     digest = tensor_digest(content, metadata, key)
     with atomic_file(path, overwrite=overwrite) as draft:
-        save_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
+        save_tensor_file(content, draft, metadata={**metadata, DIGEST_KEY: digest})
         sort_metadata(draft)
     return digest
 

@@ -72,7 +72,7 @@ def claim_states(names: Iterable[str]) -> dict[str, ClaimState]:
         names: names of the files in the folder.
 
     >>> claim_states(["a.1", "a.1.left", "a.2", "b.1", "b.1.done", "notes.txt"])
-    {'a': State(number=2, outcome=None), 'b': State(number=1, outcome='done')}
+    {'a': ClaimState(number=2, outcome=None), 'b': ClaimState(number=1, outcome='done')}
     """
     latest: dict[str, ClaimState] = {}
     for name in names:
@@ -90,7 +90,8 @@ def is_claimable(state: ClaimState, at_start: ClaimState) -> bool:
 
     It may if it was never claimed, if it was abandoned, or if its latest attempt ended before this process started.
 
-    >>> is_claimable(ClaimState(1, "failed"), at_start=ClaimState(1, "failed")), is_claimable(ClaimState(1, "failed"), at_start=UNCLAIMED)
+    >>> failed = ClaimState(1, "failed")
+    >>> is_claimable(failed, at_start=failed), is_claimable(failed, at_start=UNCLAIMED)
     (True, False)
     """
     return state.number == 0 or state.outcome == ABANDONED or (state.outcome is not None and state == at_start)
@@ -99,8 +100,9 @@ def is_claimable(state: ClaimState, at_start: ClaimState) -> bool:
 def observe_pulse(before: ObservedPulse | None, pulse: bytes, now: float) -> ObservedPulse:
     """Return the updated heartbeat record after reading `pulse` at time `now`.
 
-    >>> observe_pulse(ObservedPulse(b"7", since=10.0), b"7", now=15.0), observe_pulse(ObservedPulse(b"7", since=10.0), b"8", now=15.0)
-    (Seen(pulse=b'7', since=10.0), Seen(pulse=b'8', since=15.0))
+    >>> before = ObservedPulse(b"7", since=10.0)
+    >>> observe_pulse(before, b"7", now=15.0).since, observe_pulse(before, b"8", now=15.0).since
+    (10.0, 15.0)
     """
     return before if before is not None and before.pulse == pulse else ObservedPulse(pulse, now)
 
@@ -193,7 +195,8 @@ def iter_claims(
     """Yield claims of this process until every task has ended, in this process or another.
 
     The generator waits for tasks of other processes, and claims them if their heartbeat stops. The caller must work on
-    each claim, call `write_pulse` (`BEATS_PER_TIMEOUT` times per `patience`), and call `finish_claim` before it takes the next claim.
+    each claim, call `write_pulse` (`BEATS_PER_TIMEOUT` times per `patience`), and call `finish_claim` before it takes
+    the next claim.
 
     Args:
         keys: names of the tasks.
@@ -209,7 +212,7 @@ def iter_claims(
     >>> for mine in iter_claims(folder, ["a", "b"], {}, patience=60.0):
     ...     finish_claim(mine, "done")
     >>> read_claim_states(folder)["a"], list(iter_claims(folder, ["a", "b"], {}, patience=60.0))
-    (State(number=1, outcome='done'), [])
+    (ClaimState(number=1, outcome='done'), [])
     """
     heartbeats: dict[Claim, ObservedPulse] = {}
     while True:

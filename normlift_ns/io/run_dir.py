@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +14,7 @@ from normlift_ns.io.atomic import complete_interrupted_writes, file_digest, refu
 from normlift_ns.io.manifest import DIGESTED_PATH, MANIFEST_FILE, check_file_digests, read_manifest
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from torch import Tensor
-
-    from normlift_ns.core.field import SemanticField
+    pass
 
 
 FIELD_FOLDER = "normlift"
@@ -79,23 +75,6 @@ def field_folder(run_dir: Path) -> Path:
     return folder
 
 
-def load_field(
-    run_dir: Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
-) -> SemanticField:
-    """Load the semantic field of a lifted run.
-
-    Args:
-        means, checkpoint: as in `SemanticField.load`.
-    Raises:
-        FileNotFoundError: the run has no semantic field.
-        ValueError: the field is damaged, or belongs to other Gaussians than `means`.
-    """
-    from normlift_ns.core.field import SemanticField  # noqa: PLC0415 (commands check paths before they import torch)
-
-    folder = field_folder(run_dir)
-    return resolve_field_paths(SemanticField.load(folder, means, checkpoint=checkpoint), folder)
-
-
 def recorded_gsplat_version(run_dir: Path) -> str | None:
     """Return the gsplat version whose rasterization a run was lifted with.
 
@@ -109,11 +88,6 @@ def recorded_gsplat_version(run_dir: Path) -> str | None:
         return None
     version = read_manifest(folder)[0].get("gsplat_rules")
     return None if version is None else str(version)
-
-
-def resolve_field_paths(field: SemanticField, folder: Path) -> SemanticField:
-    """Return the field with the absolute paths of `resolve_manifest_paths` in its manifest."""
-    return replace(field, manifest=resolve_manifest_paths(field.manifest, folder))
 
 
 def resolve_manifest_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
@@ -165,7 +139,7 @@ def _check_seal(path: Path) -> None:
 
 
 def complete_interrupted_lifts(run_dir: Path) -> None:
-    """Clean up after killed lifts, next to a run directory and in its cache; see `io.atomic.complete_interrupted_writes`."""
+    """Clean up after killed lifts, next to a run directory and in its cache; see `complete_interrupted_writes`."""
     for folder in (run_dir.parent, *cache_folder(run_dir).glob("*")):
         complete_interrupted_writes(folder)
 

@@ -293,7 +293,7 @@ def find_nearest(
 
 
 def brute_force_nearest(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> NearestNeighbors:
-    """Return the K nearest other points of some points by brute force, for the few uncertain results of `find_nearest`."""
+    """Return the K nearest other points of some points by brute force, for uncertain results of `find_nearest`."""
     exact, parts = points.double(), []
     n = len(points)
     for chunk in rows.split(max(1, _PAIRS // n)):

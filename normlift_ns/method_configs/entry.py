@@ -13,7 +13,7 @@ from typing import Any
 
 def _load_method(name: str) -> Any:
     try:
-        return getattr(import_module(f"normlift_ns.method_configs.{name}"), f"{name}_method")
+        return getattr(import_module("normlift_ns.method_configs.normlift"), f"{name}_method")
     except Exception as error:  # any missing or broken dependency
         if sys.stderr is not None:
             reason = f"{type(error).__name__}: {error}"

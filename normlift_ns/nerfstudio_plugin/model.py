@@ -23,7 +23,8 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.data.images import to_camera
 from normlift_ns.data.nerfstudio.config_classes import active_sh_degree
 from normlift_ns.errors import InputError
-from normlift_ns.io.run_dir import FIELD_FOLDER, check_run, resolve_field_paths
+from normlift_ns.io.run_dir import FIELD_FOLDER, check_run
+from normlift_ns.lifted_run import resolve_field_paths
 from normlift_ns.nerfstudio_plugin.panel import SearchPanel
 from normlift_ns.options import RasterizeMode
 from normlift_ns.query.question import Query, load_query
@@ -191,7 +192,7 @@ class NormLiftModel(SplatfactoModel):
         return self._scene(None)
 
     def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """Return what `write_splat_ply` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
+        """Return parameters, whether colors are spherical harmonics, and rasterize mode, for `write_splat_ply`."""
         return dict(self.gauss_params), self.config.sh_degree > 0, self.config.rasterize_mode
 
     def _scene(self, rows: Tensor | None) -> GaussianScene:

@@ -206,7 +206,7 @@ class PanelHost(Protocol):
         ...
 
     def splats(self) -> tuple[Mapping[str, Tensor], bool, RasterizeMode]:
-        """Return what `write_splat_ply` needs: parameters, whether colors are spherical harmonics, and rasterize mode."""
+        """Return parameters, whether colors are spherical harmonics, and rasterize mode, for `write_splat_ply`."""
         ...
 
 

@@ -73,8 +73,8 @@ def make_query(
         negatives: negative prompts (default: those of the encoder, see `default_rule`).
         rule: "auto" is the rule of the encoder if `negatives` is None, cosine if it is empty, and lerf otherwise.
         threshold: "auto" is the threshold that the histogram suggests. None is the threshold of the encoder for its own
-            rule, and otherwise that of `RELEVANCY_RULES`. For the rule cosine with an encoder of another rule, None is "auto",
-            because no threshold suits all encoders.
+            rule, and otherwise that of `RELEVANCY_RULES`. For the rule cosine with an encoder of another rule, None is
+            "auto", because no threshold suits all encoders.
         min_reliability: minimum R of a selected Gaussian, in 0..1.
         refined: use refined features.
     Raises:

@@ -68,7 +68,7 @@ class RasterBatch(NamedTuple):
 
 
 class Backend(Protocol):
-    """Rasterization backend. The modules `rasterization.numba`, `rasterization.gsplat` and `rasterization.triton` implement it directly."""
+    """Rasterization backend, implemented by the modules `numba`, `gsplat` and `triton` of this package."""
 
     def check(self, job: RasterJob, *, pictures: bool) -> None:
         """Raise ValueError, with an alternative, if the backend cannot do the job.

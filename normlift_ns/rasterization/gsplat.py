@@ -55,11 +55,7 @@ class GsplatProjection(NamedTuple):
 
 def project_views(job: RasterJob, cameras: Sequence[Camera]) -> GsplatProjection:
     """Return gsplat's projection and tile lists for cameras of one size."""
-    from gsplat.cuda._wrapper import (  # noqa: PLC0415 (needs a GPU)
-        fully_fused_projection,
-        isect_offset_encode,
-        isect_tiles,
-    )
+    from gsplat.cuda._wrapper import fully_fused_projection, isect_offset_encode, isect_tiles  # noqa: PLC0415
 
     scene, settings = job.scene, job.settings
     device, (width, height) = scene.means.device, (cameras[0].width, cameras[0].height)
@@ -129,8 +125,8 @@ def check(job: RasterJob, *, pictures: bool = False) -> None:
     different = [name for name in names if getattr(job.settings, name) != getattr(compiled, name)]
     if len(different) > 0:
         raise InputError(
-            f"gsplat {installed_gsplat_version()} is compiled with a different {', '.join(different)} than the scene needs; "
-            'use backend="triton" or "torch", which support every gsplat version'
+            f"gsplat {installed_gsplat_version()} is compiled with a different {', '.join(different)} than the scene "
+            'needs; use backend="triton" or "torch", which support every gsplat version'
         )
 
 

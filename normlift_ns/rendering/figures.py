@@ -20,7 +20,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
-from normlift_ns.options import RELEVANCY_RULES
+from normlift_ns.options import RELEVANCY_RULES, WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer, Finding, pixel_relevancy
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
@@ -37,7 +37,6 @@ from normlift_ns.rendering.colors import (
     load_font,
     prompt_colors,
 )
-from normlift_ns.session.state import WEAK_RELIABILITY
 
 _MIN_SPAN = 0.05
 """Smallest difference between the relevancies at the ends of a color scale."""
@@ -517,7 +516,7 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by the names for their files.
 
     Args:
-        names: names as from `unique_file_names`, or image paths with or without suffix; empty: three evenly spaced views.
+        names: names as from `unique_file_names`, or image paths with or without suffix (default: three views).
     Raises:
         ValueError: a name matches no training image, or several.
     """

@@ -12,13 +12,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from normlift_ns.errors import InputError
+from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Finding
 from normlift_ns.query.histogram import Histogram, suggest_threshold
 from normlift_ns.query.question import Query
 from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click, join_prompts
 from normlift_ns.session.selection import SelectionBox
-from normlift_ns.session.state import WEAK_RELIABILITY, State
+from normlift_ns.session.state import State
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,13 +13,11 @@ from typing import Generic, TypeVar
 from jaxtyping import Bool
 from torch import Tensor
 
+from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query
 from normlift_ns.session.prompts import Prompt, join_prompts
 from normlift_ns.session.selection import SelectionBox, SelectionContext
-
-WEAK_RELIABILITY = 0.6
-"""R below which the evidence of a Gaussian is weak."""
 
 
 @dataclass(frozen=True, eq=False)

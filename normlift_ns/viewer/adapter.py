@@ -429,7 +429,7 @@ class BrowserPage:
         self._client.scene.set_up_direction(direction)
 
     def listen(self) -> None:
-        """Run the script that handles keys; it writes the token, the link and the held key into the box `SESSION_LABEL`."""
+        """Run the script that handles keys; it writes the token, link and held key into the box `SESSION_LABEL`."""
         self._run(_SCRIPT)
 
     def become(self, token: str) -> None:

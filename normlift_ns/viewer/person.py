@@ -18,6 +18,7 @@ from PIL import Image
 
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.errors import InputError, describe_error
+from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer
 from normlift_ns.rasterization.rasterize import render
 from normlift_ns.rendering.colors import clip_text, prompt_rgb_tuples
@@ -32,7 +33,7 @@ from normlift_ns.session.actions import (
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, list_objects, unoccluded_viewpoint
 from normlift_ns.session.prompts import build_query, click_name, encode_prompts, is_click, join_prompts
 from normlift_ns.session.selection import SelectionBox
-from normlift_ns.session.state import WEAK_RELIABILITY, History, JobQueue, RequestToken, RequestTokens, State
+from normlift_ns.session.state import History, JobQueue, RequestToken, RequestTokens, State
 from normlift_ns.viewer.adapter import SESSION_LABEL, BrowserPage, add_button_group
 from normlift_ns.viewer.shared import (
     LOOKS,

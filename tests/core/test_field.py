@@ -167,7 +167,7 @@ def test_a_full_disk_leaves_no_manifest(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     lifted, means, source = example()
-    monkeypatch.setattr("normlift_ns.io.arrays.save_file", full_disk)
+    monkeypatch.setattr("safetensors.torch.save_file", full_disk)
     with pytest.raises(OSError, match=r"f/field\.safetensors cannot be written .*No space"):
         SemanticField.build(lifted, means, source, storage="float16").save(tmp_path / "f")
     assert list((tmp_path / "f").iterdir()) == []

@@ -149,7 +149,7 @@ def test_a_full_disk_leaves_nothing_and_says_so(counted, tmp_path, monkeypatch):
         path.write_bytes(b"half")
         raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr("normlift_ns.io.arrays.save_file", full)
+    monkeypatch.setattr("safetensors.torch.save_file", full)
     with pytest.raises(OSError, match=r"labels.*/regions/\w+\.safetensors"):
         cached(counted, tmp_path).view(IMAGE, "a.jpg")
     assert list((tmp_path / "regions").iterdir()) == []

@@ -38,7 +38,7 @@ def survey() -> dict[str, str]:
 
 
 def test_every_name_of_the_survey_is_understood(survey):
-    table = json.loads(files("normlift_ns.encoders.texts").joinpath("xkcd.json").read_text())
+    table = json.loads(files("normlift_ns.encoders").joinpath("xkcd.json").read_text())
     assert {f"xkcd:{name}": colour for name, colour in table.items()} == survey
     for name in survey:
         words = name.removeprefix("xkcd:").replace("/", " ")

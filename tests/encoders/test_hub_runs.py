@@ -57,9 +57,9 @@ def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> Non
     folder.rename(tmp_path / "gone")
     (tmp_path / "manifest.json").write_text(json.dumps(field.manifest))
     program = (
-        "import json, sys; from pathlib import Path; from normlift_ns.query.text_encoder import encoder_of\n"
+        "import json, sys; from pathlib import Path; from normlift_ns.query.text_encoder import text_encoder_for\n"
         "class Field: manifest = json.loads(Path(sys.argv[1]).read_text())\n"
-        "rows = encoder_of(Field, cache=Path(sys.argv[2])).rows(['table', 'red mug'])\n"
+        "rows = text_encoder_for(Field, cache=Path(sys.argv[2])).rows(['table', 'red mug'])\n"
         "assert not {'torch', 'transformers', 'tokenizers'} & set(sys.modules), sys.modules.keys()\n"
         "print(json.dumps(rows.tolist()))"
     )

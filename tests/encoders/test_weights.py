@@ -66,8 +66,8 @@ def test_weights_of_sam_and_a_broken_cache(empty_hub: Path, tmp_path: Path) -> N
 def test_imports_stay_light() -> None:
     code = """
 import sys
-from normlift_ns.encoders.registry import clip_weights_at_hand
-clip_weights_at_hand("ViT-B-16", "laion2b_s34b_b88k")
+from normlift_ns.encoders.registry import has_local_clip_weights
+has_local_clip_weights("ViT-B-16", "laion2b_s34b_b88k")
 assert {"torch", "open_clip", "transformers", "numpy", "skimage"}.isdisjoint(sys.modules), sys.modules.keys()
 """
     subprocess.run([sys.executable, "-c", code], check=True)

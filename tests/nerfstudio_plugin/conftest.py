@@ -14,7 +14,8 @@ import torch
 from benchmarks.captures import SHARED
 from normlift_ns import SemanticField, lift, rasterize_evidence
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.io.run_dir import load_field, run_directory
+from normlift_ns.io.run_dir import run_directory
+from normlift_ns.lifted_run import load_field
 from normlift_ns.options import SourceOptions
 from normlift_ns.pipeline import write_run
 from normlift_ns.query.question import Query

@@ -90,7 +90,7 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     assert model.field is model.config.semantics is None  # a training that goes on changes the Gaussians
 
 
-@pytest.mark.parametrize("broken", ["lift_scene", "save_question"])
+@pytest.mark.parametrize("broken", ["lift_scene", "save_query"])
 def test_a_failing_lift_leaves_the_training_whole(
     train: Callable[..., StockRun], registered: None, monkeypatch, capsys, tmp_path: Path, broken: str
 ) -> None:

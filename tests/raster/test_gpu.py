@@ -247,9 +247,9 @@ def test_the_whole_lift_equals_that_of_the_cpu():
     labels = [random_labels(camera, 9, seed=v) for v, camera in enumerate(cameras)]
     table = unit_rows(36, 512, 1, torch.float32)
     results = []
-    for device in ("cpu", "cuda"):
-        there = scene.to(device)
-        lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(device))
+    for place in ("cpu", "cuda"):
+        there = scene.to(place)
+        lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(place))
         neighbors = nearest_neighbors(there.means, 36)
         given = {"own": lifted.scalars.own_evidence, "neighbors": neighbors}
         source = refine(there.means, lifted.directions, lifted.scalars.reliability, **given)

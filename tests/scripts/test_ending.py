@@ -145,7 +145,7 @@ PROGRAM = """
 import atexit, os, sys
 from dataclasses import dataclass
 from normlift_ns.errors import InputError
-from normlift_ns.cli.common import run_process
+from normlift_ns.cli.common import run_command_process
 
 class Slow:
     def __del__(self):
@@ -161,7 +161,7 @@ class Command:
     def main(self):
 {body}
 
-run_process(Command)
+run_command_process(Command)
 """
 
 

@@ -86,7 +86,7 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     monkeypatch.setattr(studies, "SWEEPS", {"beta": (0.5,), "k": (6, 12), "delta": (0.0, 0.1)})
     flags = ("--study", "ablation", "sweeps", "signals", "timing", "baselines")
     document = scored("masks", capture / "instance", *flags)
-    results, studies = document["results"], document["studies"]
+    results, tables = document["results"], document["studies"]
     told = said(capsys)
     assert all(word in told for word in ("miou_3d", "spearman_bins", "drsplat", "SFS", "GPU"))
     assert (document["experiment_name"], document["method_name"]) == ("room", "normlift")
@@ -96,30 +96,30 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     plain = scored("masks", capture / "instance", "--refined", False)["results"]
     assert plain["miou_3d"] != results["miou_3d"]
 
-    assert list(studies) == ["ablation", "sweeps", "signals", "timing", "baselines"]
-    by_variant = {row["variant"]: row["miou_3d"] for row in studies["ablation"]}
+    assert list(tables) == ["ablation", "sweeps", "signals", "timing", "baselines"]
+    by_variant = {row["variant"]: row["miou_3d"] for row in tables["ablation"]}
     assert list(by_variant) == [*get_args(Variant), *studies.CONSENSUS_VARIANTS]
     ours = by_variant["consensus_posterior"]  # the defaults, here from stored u
     assert ours == pytest.approx(results["miou_3d"], abs=5e-3)
     assert by_variant["consensus"] == plain["miou_3d"] and len(set(by_variant.values())) > 3
-    own = [(row["parameter"], row["miou_3d"]) for row in studies["sweeps"] if row["own"]]
+    own = [(row["parameter"], row["miou_3d"]) for row in tables["sweeps"] if row["own"]]
     assert own == [(name, ours) for name in ("beta", "k", "delta")]
-    of_k = [(row["value"], row["default"], row["own"]) for row in studies["sweeps"] if row["parameter"] == "k"]
+    of_k = [(row["value"], row["default"], row["own"]) for row in tables["sweeps"] if row["parameter"] == "k"]
     assert of_k == sorted({(6, False, False), (12, False, True), (RefineConfig().k, True, False)})
-    (signals,) = studies["signals"]
+    (signals,) = tables["signals"]
     assert signals["zero.share"] == pytest.approx(results["zero_evidence_share"])
     assert signals["zero.accuracy_unrefined"] is None  # no mask tells the class of what nobody sees
     assert signals["zero.accuracy_refined"] is None
     assert signals["seen.accuracy_refined"] == pytest.approx(results["accuracy_3d"], abs=1e-6)
     assert 0 <= signals["opacity.kendall_p"] <= 1 and signals["reliability.spearman_bins"] > 0.5
     assert sum(v for k, v in signals.items() if k.startswith("histogram.")) == pytest.approx(1 - signals["zero.share"])
-    (cost,) = studies["timing"]
+    (cost,) = tables["timing"]
     stages = ("features_s", "evidence_s", "consensus_s", "lift_s", "neighbors_s", "vote_s", "store_s")
     assert cost["vote_s"] > 0 and cost["store_s"] > 0
     assert cost["total_s"] == pytest.approx(sum(cost[stage] for stage in stages))
     assert {p.name for p in tmp_path.glob("*.svg")} == {"s_sweeps.svg", "s_signals.svg"}
 
-    rows = {row["method"]: row for row in studies["baselines"]}
+    rows = {row["method"]: row for row in tables["baselines"]}
     assert list(rows) == ["normlift", "unrefined", "sfs", "occam", "vala", "drsplat"]
     assert rows["normlift"]["miou_3d"] == results["miou_3d"]
     assert [rows[name]["what"] for name in BASELINES] == list(BASELINES.values())

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from normlift_ns.options import LiftOptions, RefineConfig, SourceOptions
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -464,6 +465,8 @@ _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 def background_color(config: SplatfactoModelConfig) -> Float[Tensor, " 3"]:
     """Return splatfacto's background color outside training, RGB in 0..1; for "random", the viewer's."""
+    import torch  # noqa: PLC0415 (commands read configs before they load torch)
+
     name = config.background_color
     return torch.tensor(_VIEWER_BACKGROUND) if name == "random" else torch.tensor(NAMED_COLORS[name])
 
