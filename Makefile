@@ -34,7 +34,7 @@ check: style changed-types quick-tests
 changed-types: .venv/installed
 	@base=$$(git merge-base HEAD main 2>/dev/null || echo HEAD); \
 	{ git diff --name-only --diff-filter=d $$base; git ls-files --others --exclude-standard; } | sort -u | \
-	grep -E '^(normlift_ns|benchmarks)/.*\.py$$' | xargs -r $(BIN)/basedpyright
+	grep -E '^(normlift_ns|research)/.*\.py$$' | xargs -r $(BIN)/basedpyright
 
 QUICK := $(patsubst %,tests/core/test_%.py,lift query neighbors gaussians metrics checks)
 quick-tests: .venv/installed
@@ -79,8 +79,8 @@ docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: .venv/installed
-	$(BIN)/python -m benchmarks.cpu
-	$(BIN)/python -m benchmarks.forms
+	$(BIN)/python -m research.cpu
+	$(BIN)/python -m research.forms
 
 format: .venv/installed
 	$(BIN)/ruff check --fix .

@@ -160,7 +160,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 @pytest.fixture(scope="session")
 def room() -> DemoRoom:
     """A small demo room."""
-    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+    from tests.plain_room import plain_room  # noqa: PLC0415
 
     return plain_room(6000)
 

@@ -2,7 +2,7 @@
 
 
 def test_errors_are_within_their_bounds():
-    from benchmarks.hard_case import Setting  # noqa: PLC0415
-    from benchmarks.numerics import CASES  # noqa: PLC0415
+    from research.hard_case import Setting  # noqa: PLC0415
+    from research.numerics import CASES  # noqa: PLC0415
 
     assert [line for case in CASES for line in case.failures(case.measure(Setting(small=True)))] == []

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from benchmarks.box_overlap import box_iou, half_spaces
 from normlift_ns import InputError
 from normlift_ns.analysis.objects import OrientedBox, connected_components, find_objects, oriented_box
+from research.box_overlap import box_iou, half_spaces
 from tests.examples import examples
 from tests.scenes import generator
 

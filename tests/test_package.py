@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import normlift_ns
-from benchmarks import licences
+from research import licences
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -143,7 +143,7 @@ def test_the_folder_of_method_configs_is_a_link_for_readers():
     assert link.is_symlink() and link.resolve() == ROOT / "normlift_ns" / "method_configs"
     points = project()["entry-points"]["nerfstudio.method_configs"]
     assert all(value.startswith("normlift_ns.method_configs.") for value in points.values())
-    for path in [*ROOT.glob("normlift_ns/**/*.py"), *ROOT.glob("benchmarks/*.py"), *ROOT.glob("tests/**/*.py")]:
+    for path in [*ROOT.glob("normlift_ns/**/*.py"), *ROOT.glob("research/*.py"), *ROOT.glob("tests/**/*.py")]:
         text = path.read_text()
         assert "\nimport method_configs" not in text and "\nfrom method_configs" not in text, path
 
@@ -163,7 +163,7 @@ def test_every_dependency_and_its_licence_are_listed():
     named = [*project()["dependencies"], *(x for extra in extras for x in extra)]
     names = {re.split(r"[\s<>=!~;\[]", line)[0].lower().replace("_", "-") for line in named} - {"normlift-ns"}
     rows = [line.split("|")[1:4] for line in licences.PAGE.read_text("utf8").splitlines() if line.startswith("| ")][1:]
-    assert {row[0].strip() for row in rows} == names, "refresh the table: python -m benchmarks.licences"
+    assert {row[0].strip() for row in rows} == names, "refresh the table: python -m research.licences"
     assert all(row[1].strip() not in ("", "see its page") for row in rows)
     assert licences.packages().keys() <= names  # those of the installed metadata, which make refreshes
     assert licences.licence("pytest") == "MIT"

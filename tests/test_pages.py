@@ -23,7 +23,7 @@ The table says 7; no line ends here"""
 
 @pytest.fixture(scope="module")
 def pages() -> Any:
-    from benchmarks import pages  # noqa: PLC0415 (scikit-image, matplotlib)
+    from research import pages  # noqa: PLC0415 (scikit-image, matplotlib)
 
     return pages
 
@@ -44,7 +44,7 @@ def test_tables_of_the_pages_are_those_of_the_results_and_every_table_stands_on_
     shown = set()
     for name in pages.PAGES:
         text = (pages.DOCS / name).read_bytes().decode()
-        assert pages.outdated(text, made) == [], "refresh them: python -m benchmarks.pages"
+        assert pages.outdated(text, made) == [], "refresh them: python -m research.pages"
         assert pages.refreshed(text, made) == text
         shown |= {part.table for part in pages.split(text, made)}
     assert shown == {None, *made}

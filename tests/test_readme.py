@@ -17,9 +17,9 @@ import pytest
 import torch
 
 import normlift_ns
-from benchmarks.reference import COMMANDS, PAGE
-from benchmarks.reference import page as reference
 from normlift_ns.cli.lift import NormLift
+from research.reference import COMMANDS, PAGE
+from research.reference import page as reference
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(normlift_ns.__file__).parent
@@ -105,8 +105,8 @@ def test_options_that_are_named_exist():
 
 
 def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
-    from benchmarks.documents import documents  # noqa: PLC0415 (scikit-image)
-    from benchmarks.tables import tables  # noqa: PLC0415
+    from research.documents import documents  # noqa: PLC0415 (scikit-image)
+    from research.tables import tables  # noqa: PLC0415
 
     assert len(README.splitlines()) <= 120
     made, shown = tables(documents()), README.split("## Accuracy")[1]
@@ -126,7 +126,7 @@ def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
 
 
 def metric(document: str, key: str) -> float:
-    found = json.loads((ROOT / "benchmarks" / "results" / f"{document}.json").read_text("utf8"))["metrics"]
+    found = json.loads((ROOT / "research" / "results" / f"{document}.json").read_text("utf8"))["metrics"]
     return next(x["value"] for x in found if x["key"] == key)
 
 
@@ -164,7 +164,7 @@ def test_messages_of_troubleshooting_are_in_the_code():
 
 
 def test_the_reference_is_made_of_the_code_and_has_every_public_name():
-    assert PAGE.read_text("utf8") == reference(), "refresh it: python -m benchmarks.reference"
+    assert PAGE.read_text("utf8") == reference(), "refresh it: python -m research.reference"
     shown = re.findall(r"^::: normlift_ns\.[\w.]*?(\w+)$", (PAGE.parent / "api.md").read_text("utf8"), re.MULTILINE)
     assert sorted(shown) == sorted(normlift_ns.__all__)
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from benchmarks.captures import SHARED
 from tests.browser.person import needs_chromium
 from tests.browser.server import STOCK, Server
 from tests.browser.viewer import Tab, overlaid
-from tests.captures import needs_shared
+from tests.captures import SHARED, needs_shared
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -19,6 +19,6 @@ def room() -> DemoRoom:
 @pytest.fixture(scope="session")
 def small() -> DemoRoom:
     """A room that is built in a moment."""
-    from benchmarks.plain_room import plain_room  # noqa: PLC0415
+    from tests.plain_room import plain_room  # noqa: PLC0415
 
     return plain_room(2000)

@@ -18,7 +18,7 @@ def labels(room: DemoRoom) -> list[torch.Tensor]:
 
 
 def test_same_arguments_same_room(small: DemoRoom):
-    from benchmarks.plain_room import plain_room  # noqa: PLC0415 (built as the demo's is, but faster)
+    from tests.plain_room import plain_room  # noqa: PLC0415 (built as the demo's is, but faster)
 
     again, other = plain_room(2000, seed=0), plain_room(2000, seed=4)
     for name in ("means", "quats", "scales", "opacities"):

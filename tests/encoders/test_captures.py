@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.captures import SHARED
-from tests.captures import needs_shared
+from tests.captures import SHARED, needs_shared
 
 CAPTURES = SHARED / "captures"
 pytestmark = [pytest.mark.slow, needs_shared]

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.captures import SHARED
-from benchmarks.plain_room import plain_room
 from normlift_ns.demo.capture import write_capture, write_splatfacto_run
-from tests.captures import needs_shared
+from tests.captures import SHARED, needs_shared
 from tests.golden.summary import compare, run_commands, summarize
+from tests.plain_room import plain_room
 
 GOLDEN = Path(__file__).with_name("golden.json")
 pytestmark = pytest.mark.slow

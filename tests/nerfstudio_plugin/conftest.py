@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks.captures import SHARED
 from normlift_ns import SemanticField, lift, rasterize_evidence
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.io.run_dir import run_directory
@@ -20,6 +19,7 @@ from normlift_ns.options import SourceOptions
 from normlift_ns.pipeline import write_run
 from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import ENCODER_KEYS
+from tests.captures import SHARED
 from tests.nerfstudio_plugin.stock_run import StockRun, train_splatfacto, write_dataset
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.captures import SHARED
 from normlift_ns.rasterization.rasterize import render_image
+from tests.captures import SHARED
 from tests.nerfstudio_plugin.conftest import opened
 
 pytestmark = pytest.mark.slow

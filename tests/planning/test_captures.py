@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.captures import SHARED
-from tests.captures import needs_shared
+from tests.captures import SHARED, needs_shared
 
 PROGRAM = """
 import json, sys, time

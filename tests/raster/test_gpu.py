@@ -7,12 +7,11 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 import torch
 
-from benchmarks.captures import SHARED, trained_scene, training_cameras
 from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.core import device
 from normlift_ns.rasterization import gsplat, triton
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob
-from tests.captures import fixture_view, needs_shared, weight_fixtures
+from tests.captures import SHARED, fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
 from tests.kernels.test_regions import hard_scene
 from tests.raster.test_gsplat_fixtures import fixture_difference
 from tests.scenes import dense, generator, orbit, random_labels, random_scene, unit_rows

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.captures import trained_scene, training_cameras
 from normlift_ns import rasterize_evidence
-from tests.captures import fixture_view, needs_shared, weight_fixtures
+from tests.captures import fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
 
 pytestmark = [pytest.mark.slow, needs_shared]
 scene_of = cache(trained_scene)

@@ -17,8 +17,8 @@ import pytest
 import tyro
 
 import normlift_ns
-from benchmarks.reference import COMMANDS
 from normlift_ns.cli import common, start
+from research.reference import COMMANDS
 from tests.scripts.conftest import run_entry
 
 if sys.version_info >= (3, 11):

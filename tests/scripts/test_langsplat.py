@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from benchmarks.captures import SHARED
 from normlift_ns import Scene, open_run, render
 from normlift_ns.cli import lift, query
 from normlift_ns.cli.demo import iou_per_class
 from normlift_ns.encoders.text_files import TextEmbeddingFile
 from normlift_ns.query.engine import pixel_relevancy
-from tests.captures import clip_vectors, needs_shared
+from tests.captures import SHARED, clip_vectors, needs_shared
 from tests.scripts.conftest import run_entry
 
 pytestmark = needs_shared
@@ -91,8 +90,8 @@ def write_features(capture: Path, folder: Path, vectors: NDArray, views: int, se
 @pytest.mark.parametrize(("draws", "least"), [(1, 0.9), pytest.param(3, 0.92, marks=pytest.mark.extra)])
 def test_damaged_masks_lift_to_the_right_things(draws, least, nerfstudio, tmp_path, monkeypatch):
     """mIoU over the Gaussians of 13 classes, mean of some draws of the damage."""
-    from benchmarks.plain_room import plain_room  # noqa: PLC0415
     from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
+    from tests.plain_room import plain_room  # noqa: PLC0415
 
     room = plain_room()
     names = json.loads((SHARED / "clip_vectors" / "lvis_v1_names.json").read_text())

@@ -29,8 +29,8 @@ TABLETOP = SHARED / "captures" / "outputs" / "tabletop" / "splatfacto" / "run" /
 @pytest.fixture(scope="module")
 def trained(nerfstudio: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A room of three grains of Gaussians."""
-    from benchmarks.plain_room import plain_room  # noqa: PLC0415
     from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415
+    from tests.plain_room import plain_room  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("several")
     room = plain_room(20_000)

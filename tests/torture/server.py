@@ -19,9 +19,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.plain_room import plain_room
 from normlift_ns.cli import export, lift, query
 from normlift_ns.demo.capture import write_capture, write_splatfacto_run
+from tests.plain_room import plain_room
 from tests.torture import flips
 
 _WRITE = os.O_WRONLY | os.O_RDWR

@@ -21,7 +21,7 @@ MOST_REST = 8_000
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
 def test_an_answer_costs_32_bytes_per_drawn_gaussian(tmp_path):
-    from benchmarks.view import Client  # noqa: PLC0415
+    from research.view import Client  # noqa: PLC0415
 
     rests, block = [], 14**3
     door, people = Door("127.0.0.1", free_port()), People(run_of(tmp_path, cubes(14)))

@@ -1,0 +1,83 @@
+"""Boxes of the tabletop's objects from exact and from damaged masks, against boxes of the true Gaussians.
+
+    python -m research.boxes --views 16
+
+True Gaussians are those of the controlled benchmark (`research.synthetic_scenes.PURITY`). Boxes are made of both alike, but the
+objects found are connected parts, of which the largest counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from normlift_ns import RefineConfig, SemanticField, consensus, lift, refine
+from normlift_ns.analysis.objects import oriented_box
+from normlift_ns.exports import answer_instances
+from normlift_ns.query.engine import Answer, run_query
+from normlift_ns.query.question import Query
+from research.box_overlap import box_iou
+from research.damage import STEPS, Damage, observe
+from research.synthetic_scenes import Words, World, real_words, tabletop
+
+EXACT = "exact masks"
+DAMAGES: dict[str, Damage] = {EXACT: Damage(noise=0.0), "hard": STEPS["hard"]}
+
+
+def asked(world: World, words: Words, damage: Damage, seed: int = 0) -> Answer:
+    """The answer of a lift with default options; every class is asked, and a Gaussian belongs to the best."""
+    observed = observe(world, words, damage, seed)
+    table = consensus(
+        observed.evidence, observed.features, level=torch.zeros(len(observed.features), dtype=torch.int64)
+    )
+    lifted = lift(observed.evidence, table.features)
+    means, own = world.scene.means, lifted.scalars.own_evidence
+    source = refine(means, lifted.directions, lifted.scalars.reliability, RefineConfig(), own=own)
+    field = SemanticField.build(lifted, means, source)
+    texts = tuple(str(c) for c in range(world.classes))
+    vectors = words.classes.double().cpu().numpy()
+    found = run_query(field, means, Query(texts, vectors, rule="cosine", threshold=-2.0))
+    return replace(found, selected=found.valid[:, None].expand_as(found.relevancy))
+
+
+def box_scores(means: Tensor, truth: Tensor, found: Answer) -> list[float]:
+    """IoU of the box of every class: of its true Gaussians, and of the largest connected part that is found."""
+    instances = answer_instances(found)
+    scores = []
+    for c in range(len(found.texts)):
+        first = next((i for i, of in enumerate(instances.classes, 1) if of == c + 1), None)
+        if first is None:
+            scores.append(0.0)
+            continue
+        both = (means[truth == c], means[instances.instance_id == first])
+        scores.append(box_iou(*(oriented_box(points.double().cpu().numpy()) for points in both)))
+    return scores
+
+
+def table(rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> str:
+    """As markdown."""
+    lines = [f"| object | {' | '.join(rows)} |", "|---" * (1 + len(rows)) + "|"]
+    for i, name in enumerate(names):
+        lines.append(f"| {name} | {' | '.join(f'{scores[i]:.2f}' for scores in rows.values())} |")
+    means = (sum(scores) / len(scores) for scores in rows.values())
+    return "\n".join([*lines, f"| mean | {' | '.join(f'{mean:.3f}' for mean in means)} |"])
+
+
+def main() -> None:
+    from normlift_ns.evaluation.protocols import read_names  # noqa: PLC0415
+    from tests.captures import SHARED  # noqa: PLC0415
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--views", type=int, help="of an even spread; by default all 44")
+    world, words = tabletop(parser.parse_args().views), real_words()
+    names = read_names(SHARED / "captures" / "tabletop" / "labels.json").classes
+    rows = {step: box_scores(world.scene.means, world.truth, asked(world, words, d)) for step, d in DAMAGES.items()}
+    print(table(rows, names))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""What all cells of one scene and one kind of region share: evidence, neighbours, voters, words and looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import torch
+from torch import Tensor
+
+from normlift_ns import Evidence, lift, nearest_neighbors
+from normlift_ns.core.consensus import apply_consensus, region_overlaps, sample_gaussians, total_view_weights
+from research.batched_votes import Result, Voters, results, voters_of
+from research.candidates import Candidate
+from research.damage import Observed, observe
+from research.features import LENGTHS, Looks, orthogonal_words, world_looks
+from research.pseudo_regions import Pieces, observe_pieces, pieces
+from research.rule import Cell, damage_of
+from research.second_room import second
+from research.synthetic_scenes import Words, World, demo, made_words, real_words, tabletop, with_floaters
+from research.third_room import third
+
+NEIGHBORS = 36
+SAMPLE = 50
+"""Gaussians of every region that the consensus looks at."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How large everything is."""
+
+    voters: int | None = None
+    """Gaussians that vote and count; None: all whose class is known."""
+    gaussians: int | None = None
+    """Of the rooms; None: as many as they have by default."""
+    views: int | None = None
+    """Of the tabletop; None: all."""
+    room_views: int | None = None
+    room_width: int | None = None
+    """Views of the rooms, and pixels across; None: as many as they have by default."""
+    pieces: int | None = None
+    """Per image; None: as many as the source makes by default."""
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a site is built for."""
+
+    scene: str
+    kind: str
+    floaters: bool
+
+    @staticmethod
+    def of(cell: Cell) -> Place:
+        """Where a cell is run."""
+        return Place(cell.scene, cell.kind, cell.damage == "floaters")
+
+
+class Site:
+    """Runs the cells of one place."""
+
+    def __init__(self, place: Place, settings: Settings) -> None:
+        base = base_world(place.scene, settings)
+        whole = with_floaters(base) if place.floaters else base
+        self.words = words_of(place.scene, whole.classes)
+        near = nearest_neighbors(whole.scene.means.to(settings.device), NEIGHBORS)
+        voters = voters_of(near, whole.truth.to(settings.device), whole.classes, sample_of(whole.truth, settings))
+        kept = None
+        if settings.voters is not None:
+            kept = voters.group[voters.group >= 0].unique()
+            voters = renumbered(voters, kept)
+        self.voters = voters
+        if place.kind == "masks":
+            self.cut: Pieces | None = None
+            self._whole = whole
+            self.world = ready(whole, restricted(whole.evidence, kept), settings.device)
+        else:
+            cut = pieces(whole, place.kind, settings.pieces)
+            self.world = ready(whole, whole.evidence, settings.device)
+            evidence = restricted(cut.evidence, kept).to(settings.device)
+            self._looks = cut.looks
+            self.cut = replace(cut, world=self.world, evidence=evidence)
+
+    @cached_property
+    def looks(self) -> Looks:
+        """Histograms of the cells, or of the pieces."""
+        return world_looks(self._whole) if self.cut is None else self._looks
+
+    def observed(self, cell: Cell, seed: int) -> Observed:
+        """What a lift gets in a cell."""
+        if cell.statistic == "histogram":
+            words, lengths = self.looks, None
+        else:
+            words, lengths = self.words[cell.statistic], LENGTHS[cell.statistic]
+        if self.cut is None:
+            return observe(self.world, words, damage_of(cell), seed, lengths)
+        return observe_pieces(self.cut, words, damage_of(cell), seed, lengths)
+
+    def run(self, cell: Cell, seed: int, candidates: Sequence[Candidate]) -> dict[str, Result]:
+        """All candidates on one observation, in their order."""
+        observed = self.observed(cell, seed)
+        classes = (self.looks if cell.statistic == "histogram" else self.words[cell.statistic]).classes
+        by_table: dict[float | None, list[Candidate]] = {}
+        for one in candidates:
+            by_table.setdefault(one.consensus, []).append(one)
+        tables = agreed_tables(observed.evidence, observed.features, [p for p in by_table if p is not None])
+        found: dict[str, Result] = {}
+        seen = lift(observed.evidence, observed.features)
+        for power, some in by_table.items():  # R as regions were seen, as `normlift_ns.pipeline` has it
+            lifted = seen if power is None else replace(lift(observed.evidence, tables[power]), scalars=seen.scalars)
+            found |= results(some, lifted, self.voters, classes.to(observed.features.device))
+        return {one.name: found[one.name] for one in candidates}
+
+
+def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float]) -> dict[float, Tensor]:
+    """F' of every power; the overlaps of regions are computed once."""
+    if len(powers) == 0:
+        return {}
+    chosen, chance = sample_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
+    rows, total = evidence.rows.select_rows(chosen), total_view_weights(evidence, chosen)
+    overlaps = region_overlaps(rows, evidence.region_view, chance, total)
+    return {power: apply_consensus(features, overlaps, power) for power in powers}
+
+
+@lru_cache(maxsize=1)
+def base_world(scene: str, settings: Settings) -> World:
+    """A scene, on the CPU."""
+    if scene == "tabletop":
+        return tabletop(settings.views)
+    given = {"num_gaussians": settings.gaussians, "views": settings.room_views, "width": settings.room_width}
+    room = {"demo": demo, "second": second, "third": third}[scene]
+    return room(**{key: value for key, value in given.items() if value is not None})
+
+
+def words_of(scene: str, classes: int) -> dict[str, Words]:
+    """Vectors of the classes by statistic: CLIP's for the tabletop, made ones as close to each other for the rooms."""
+    close = real_words() if scene == "tabletop" else made_words(classes)
+    return {name: orthogonal_words(classes) if name == "orthogonal" else close for name in LENGTHS}
+
+
+def sample_of(truth: Tensor, settings: Settings) -> Tensor | None:
+    """The Gaussians that vote, in order; None: all whose class is known."""
+    if settings.voters is None:
+        return None
+    known = (truth >= 0).nonzero().squeeze(1)
+    chosen = known[torch.randperm(len(known), generator=torch.Generator().manual_seed(0))[: settings.voters]]
+    return chosen.sort().values.to(settings.device)
+
+
+def renumbered(voters: Voters, kept: Tensor) -> Voters:
+    """The voters of a scene of which only some Gaussians are kept."""
+    group = torch.searchsorted(kept, voters.group.clamp(min=0))
+    return replace(voters, group=torch.where(voters.group >= 0, group, -1))
+
+
+def restricted(evidence: Evidence, kept: Tensor | None) -> Evidence:
+    """The evidence of some Gaussians; None: of all."""
+    if kept is None:
+        return evidence
+    rows, unlabeled = (x.select_rows(kept.cpu()) for x in (evidence.rows, evidence.unlabeled))
+    return replace(evidence, rows=rows, unlabeled=unlabeled)
+
+
+def ready(world: World, evidence: Evidence, device: str) -> World:
+    """The world with other evidence, for observations on a device."""
+    order = world.azimuth_rank
+    moved = replace(world, evidence=evidence).to(device)
+    moved.__dict__["azimuth_rank"] = order
+    return moved

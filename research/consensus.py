@@ -1,0 +1,178 @@
+"""Which R says of a consensus's answers how good they are, and which one a vote should use: that of F or that of F'.
+
+    python -m research.consensus                 tabletop (half of its views), plain room and second room
+    python -m research.consensus --minutes 9     no new observation after so many minutes; the same command goes on
+    python -m research.consensus --quick         plain room of 20,000 Gaussians, two steps, one seed
+
+Writes results/consensus.json. Damage and seeds are those on which no parameter was fitted (`fit.HELD_OUT`, seeds from
+200 on), and the two of the ladder whose mistakes are not independent. Of every observation: Kendall's tau of R and of
+whether the unrefined answer of F' is right, over all Gaussians whose class is known; Spearman's of ten bins of equal
+count by R and the accuracy in each, where that varies; and mIoU after the posterior vote with either R, of a sample.
+The R with the higher mean of both over scenes is the one to store. Accuracy of all methods: `research.accuracy`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from normlift_ns import Neighbors, RefineConfig, lift, nearest_neighbors, refine
+from normlift_ns.core.consensus import consensus
+from normlift_ns.core.metrics import classify, kendall, spearman
+from normlift_ns.evaluation.studies import accuracy_bins
+from research.accuracy import scores_3d
+from research.accuracy_report import mean_and_interval
+from research.damage import STEPS, observe
+from research.fit import HELD_OUT
+from research.report import RESULTS, Report
+from research.rows import append, read_rows
+from research.second_room import second
+from research.synthetic_scenes import Words, World, demo, made_words, real_words, tabletop
+from research.variants import Scores, lifted_scores, only
+
+SCENES = ("tabletop", "demo", "second")
+DAMAGES = (*HELD_OUT, "group", "arc")
+FIRST_SEED = 200
+VIEWS = 22
+"""Training views of the tabletop."""
+VARYING = 0.05
+"""Bins between which accuracy differs by less rank nothing."""
+SOURCES = ("F", "F'")
+
+
+def make_world(name: str, gaussians: int) -> tuple[World, Words]:
+    """A scene and the vectors of its classes."""
+    if name == "tabletop":
+        return tabletop(VIEWS), real_words()
+    world = demo(gaussians) if name == "demo" else second(gaussians)
+    return world, made_words(world.classes)
+
+
+def observation(
+    world: World, classes: Tensor, words: Words, voting: Neighbors, some: Tensor, step: str, seed: int
+) -> dict[str, Any]:
+    """One row."""
+    observed, means = observe(world, words, STEPS[step], seed), world.scene.means
+    found = consensus(observed.evidence, observed.features)
+    lifts = {name: lift(observed.evidence, x) for name, x in zip(SOURCES, (observed.features, found.features))}
+    answers, known = {name: lifted_scores(x, classes) for name, x in lifts.items()}, world.truth >= 0
+    correct = (classify(*answers["F'"]) == world.truth)[known]
+    row: dict[str, Any] = {"agreement": found.agreement[0]}
+    for name, lifted in lifts.items():
+        r, own = lifted.scalars.reliability, lifted.scalars.own_evidence
+        source = refine(means, lifts["F'"].directions, r, RefineConfig(vote="posterior"), own=own, neighbors=voting)
+        voted = Scores(*(x[source.long()] for x in answers["F'"]))
+        row[name] = {
+            "miou": scores_3d(world, answers[name], some)["miou"],
+            "voted": scores_3d(world, voted, some)["miou"],
+            "kendall": kendall(r[known].cpu(), correct.double().cpu()),
+            "bins": accuracy_bins(r[known], correct),
+        }
+    return row
+
+
+def run_all(arguments: argparse.Namespace, steps: Sequence[str], deadline: float) -> list[dict[str, Any]]:
+    """One row per scene, step and seed, until the deadline (`time.time`)."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    run = {"voters": arguments.voters, "gaussians": arguments.gaussians, "views": VIEWS}
+    rows = read_rows(arguments.rows, run)
+    done = {(row["scene"], row["step"], row["seed"]) for row in rows}
+    for name in arguments.scenes:
+        every = [(step, FIRST_SEED + seed) for seed in range(arguments.seeds) for step in steps]
+        missing = [x for x in every if (name, *x) not in done]
+        if len(missing) == 0 or time.time() > deadline:
+            continue
+        there, words = make_world(name, arguments.gaussians)
+        world, classes = there.to(device), words.classes.to(device)
+        known = (world.truth >= 0).nonzero().squeeze(1)
+        g = torch.Generator().manual_seed(0)
+        some = known[torch.randperm(len(known), generator=g)[: arguments.voters].to(device)]
+        voting = only(nearest_neighbors(world.scene.means, RefineConfig().k), some)
+        for step, seed in missing:
+            if time.time() > deadline:
+                break
+            found = observation(world, classes, words, voting, some, step, seed)
+            rows.append({"scene": name, "step": step, "seed": seed, **found})
+            append(arguments.rows, rows[-1])
+            shown = (f"{x}: {found[x]['kendall']:.3f}, voted {found[x]['voted']:.1f}" for x in SOURCES)
+            print(f"{name}, {step}, seed {seed}: R of", "; of ".join(shown), flush=True)
+    return rows
+
+
+def ranks(row: dict[str, Any], source: str) -> float | None:
+    """Spearman's correlation of ten bins, None where accuracy hardly varies by either R."""
+    if max(np.ptp(row[x]["bins"]) for x in SOURCES) < VARYING:
+        return None
+    return spearman(torch.arange(10.0), torch.tensor(row[source]["bins"]))
+
+
+def summarize(rows: list[dict[str, Any]], report: Report) -> None:
+    """Means with intervals over observations: of all scenes, of each, and of each step."""
+    scenes, steps = (list(dict.fromkeys(row[key] for row in rows)) for key in ("scene", "step"))
+    groups = {"all": rows}
+    groups |= {scene: [row for row in rows if row["scene"] == scene] for scene in scenes}
+    groups |= {f"step {step}": [row for row in rows if row["step"] == step] for step in steps}
+    for group, some in groups.items():
+        for source in SOURCES:
+            for key, unit in (("kendall", "tau"), ("miou", "points"), ("voted", "points")):
+                _add(report, f"{group}.{source}.{key}", [row[source][key] for row in some], unit)
+            found = [x for row in some if (x := ranks(row, source)) is not None]
+            if len(found) > 0:
+                _add(report, f"{group}.{source}.spearman_bins", found, f"{len(found)} of {len(some)} observations")
+            lowest = [100 * row[source]["bins"][0] for row in some]
+            _add(report, f"{group}.{source}.lowest_tenth", lowest, "points, accuracy of the lowest tenth by R")
+        for key in ("kendall", "voted"):
+            gain = [row["F'"][key] - row["F"][key] for row in some]
+            _add(report, f"{group}.difference.{key}", gain, "R of F' against R of F")
+
+
+def _add(report: Report, key: str, values: Sequence[float], unit: str) -> None:
+    mean, half = mean_and_interval(values)
+    report.add(key, mean, unit)
+    report.add(f"{key}_ci95", half, "half of the 95 % interval")
+
+
+def main(arguments: argparse.Namespace) -> None:
+    torch.set_grad_enabled(False)
+    deadline = float("inf") if arguments.minutes is None else time.time() + 60 * arguments.minutes
+    steps = DAMAGES
+    if arguments.quick:
+        arguments.scenes, arguments.gaussians, arguments.seeds, steps = ["demo"], 20_000, 1, ("hard", "group")
+    rows = run_all(arguments, steps, deadline)
+    wanted = set(wanted_rows(arguments, steps))
+    rows = [row for row in rows if (row["scene"], row["step"], row["seed"]) in wanted]
+    if len(rows) < len(wanted):
+        sys.exit(f"{len(rows)} of {len(wanted)} observations are done; the same command goes on")
+    report = Report("consensus")
+    report.add("voters", arguments.voters, "Gaussians per scene that vote and count for mIoU")
+    report.add("seeds", arguments.seeds, f"repeats, from {FIRST_SEED} on")
+    summarize(rows, report)
+    report.write(arguments.output)
+
+
+def wanted_rows(arguments: argparse.Namespace, steps: Sequence[str]) -> Iterator[tuple[str, str, int]]:
+    """Scene, step and seed of every observation."""
+    for scene in arguments.scenes:
+        for step in steps:
+            yield from ((scene, step, FIRST_SEED + seed) for seed in range(arguments.seeds))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a small scene, two steps, one seed")
+    parser.add_argument("--voters", type=int, default=2500, help="Gaussians that vote and count for mIoU")
+    parser.add_argument("--gaussians", type=int, default=40_000, help="of each room")
+    parser.add_argument("--seeds", type=int, default=2, help="repeats")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
+    parser.add_argument("--minutes", type=float, help="no observation begins later than this")
+    parser.add_argument("--rows", type=Path, default=RESULTS / "consensus_rows.jsonl", help="finished observations")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    main(parser.parse_args())

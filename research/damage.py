@@ -1,0 +1,239 @@
+"""A ladder of damage to masks and their features, with the observation that a lift gets; pure functions with a seed.
+
+What features are made of stands in `research.features`. `LADDER` is version 0.1's 13 steps, whose numbers do not
+change: what later steps draw comes from a generator of their own. `STEPS` adds two whose mistakes are not independent
+from mask to mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from normlift_ns import Evidence
+from research.features import Lengths, Looks, mask_features, mask_looks, mistaken
+from research.synthetic_scenes import Cells, Words, World, block_side
+
+LATER = 2**20
+"""Added to the seed of what the steps after version 0.1's draw, so that the others keep their numbers."""
+GROUP = (3, 6)
+"""Fewest and most things that share one mask in a view of damage `grouped`."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """How much goes wrong; the default is the first step of the ladder, features with noise and nothing else."""
+
+    noise: float = 1.2
+    """Length of the noise of every mask in every view; a text vector has length 1."""
+    wrong: float = 0.0
+    """Share of masks whose feature is that of another class, near ones more often."""
+    merged: float = 0.0
+    """Share of masks that are one with another mask of their view; the larger gives the class."""
+    split: float = 0.0
+    """Share of masks cut in two through their middle; each half has its own noise and its own mistakes."""
+    dropped: float = 0.0
+    """Share of masks that are missing: unlabelled pixels."""
+    shifted: float = 0.0
+    """Blocks (a fortieth of the image's width) by which every mask is off, in a direction of its own; of overlapping
+    masks the later wins."""
+    boundary: float = 0.0
+    """Share of cells that take the label found two blocks away in a random direction: frayed edges."""
+    pose: float = 0.0
+    """Blocks by which all masks of a view are off together: what a rotation error of the pose does, to first order."""
+    views: int | None = None
+    """Use so many views, spread evenly from a random start; None: all."""
+    dominant: float = 1.0
+    """Factor on the weight of one random view of every five, as if their images had so many times the pixels."""
+    floaters: bool = False
+    """The scene has 5 % more Gaussians floating before the cameras; see `synthetic_scenes.with_floaters`."""
+    grouped: float = 0.0
+    """Share of the views in which 3 to 6 of the things in sight, those whose masks are nearest to a random one of them,
+    share one mask; the largest gives the class."""
+    arc: float = 0.0
+    """Every object has one wrong class, the same over this share of all views: neighbours by azimuth around it."""
+
+
+MILD = Damage(wrong=0.1, merged=0.1, dropped=0.1, boundary=0.15)
+LADDER = {
+    "noise only": Damage(),
+    "mild": MILD,
+    "noise": replace(MILD, noise=2.5),
+    "wrong classes": replace(MILD, wrong=0.35),
+    "merged masks": replace(MILD, merged=0.4),
+    "split masks": replace(MILD, split=0.7, wrong=0.25),
+    "shifted masks": replace(MILD, shifted=1.0),
+    "dropped masks": replace(MILD, dropped=0.6),
+    "few views": replace(MILD, views=4),
+    "dominant view": replace(MILD, dominant=64.0),
+    "pose noise": replace(MILD, pose=1.0),
+    "floaters": replace(MILD, floaters=True),
+    "hard": Damage(2.0, wrong=0.3, merged=0.2, dropped=0.25, boundary=0.35, shifted=0.4),
+}
+"""Version 0.1's."""
+STEPS = LADDER | {"group": replace(MILD, grouped=0.4), "arc": replace(MILD, arc=0.4)}
+
+
+class Observed(NamedTuple):
+    """What a lift gets."""
+
+    evidence: Evidence
+    features: Tensor
+    """[S, D] unit."""
+    columns: Tensor
+    """[1, C'] region of every cell of the chosen views, -1 for none."""
+    views: list[int]
+
+
+def observe(world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | None = None) -> Observed:
+    """Masks and features of the world after the damage. The same arguments give the same result on any device.
+
+    Args:
+        words: what features are made of; with `Looks` they are histograms of what the damaged masks show.
+        lengths: of the parts of features that are made of words.
+    """
+    g, later = (torch.Generator().manual_seed(seed + more) for more in (0, LATER))
+    cells = world.cells
+    label = masks_of_cells(cells, world.classes, damage, g)
+    size = torch.bincount(_key(cells.view, label, world.classes)[label >= 0], minlength=len(cells.maps) * world.classes)
+    size = size.view(-1, world.classes)
+    joined, dropped = _merge_and_drop(size, damage, g)
+    if damage.grouped > 0:
+        joined = _grouped(cells, label, size, damage, later).gather(1, joined)
+    half = _halves(cells, label, world.classes, damage, g)
+    final = torch.where(label >= 0, joined[cells.view, label.clamp(min=0)], -1)
+    gone = (final < 0) | dropped[cells.view, final.clamp(min=0)]
+    chosen = choose_views(len(cells.maps), damage, g)
+    keep = torch.zeros(len(cells.maps), dtype=torch.bool)
+    keep[chosen] = True
+    key = torch.where(gone, -1, _key(cells.view, final, world.classes) * 2 + half)
+    present, index = key[keep[cells.view]].unique(return_inverse=True)
+    index = index - int(len(present) > 0 and int(present[0]) < 0)
+    present = present[present >= 0]
+    masks, view = present // 2 % world.classes, present // (2 * world.classes)
+    forced = _arc(world, words.classes, damage, later)[view, masks] if damage.arc > 0 else torch.full_like(masks, -1)
+    if isinstance(words, Looks):
+        whole = torch.full((len(cells.view),), -1)
+        whole[keep[cells.view]] = index
+        features = mask_looks(words, whole, masks, forced, damage.wrong, g)
+    else:
+        features = mask_features(words, masks, forced, damage.wrong, damage.noise, lengths or Lengths(), g)
+    evidence = world.evidence
+    if damage.dominant > 1:
+        evidence = _weighted(evidence, _factors(len(cells.maps), damage, g).to(evidence.rows.weight))
+    if len(chosen) < len(cells.maps):
+        evidence = evidence.select_views(chosen)
+    renumbered = torch.full((len(cells.maps),), -1)
+    renumbered[chosen] = torch.arange(len(chosen))
+    region_view = renumbered[view].int()
+    columns = index[None]
+    return Observed(evidence.regroup(columns, region_view), features.to(world.scene.means.device), columns, chosen)
+
+
+def masks_of_cells(cells: Cells, classes: int, damage: Damage, g: torch.Generator) -> Tensor:
+    """[C] class of the mask that every cell lies in after masks moved and frayed, -1 for none."""
+    views = len(cells.maps)
+    whole = damage.pose * block_side(cells.maps) * _unit(views, g)
+    each = damage.shifted * block_side(cells.maps) * _unit(views * classes, g).view(views, classes, 2)
+    place = cells.centre - whole[cells.view]
+    label = _look_up(cells, place) if damage.pose > 0 else cells.mask.clone()
+    if damage.shifted > 0:
+        moved = torch.full_like(label, -1)
+        for c in range(classes):
+            moved[_look_up(cells, place - each[cells.view, c]) == c] = c
+        label = moved
+    aside = place + 2 * block_side(cells.maps) * _unit(len(place), g)
+    frayed = torch.rand(len(place), generator=g) < damage.boundary
+    return torch.where(frayed, _look_up(cells, aside), label) if damage.boundary > 0 else label
+
+
+def _look_up(cells: Cells, place: Tensor) -> Tensor:
+    """Exact class at places [C, 2] of the cells' views; that of the nearest pixel outside of the image."""
+    height, width = cells.maps.shape[1:]
+    x, y = place[:, 0].floor().long().clamp(0, width - 1), place[:, 1].floor().long().clamp(0, height - 1)
+    return cells.maps[cells.view, y, x]
+
+
+def _merge_and_drop(size: Tensor, damage: Damage, g: torch.Generator) -> tuple[Tensor, Tensor]:
+    """[V, K] what every mask becomes part of, and whether that is missing."""
+    views, classes = size.shape
+    joins = torch.rand(views, classes, generator=g) < damage.merged
+    chance = torch.rand(views, classes, classes, generator=g) * (size > 0)[:, None] * (1 - torch.eye(classes))
+    partner = chance.argmax(dim=2)
+    partner = torch.where(joins & (size.gather(1, partner) > size), partner, torch.arange(classes))
+    return partner, torch.rand(views, classes, generator=g) < damage.dropped
+
+
+def _grouped(cells: Cells, label: Tensor, size: Tensor, damage: Damage, g: torch.Generator) -> Tensor:
+    """[V, K] what every mask becomes part of."""
+    views, classes = size.shape
+    partner = torch.arange(classes).repeat(views, 1)
+    key, there = _key(cells.view, label.clamp(min=0), classes), (label >= 0).float()
+    middle = torch.zeros(views * classes, 2).index_add_(0, key, cells.centre * there[:, None])
+    middle = (middle / size.view(-1, 1).clamp(min=1)).view(views, classes, 2)
+    for view in torch.randperm(views, generator=g)[: round(damage.grouped * views)].tolist():
+        things = (size[view] > 0).nonzero().squeeze(1)
+        count = int(torch.randint(GROUP[0], GROUP[1] + 1, (), generator=g))
+        first = int(torch.randint(0, max(1, len(things)), (), generator=g))
+        if len(things) >= GROUP[0]:
+            far = (middle[view, things] - middle[view, things[first]]).norm(dim=1)
+            group = things[far.argsort()[:count]]
+            partner[view, group] = group[size[view, group].argmax()]
+    return partner
+
+
+def _arc(world: World, classes: Tensor, damage: Damage, g: torch.Generator) -> Tensor:
+    """[V, K] wrong class of every object in the views of its arc, -1 in the others."""
+    rank = world.azimuth_rank
+    views = len(rank)
+    start = torch.randint(0, views, (world.classes,), generator=g)
+    wrong = mistaken(torch.arange(world.classes), classes, g)
+    return torch.where((rank - start) % views < round(damage.arc * views), wrong, -1)
+
+
+def _halves(cells: Cells, label: Tensor, classes: int, damage: Damage, g: torch.Generator) -> Tensor:
+    """[C] 0 or 1: side of the cut of its mask that a cell lies on."""
+    views = len(cells.maps)
+    key = _key(cells.view, label.clamp(min=0), classes)
+    count = torch.bincount(key, minlength=views * classes).clamp(min=1)[:, None]
+    middle = torch.zeros(views * classes, 2).index_add_(0, key, cells.centre) / count
+    across = _unit(views * classes, g)
+    cut = torch.rand(views * classes, generator=g) < damage.split
+    return (((cells.centre - middle[key]) * across[key]).sum(1) > 0).long() * cut[key]
+
+
+def choose_views(views: int, damage: Damage, g: torch.Generator) -> list[int]:
+    """The views that are used, in order."""
+    if damage.views is None:
+        return list(range(views))
+    start = int(torch.randint(0, views, (), generator=g))
+    return sorted({(start + i * views // damage.views) % views for i in range(damage.views)})
+
+
+def _factors(views: int, damage: Damage, g: torch.Generator) -> Tensor:
+    factor = torch.ones(views)
+    factor[torch.randperm(views, generator=g)[: max(1, views // 5)]] = damage.dominant
+    return factor
+
+
+def _weighted(evidence: Evidence, factor: Tensor) -> Evidence:
+    """Evidence with a factor [V] on the weight of each view."""
+    rows, blank = evidence.rows, evidence.unlabeled
+    return replace(
+        evidence,
+        rows=replace(rows, weight=rows.weight * factor[evidence.region_view[rows.column.long()].long()]),
+        unlabeled=replace(blank, weight=blank.weight * factor[blank.column.long()]),
+    )
+
+
+def _key(view: Tensor, mask: Tensor, classes: int) -> Tensor:
+    return view * classes + mask
+
+
+def _unit(count: int, g: torch.Generator) -> Tensor:
+    """[count, 2] unit vectors."""
+    return normalize(torch.randn(count, 2, generator=g), dim=1)

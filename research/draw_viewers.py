@@ -1,0 +1,74 @@
+"""docs/viewer_own.jpg, viewer_overlay.jpg and viewer_isolated.jpg: both viewers on the demo room, in Chromium.
+
+python -m research.draw_viewers [config.yml of the lifted demo room]      after make demo; nothing is saved in the run
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import Browser, Page
+
+from research.plots import DOCS
+from tests.browser.person import PANEL, chromium, coloured
+from tests.browser.viewer import TITLE, Own, Tab, ns_viewer, own_viewer
+
+CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
+OWN, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"
+"""Things that the first views of the two viewers show."""
+CLICKED = (0.35, 0.85)
+"""Where the pumpkin is in the picture of the first view, as fractions of its width and height."""
+
+
+def main(config: Path) -> None:
+    """Draws the three pictures."""
+    log = Path(tempfile.mkdtemp()) / "log"
+    with chromium() as browser:
+        with own_viewer(config, log) as address:
+            own(browser, address)
+        with ns_viewer(config, log, cwd=config.parents[4]) as address:
+            stock(browser, address)
+
+
+def own(browser: Browser, address: str) -> None:
+    """ns-normlift-view with an answer."""
+    page = Own(browser, address, size=(1200, 640), sharpness=1)
+    page.ask(OWN)
+    page.selects(lambda count: count > 0, "an answer")
+    page.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
+    shot(page.page, "viewer_own")
+
+
+def stock(browser: Browser, address: str) -> None:
+    """ns-viewer with an answer, and with one thing alone."""
+    tab = Tab(browser, address, size=(1300, 947), sharpness=1)
+    tab.fresh()
+    tab.asks(STOCK, answered=2)
+    tab.show("overlay")
+    tab.sees(lambda seen: coloured(seen).sum() > 1000, "an overlay")
+    shot(tab.page, "viewer_overlay")
+    tab.press("Clear")
+    tab.show("rgb")
+    tab.arm("More like this")
+    tab.click(((1300 - PANEL) * CLICKED[0], (947 - TITLE) * CLICKED[1]))
+    tab.selects(lambda count: count > 0, "clicked")
+    tab.press("Only")
+    tab.show("rgb")
+    tab.sees(lambda seen: (seen.std(axis=2) < 20).mean() > 0.7, "one thing before the background")
+    shot(tab.page, "viewer_isolated")
+
+
+def shot(page: Page, name: str) -> None:
+    """Keeps the page as a JPEG of the documentation, at most 1,200 pixels wide."""
+    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    image.thumbnail((1200, 1200))
+    image.save(DOCS / f"{name}.jpg", quality=88)
+    sys.stdout.write(f"Written: {DOCS / name}.jpg\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else CONFIG.resolve())

@@ -1,0 +1,459 @@
+"""Small faults planted in the package, to see whether the tests find them.
+
+    python -m research.faults draw --seed 1 --output faults.json
+    python -m research.faults run faults.json --trees ../checkout --tier test --label old
+    python -m research.faults table faults.json
+
+`draw` takes places by a seed, some in every package, and keeps those that pass lint, types and import. `run` plants
+each in another checkout that has a `.venv`, and runs the nearest test files first; those that remain are planted
+together, and the whole tier runs once. Where a test fails then, each fault is tried with that test alone. So a fault
+counts as found if a test fails that passes without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import difflib
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from queue import Queue
+
+PACKAGES = (
+    "core",
+    "raster",
+    "kernels",
+    "encoders",
+    "scenes",
+    "runs",
+    "session",
+    "viewer",
+    "objects",
+    "insight",
+    "evaluation",
+    "nerfstudio_plugin",
+    "scripts",
+    ".",  # modules at the top
+)
+KINDS = (
+    "off by one",
+    "swapped sign",
+    "dropped check",
+    "wrong axis",
+    "wrong default",
+    "missing call",
+    "inverted condition",
+)
+CALLS = {
+    *("flush", "fsync", "close", "synchronize", "join", "wait", "clear", "discard", "unlink", "release", "set", "put"),
+    *("notify", "notify_all", "update", "cancel", "shutdown", "truncate", "remove", "add", "sort", "start", "stop"),
+    *(
+        "fill_",
+        "copy_",
+        "zero_",
+        "clamp_",
+        "mul_",
+        "add_",
+        "div_",
+        "sub_",
+        "masked_fill_",
+        "index_add_",
+        "scatter_add_",
+    ),
+}
+CHECKS = re.compile(r"^_?(check|refuse|ensure|require|validate|writable)_?")
+SWAPPED = {
+    ast.Lt: ">=",
+    ast.GtE: "<",
+    ast.Gt: "<=",
+    ast.LtE: ">",
+    ast.Eq: "!=",
+    ast.NotEq: "==",
+    ast.Is: "is not",
+    ast.IsNot: "is",
+    ast.In: "not in",
+    ast.NotIn: "in",
+}
+BOUNDS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One change of one file."""
+
+    name: str
+    package: str
+    kind: str
+    file: str
+    line: int
+    function: str
+    patch: str
+    found: dict[str, str] | None = None
+    """By tier, the test that finds it, or "" if none does."""
+    equivalent: str = ""
+    """Why no test can find it, for faults that change nothing."""
+
+
+Node = ast.expr | ast.stmt
+Edit = tuple[str, Node, str]
+
+
+def edits(tree: ast.Module) -> Iterator[tuple[str, Node, str, str]]:
+    """Every kind, node, new text and name of the function around it."""
+    for node, function in _code(tree, ""):
+        for kind, place, text in _edits(node):
+            yield kind, place, text, function
+
+
+def _code(node: ast.AST, function: str) -> Iterator[tuple[ast.AST, str]]:
+    """Nodes that run: no annotations, no docstrings, nothing for types alone."""
+    yield node, function
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        function = f"{function}.{node.name}".lstrip(".")
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr | ast.Assert):
+                continue
+            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+                continue
+            yield from _code(child, function)
+
+
+def _number(node: ast.AST | None) -> int | None:
+    return node.value if isinstance(node, ast.Constant) and type(node.value) is int else None
+
+
+def _text(node: ast.AST) -> bool:
+    return isinstance(node, ast.JoinedStr | ast.List | ast.Tuple | ast.Set) or (
+        isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+
+
+def _edits(node: ast.AST) -> Iterator[Edit]:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
+        sides = [ast.unparse(x) for x in (node.left, node.right)]
+        if not _text(node.left) and not _text(node.right):
+            sign = "-" if isinstance(node.op, ast.Add) else "+"
+            right = f"({sides[1]})" if isinstance(node.right, ast.BinOp) else sides[1]
+            yield "swapped sign", node, f"({sides[0]} {sign} {right})"
+        if (value := _number(node.right)) is not None:
+            yield "off by one", node.right, str(value + 1)
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
+        yield "swapped sign", node, ast.unparse(node.operand)
+    elif isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in BOUNDS:
+        if _number(node.comparators[0]) is not None or "len(" in ast.unparse(node) or "shape" in ast.unparse(node):
+            text = f"{ast.unparse(node.left)} {BOUNDS[type(node.ops[0])]} {ast.unparse(node.comparators[0])}"
+            yield "off by one", node, text
+    elif isinstance(node, ast.Slice):
+        for bound in (node.lower, node.upper):
+            if bound is not None and (value := _number(bound)) is not None:
+                yield "off by one", bound, str(value + 1)
+    elif isinstance(node, ast.Call):
+        yield from _calls(node)
+    elif isinstance(node, ast.Subscript) and (value := _number(node.slice)) is not None:
+        if isinstance(node.value, ast.Attribute) and node.value.attr == "shape":
+            yield "wrong axis", node.slice, str(1 - min(value, 1))
+        else:
+            yield "off by one", node.slice, str(value + 1)
+    elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+        called = node.value.func
+        name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
+        if CHECKS.match(name):
+            yield "dropped check", node, "pass"
+        elif name in CALLS and isinstance(called, ast.Attribute):
+            yield "missing call", node, "pass"
+    elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        pairs = zip(reversed(node.args.args), reversed(node.args.defaults))
+        for _, default in [*pairs, *zip(node.args.kwonlyargs, node.args.kw_defaults)]:
+            yield from _default(default)
+    elif isinstance(node, ast.ClassDef):
+        for line in node.body:
+            if isinstance(line, ast.AnnAssign):
+                yield from _default(line.value)
+    elif isinstance(node, ast.If) and len(node.orelse) == 0 and isinstance(node.body[0], ast.Raise):
+        yield "dropped check", node, "pass"
+    if isinstance(node, ast.If | ast.IfExp | ast.While):
+        yield "inverted condition", node.test, _inverted(node.test)
+
+
+def _calls(node: ast.Call) -> Iterator[Edit]:
+    for word in node.keywords:
+        if word.arg in ("dim", "axis"):
+            yield from _other_axis(word.value)
+    name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+    if name == "range":
+        for bound in node.args:
+            if not _text(bound):
+                yield "off by one", bound, f"{ast.unparse(bound)} + 1"
+    if name in ("size", "squeeze", "unsqueeze", "flip", "any", "all") and len(node.args) == 1:
+        yield from _other_axis(node.args[0])
+
+
+def _other_axis(node: ast.expr) -> Iterator[Edit]:
+    if (value := _axis(node)) is not None:
+        yield "wrong axis", node, "1" if value == 0 else "0"
+
+
+def _axis(node: ast.AST) -> int | None:
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        value = _number(node.operand)
+        return None if value is None else -value
+    return _number(node)
+
+
+def _default(node: ast.AST | None) -> Iterator[Edit]:
+    if not isinstance(node, ast.Constant):
+        return
+    if isinstance(node.value, bool):
+        yield "wrong default", node, str(not node.value)
+    elif isinstance(node.value, int):
+        yield "wrong default", node, str(node.value + 1)
+    elif isinstance(node.value, float):
+        yield "wrong default", node, repr(node.value * 1.5 if node.value != 0 else 0.5)
+
+
+def _inverted(test: ast.expr) -> str:
+    if isinstance(test, ast.Compare) and len(test.ops) == 1:
+        return f"{ast.unparse(test.left)} {SWAPPED[type(test.ops[0])]} {ast.unparse(test.comparators[0])}"
+    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
+        return ast.unparse(test.operand)
+    return f"not ({ast.unparse(test)})"
+
+
+def changed(source: str, node: Node, text: str) -> str:
+    """A source with a node replaced."""
+    data = source.encode()
+    starts = [0]
+    for line in data.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    last, column = node.end_lineno or node.lineno, node.end_col_offset or 0
+    start, end = starts[node.lineno - 1] + node.col_offset, starts[last - 1] + column
+    return (data[:start] + text.encode() + data[end:]).decode()
+
+
+def draw(root: Path, seed: int, most: int) -> list[Fault]:
+    """So many faults of every package, at most one in a file, that pass lint, types and import."""
+    chance, faults, spent = random.Random(seed), [], set()
+    for package in PACKAGES:
+        folder = root / "normlift_ns" / package
+        files = sorted(folder.glob("*.py") if package == "." else folder.rglob("*.py"))
+        places: dict[str, list[Fault]] = {kind: [] for kind in KINDS}
+        for file in files:
+            source, name = file.read_text("utf8"), file.relative_to(root).as_posix()
+            for kind, node, text, function in edits(ast.parse(source)):
+                after = changed(source, node, text)
+                lines = difflib.unified_diff(
+                    source.splitlines(keepends=True), after.splitlines(keepends=True), f"a/{name}", f"b/{name}"
+                )
+                places[kind].append(Fault("", package, kind, name, node.lineno, function, "".join(lines)))
+        order = list(KINDS)
+        chance.shuffle(order)
+        for kind in order:
+            chance.shuffle(places[kind])
+        taken: list[Fault] = []
+        while len(taken) < most and any(places.values()):
+            kind = order[0]
+            order = [*order[1:], kind]
+            while places[kind]:
+                fault = places[kind].pop()
+                if fault.file not in spent and (patch := passed(root, fault)):
+                    taken.append(replace(fault, patch=patch))
+                    spent.add(fault.file)
+                    break
+        faults += taken
+        print(package, len(taken), flush=True)
+    return [replace(fault, name=f"F{i + 1:02}") for i, fault in enumerate(faults)]
+
+
+def passed(root: Path, fault: Fault) -> str:
+    """The formatted patch of a fault, or "" if lint, types or import have something against it."""
+    module = fault.file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    binaries = root / ".venv/bin"
+    checks = (
+        (binaries / "ruff", "check", "-q", fault.file),
+        (binaries / "python", "-W", "ignore", "-c", f"import {module}"),
+        (binaries / "basedpyright", fault.file),
+    )
+    with planted(root, [fault]):
+        subprocess.run([binaries / "ruff", "format", "-q", fault.file], cwd=root, check=True)
+        if any(subprocess.run(x, cwd=root, capture_output=True, check=False).returncode != 0 for x in checks):
+            return ""
+        diff = ["git", "diff", "--", fault.file]
+        return subprocess.run(diff, cwd=root, capture_output=True, text=True, check=True).stdout
+
+
+class planted:
+    """Applies the patches of faults to a tree, and takes them back."""
+
+    def __init__(self, root: Path, faults: list[Fault]) -> None:
+        self.root, self.files, self.patch = root, {x.file for x in faults}, "".join(x.patch for x in faults)
+
+    def __enter__(self) -> None:
+        subprocess.run(["git", "apply", "-"], input=self.patch, text=True, cwd=self.root, check=True)
+
+    def __exit__(self, *_: object) -> None:
+        subprocess.run(["git", "checkout", "-q", "--", *self.files], cwd=self.root, check=True)
+
+
+TIERS = ("test", "slow")
+TIME_OUT = "time-out"
+
+
+def marker(root: Path, tier: str) -> str:
+    """The tests of a tier; checkouts from before the tier `extra` have no such marker."""
+    extra = " and not extra" if '"extra: ' in (root / "pyproject.toml").read_text("utf8") else ""
+    return ("slow" if tier == "slow" else "not slow") + extra
+
+
+def pytest(root: Path, tier: str, *words: str, limit: float) -> list[str]:
+    """Names of tests that fail; `TIME_OUT` if they do not end, "collection" if none could run."""
+    command = [".venv/bin/python", "-m", "pytest", "-q", "--no-header", "-rfE", "-m", marker(root, tier), *words]
+    process = subprocess.Popen(
+        command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
+        env=os.environ | {"CI": "1"}, start_new_session=True,
+    )  # fmt: skip
+    try:
+        printed, _ = process.communicate(timeout=limit)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        return [TIME_OUT]
+    failed = re.findall(r"^(?:FAILED|ERROR) (tests/.*?|normlift_ns/.*?)(?: - .*)?$", printed, re.MULTILINE)
+    return failed or (["collection"] if process.returncode not in (0, 5) else [])
+
+
+def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
+    """Test files that name the function or module of a fault, those of its folder first."""
+    stem = Path(fault.file).stem if Path(fault.file).stem != "__init__" else Path(fault.file).parent.name
+    names = [x for x in fault.function.split(".") if not x.startswith("_")]
+    module = fault.file.removesuffix(".py").replace("/", ".")
+    scores: dict[str, float] = {}
+    for path in sorted(set(root.glob("tests/**/test_*.py")) - set(root.glob("tests/browser/*.py"))):
+        text = path.read_text("utf8")
+        score = 4.0 * (module in text) + 2.0 * any(re.search(rf"\b{re.escape(x)}\b", text) for x in names)
+        score += 3.0 * (path.stem == f"test_{stem}") + 1.0 * (f"tests/{fault.package}/" in path.as_posix())
+        score += 0.5 * bool(re.search(rf"\b{re.escape(stem)}\b", text))
+        if score > 0:
+            scores[path.relative_to(root).as_posix()] = score
+    return sorted(scores, key=lambda x: -scores[x])[:most]
+
+
+def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Path, *, together: bool) -> None:
+    """Looks for every fault with the nearest files, then for the rest with the whole tier; saves what is found.
+
+    Args:
+        trees: equal checkouts, each with a `.venv`; so many faults are tried at a time.
+        label: the name of what is run, a column of the table.
+        together: begin with all faults planted together.
+    """
+    found = {x.name: dict(x.found or {}) for x in faults}
+    free: Queue[Path] = Queue()
+    for tree in trees:
+        free.put(tree)
+    passes: dict[str, bool] = {}
+    several = ("-n", os.environ.get("WORKERS", "2"), "--ignore=tests/browser")
+
+    def keep() -> None:
+        save.write_text(json.dumps([asdict(replace(x, found=found[x.name])) for x in faults], indent=1) + "\n")
+
+    def first(fault: Fault, words: list[str], limit: float) -> str:
+        """The first test that fails with a fault and passes without it."""
+        tree = free.get()
+        try:
+            with planted(tree, [fault]):
+                failed = pytest(tree, tier, *words, limit=limit)
+            return next((x for x in failed if passes_without(tree, x, words, limit)), "")
+        finally:
+            free.put(tree)
+
+    def passes_without(tree: Path, test: str, words: Sequence[str], limit: float) -> bool:
+        words = words if test in (TIME_OUT, "collection") else [test]
+        name = " ".join(words)
+        if name not in passes:
+            passes[name] = not pytest(tree, tier, *words, limit=limit)
+        return passes[name]
+
+    def look(fault: Fault, words: list[str], limit: float = 300) -> None:
+        test = first(fault, words, limit)
+        print(fault.name, fault.file, fault.kind, "->", test, flush=True)
+        if test:
+            found[fault.name][label] = test
+            keep()
+
+    missing = [x for x in faults if label not in found[x.name] and not x.equivalent]
+    with ThreadPoolExecutor(len(trees)) as pool:
+        if not together:
+            list(pool.map(lambda x: look(x, ["--maxfail=3", *nearest(trees[0], x)]), missing))
+        rest = [x for x in missing if label not in found[x.name]]
+        fails = set(pytest(trees[0], tier, *several, limit=5400)) if rest else set()
+        while rest:
+            with planted(trees[0], rest):
+                failed = [x for x in pytest(trees[0], tier, *several, limit=5400) if x not in fails]
+            print(f"{len(rest)} together: {len(failed)} tests fail", *failed, sep="\n", flush=True)
+            files: dict[str, list[str]] = {}
+            for test in failed:
+                files.setdefault(test.split("::", maxsplit=1)[0], []).append(test)
+            tests = [test for some in files.values() for test in some[:4]]
+            before = len(rest)
+            list(pool.map(lambda x, words=tests: look(x, ["-x", *words]), rest if tests else []))
+            rest = [x for x in rest if label not in found[x.name]]
+            if len(rest) == before:
+                break
+    for fault in rest:
+        found[fault.name][label] = ""
+    keep()
+
+
+def load(path: Path) -> list[Fault]:
+    """The faults of a file."""
+    return [Fault(**x) for x in json.loads(path.read_text("utf8"))]
+
+
+def table(faults: list[Fault]) -> str:
+    """Found of all, by package and by what was run."""
+    labels = sorted({label for x in faults for label in x.found or {}})
+    lines = [f"| package | faults | {' | '.join(labels)} |", f"|---|---:|{'---:|' * len(labels)}"]
+    real = [x for x in faults if not x.equivalent]
+    for package in [*PACKAGES, "all"]:
+        here = [x for x in real if package in (x.package, "all")]
+        counts = [sum(bool((x.found or {}).get(label)) for x in here) for label in labels]
+        lines.append(f"| {package} | {len(here)} | {' | '.join(map(str, counts))} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description="Plants small faults in the package, to see whether the tests find them."
+    )
+    actions = parser.add_subparsers(dest="action", required=True)
+    drawing = actions.add_parser("draw")
+    drawing.add_argument("--seed", type=int, required=True)
+    drawing.add_argument("--most", type=int, default=5)
+    drawing.add_argument("--output", type=Path, required=True)
+    running = actions.add_parser("run")
+    running.add_argument("faults", type=Path)
+    running.add_argument("--trees", type=Path, nargs="+", default=[Path()])
+    running.add_argument("--tier", choices=TIERS, default="test")
+    running.add_argument("--label", required=True)
+    running.add_argument("--together", action="store_true")
+    showing = actions.add_parser("table")
+    showing.add_argument("faults", type=Path)
+    given = parser.parse_args()
+    if given.action == "draw":
+        drawn = draw(Path().resolve(), given.seed, given.most)
+        given.output.write_text(json.dumps([asdict(x) for x in drawn], indent=1) + "\n")
+    elif given.action == "run":
+        trees = [x.resolve() for x in given.trees]
+        run(load(given.faults), trees, given.tier, given.label, given.faults, together=given.together)
+    else:
+        print(table(load(given.faults)))

@@ -1,0 +1,56 @@
+"""Scenes, cameras and regions that are lifted on a GPU, and how long a step takes there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+
+from normlift_ns import Camera, Evidence, GaussianScene, rasterize_evidence
+from research import rooms
+from research.cpu import grid_labels
+from tests.captures import trained_scene, training_cameras
+
+
+@dataclass(frozen=True)
+class Case:
+    name: str
+    scene: GaussianScene
+    cameras: list[Camera]
+    labels: list[torch.Tensor]
+
+    @cached_property
+    def counts(self) -> list[int]:
+        """Regions of each view."""
+        return [int(labels.max()) + 1 for labels in self.labels]
+
+    def evidence(self, **options: Any) -> Evidence:
+        return rasterize_evidence(self.scene, self.cameras, self.labels, num_regions=self.counts, **options)
+
+
+def room_case(name: str, n: int, views: int, regions: int = 128, scale: float = 1.0) -> Case:
+    width, height = round(rooms.WIDTH * scale), round(rooms.HEIGHT * scale)
+    labels = [rooms.voronoi_labels(regions, width, height, seed=v) for v in range(views)]
+    return Case(name, rooms.room(n), rooms.cameras(views, width, height), labels)
+
+
+def capture_case(name: str) -> Case:
+    cameras = training_cameras(name)
+    return Case(name, trained_scene(name).to("cuda"), cameras, [grid_labels(camera).cuda() for camera in cameras])
+
+
+def timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Median seconds of three runs after a first one, and the result of the last."""
+    result, seconds = run(), []
+    for _ in range(3):
+        del result
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        result = run()
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return sorted(seconds)[1], result

@@ -1,0 +1,325 @@
+"""Two GPUs against one of them, in the same run: evidence, exchange, lift, neighbours and vote; the front end; whole
+commands; and 100 million Gaussians.
+
+    python -m research.gpu_scale                    all of it; starts its two processes itself
+    python -m research.gpu_scale --only core        one part: core, front, large or command
+    python -m research.gpu_scale --device cpu --quick    tiny, through gloo, which runs anywhere
+
+Times go from one barrier of both processes to the next, medians of some rounds, one GPU and two in turns. The error is
+the largest difference of any number of any Gaussian between the two: it has to be 0. SAM and CLIP have random weights.
+What the file holds of other parts stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from normlift_ns import Camera, Evidence, GaussianScene, RefineConfig, lift, rasterize_evidence
+from normlift_ns.core.lift import Scalars
+from normlift_ns.core.partition import SINGLE_PROCESS, Communicator, Partition
+from normlift_ns.distributed.communicator import EvidenceShard, redistribute_evidence
+from normlift_ns.distributed.launch import distributed_context, launch_processes
+from normlift_ns.evidence_collection import chunk_views
+from normlift_ns.pipeline import vote_distributed
+from normlift_ns.progress import StageTimer
+from research import rooms
+from research.command import joined as with_earlier
+from research.report import RESULTS, Report
+from tests.captures import SHARED
+
+DIMENSION, REGIONS, MAPS = 512, 128, 16
+ENTRY = 12
+"""Bytes of an entry that changes hands."""
+
+
+class Case(NamedTuple):
+    scene: GaussianScene
+    cameras: Sequence[Camera]
+    labels: Sequence[Tensor]
+    """Of some views, taken in turn."""
+    table: Tensor
+
+    @staticmethod
+    def of(n: int, views: int, device: str, scale: float = 1.0, dimension: int = DIMENSION) -> Case:
+        width, height = round(rooms.WIDTH * scale), round(rooms.HEIGHT * scale)
+        maps = [rooms.voronoi_labels(REGIONS, width, height, seed=v, device=device) for v in range(min(MAPS, views))]
+        g = torch.Generator(device).manual_seed(0)
+        table = torch.randn(views * REGIONS, dimension, generator=g, device=device)
+        scene = rooms.room(n, device=device, drawn_on=device)
+        return Case(scene, rooms.cameras(views, width, height), maps, torch.nn.functional.normalize(table, dim=1))
+
+
+class Found(NamedTuple):
+    scalars: Scalars
+    copied: Tensor
+    seconds: dict[str, float]
+    evidence: Evidence
+
+
+class Clock:
+    """Seconds from barrier to barrier."""
+
+    def __init__(self, team: Communicator, device: str) -> None:
+        self.team, self.device, self.seconds = team, device, dict[str, float]()
+        self.last = self.now()
+
+    def now(self) -> float:
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+        self.team.add(torch.zeros(1))
+        return time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = self.now()
+        self.seconds[name], self.last = now - self.last, now
+
+
+def core(team: Communicator, case: Case, folder: Path, device: str) -> Found:
+    """What the Gaussians of this process become, and the seconds of every step."""
+    clock = Clock(team, device)
+    portion = Partition.of(team, case.scene.means)
+    chunks = chunk_views(range(len(case.cameras)), team.size)
+    pieces, whole = dict[int, EvidenceShard](), list[Evidence]()
+    with team.shares(folder):
+        for number in team.chunks(len(chunks)):
+            cameras = [case.cameras[v] for v in chunks[number]]
+            labels = [case.labels[v % len(case.labels)] for v in chunks[number]]
+            found = rasterize_evidence(case.scene, cameras, labels, num_regions=[REGIONS] * len(cameras))
+            if team.size > 1:
+                pieces[number] = EvidenceShard.of(found, portion)
+            else:
+                whole.append(found)
+            del found
+        clock.lap("evidence")
+    evidence = Evidence.merge(*whole) if team.size == 1 else redistribute_evidence(pieces, portion, len(chunks))
+    whole.clear()
+    pieces.clear()
+    clock.lap("exchange")
+    lifted = lift(evidence, case.table)
+    clock.lap("lift")
+    own = lifted.scalars.own_evidence
+    stages = StageTimer(lambda stage, done, total: None)
+    copied, _ = vote_distributed(case.scene.means, lifted, own, RefineConfig(), portion, stages)
+    clock.lap("vote")
+    clock.seconds |= {name: stages.seconds[name] for name in ("neighbors",)}
+    return Found(lifted.scalars.map(portion.join), portion.join(copied), clock.seconds, evidence)
+
+
+SMALL_VIEWS: dict[str, Any] = {"scale": 0.1, "dimension": 16}
+STEPS = ("evidence", "exchange", "lift", "vote")
+
+
+def total(seconds: Mapping[str, float]) -> float:
+    return sum(seconds[step] for step in STEPS)
+
+
+def difference(a: Found, b: Found) -> float:
+    """Largest difference of any number of any Gaussian; of directions taken, how many differ."""
+    pairs = [(getattr(a.scalars, f.name), getattr(b.scalars, f.name)) for f in fields(Scalars)]
+    return max(float((a.copied != b.copied).sum()), *(float((x.double() - y.double()).abs().max()) for x, y in pairs))
+
+
+def compare_core(
+    team: Communicator, report: Report, name: str, case: Case, folder: Path, device: str, rounds: int
+) -> None:
+    one, two, wrong, entries = list[dict[str, float]](), list[dict[str, float]](), 0.0, 0
+    for turn in range(rounds + 1):
+        alone = core(SINGLE_PROCESS, case, folder, device) if team.rank == 0 else None
+        team.add(torch.zeros(1))
+        together = core(team, case, folder, device)
+        entries = together.evidence.nnz
+        if alone is not None:
+            wrong = max(wrong, difference(alone, together))
+            if turn > 0:  # the first one compiles
+                one.append(alone.seconds)
+                two.append(together.seconds)
+        del alone, together
+        team.add(torch.zeros(1))
+    exchanged = int(team.add(torch.tensor([entries])).item())
+    if team.rank > 0:
+        return
+    seconds = statistics.median(map(total, two))
+    report.add(f"core_speedup_2{name}", statistics.median(map(total, one)) / seconds, "one GPU over two", wrong)
+    report.add(f"core_one_s{name}", statistics.median(map(total, one)), "s")
+    report.add(f"core_two_s{name}", seconds, "s", wrong)
+    for step in (*STEPS, "neighbors"):
+        for count, found in ((1, one), (2, two)):
+            report.add(f"core{name}.{step}_s_{count}", statistics.median(x[step] for x in found), "s")
+    moved = exchanged * (team.size - 1) / team.size * ENTRY / 2**30
+    report.add(f"core{name}.exchanged_gib", moved, "GiB in all")
+    spent = statistics.median(x["exchange"] for x in two)
+    report.add(f"exchange_gib_s{name}", moved / spent, "GiB/s, sorting what came included")
+
+
+def large(team: Communicator, report: Report, case: Case, folder: Path, device: str) -> None:
+    if device == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    begin = time.perf_counter()
+    found = core(team, case, folder, device)
+    spent = time.perf_counter() - begin
+    nnz = int(team.add(torch.tensor([found.evidence.nnz])).item())
+    peak = torch.tensor([torch.cuda.max_memory_allocated() / 2**30 if device == "cuda" else 0.0])
+    peak = float(team.join(peak).max())
+    changed = float((found.copied != torch.arange(len(found.copied), device=found.copied.device)).float().mean())
+    if team.rank > 0:
+        return
+    n = len(case.scene)
+    report.add("n100m.gaussians", n, f"Gaussians, {len(case.cameras)} views")
+    report.add("n100m.evidence_s", found.seconds["evidence"], "s")
+    for step in ("exchange", "lift", "vote", "neighbors"):
+        report.add(f"n100m.{step}_s", found.seconds[step], "s")
+    report.add("n100m.total_s", spent, "s, kernels compiled before")
+    report.add("n100m.peak_gib_per_gpu", peak, "GiB, the larger of both")
+    report.add("n100m.entries_per_gaussian", nnz / n, "entries")
+    report.add("n100m.with_evidence", float((found.scalars.norm > 0).float().mean()), "share of Gaussians")
+    report.add("n100m.copied", changed, "share of Gaussians")
+
+
+def front(team: Communicator, report: Report, folder: Path, device: str, quick: bool) -> None:
+    """SAM and CLIP over photographs, in chunks."""
+    from normlift_ns.encoders.base import RegionFeatures, iterate_view_features  # noqa: PLC0415
+    from research.front_end_inputs import SMALL, Size, injected_sam, random_clip, random_sam  # noqa: PLC0415
+
+    size, count = (SMALL, 6) if quick else (Size(), 48)
+    torch.manual_seed(0)
+    mine = folder / f"clip{team.rank}"
+    mine.mkdir()
+    source = RegionFeatures(injected_sam(size, random_sam(size, device), device), random_clip(size, mine, device))
+    g = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (count, size.height, size.width, 3), generator=g, dtype=torch.uint8)
+
+    def see(some: Communicator) -> float:
+        clock, chunks = Clock(some, device), chunk_views(range(count), some.size)
+        with some.shares(folder):
+            for number in some.chunks(len(chunks)):
+                for _ in iterate_view_features(source, ((images[v], str(v)) for v in chunks[number])):
+                    pass
+            clock.lap("all")
+        return clock.seconds["all"]
+
+    for _ in iterate_view_features(source, ((images[v], str(v)) for v in range(2))):  # compiles
+        pass
+    one = [see(SINGLE_PROCESS)] if team.rank == 0 else []
+    team.add(torch.zeros(1))
+    two = [see(team), see(team)]
+    one += [see(SINGLE_PROCESS)] if team.rank == 0 else []
+    team.add(torch.zeros(1))
+    if team.rank == 0:
+        unit = f"one GPU over two, {count} images"
+        report.add("front_end_speedup_2", statistics.mean(one) / statistics.mean(two), unit)
+        report.add("front_end_one_s", statistics.mean(one), f"s, {count} images")
+        report.add("front_end_two_s", statistics.mean(two), f"s, {count} images")
+
+
+def sam_that_finds(folder: Path, quick: bool) -> None:
+    """Random weights of SAM whose masks pass the rules: sure of themselves, and with sharp borders."""
+    from research.front_end_inputs import SMALL, Size, random_sam  # noqa: PLC0415
+
+    torch.manual_seed(0)
+    model = random_sam(SMALL if quick else Size(), "cpu")
+    decoder = model.mask_decoder
+    with torch.no_grad():
+        decoder.iou_prediction_head.proj_out.bias.fill_(0.95)
+        for network in decoder.output_hypernetworks_mlps:
+            network.proj_out.weight.mul_(1000)
+            network.proj_out.bias.mul_(1000)
+    model.save_pretrained(folder)
+
+
+def commands(report: Report, trained: Path, folder: Path, device: str, quick: bool) -> None:
+    """ns-normlift with SAM and CLIP of random weights on one device and on two, caches empty, kernels compiled."""
+    from research.command import make_weights  # noqa: PLC0415
+
+    sam_that_finds(folder / "sam", quick)
+    flags = ["--load-config", str(trained), "--device", device, "--regions", "sam", "--sam-model", str(folder / "sam")]
+    flags += [str(word) for word in make_weights(folder, ["fox"])] + (["--max-views", "4"] if quick else [])
+
+    def lifted(devices: int, name: str, *more: str) -> float:
+        words = [sys.executable, "-m", "normlift_ns.cli.lift", *flags, "--num-devices", str(devices)]
+        words += ["--output-dir", str(folder / name), "--timestamp", "run", *more]
+        begin = time.perf_counter()
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        print(done.stdout[-1500:], done.stderr[-1500:], flush=True)
+        done.check_returncode()
+        return time.perf_counter() - begin
+
+    lifted(1, "warm", "--max-views", "2")
+    one, two = lifted(1, "one"), lifted(2, "two")
+    files = [next((folder / name).glob("*/normlift/run/normlift/field.safetensors")) for name in ("one", "two")]
+    wrong = float(files[0].read_bytes() != files[1].read_bytes())
+    report.add("whole_command_speedup_2", one / two, "one GPU over two, from the shell, SAM and CLIP", wrong)
+    report.add("whole_command_one_s", one, "s")
+    report.add("whole_command_two_s", two, "s", wrong)
+
+
+PARTS = ("core", "front", "large", "command")
+
+
+SIZES = (("", 1_930_000, 177), ("_10m", 10_000_000, 20))
+"""Names, Gaussians and views."""
+TINY = (("", 20_000, 21), ("_10m", 30_000, 5))
+
+
+def work(team: Communicator, part: str, report: Report, folder: Path, device: str, quick: bool) -> None:
+    """What both processes do."""
+    make: Callable[[int, int], Case] = partial(Case.of, device=device, **(SMALL_VIEWS if quick else {}))
+    if part == "core":
+        for name, n, views in TINY if quick else SIZES:
+            compare_core(team, report, name, make(n, views), folder, device, 1 if quick else 7)
+    if part == "front":
+        front(team, report, folder, device, quick)
+    if part == "large":
+        core(team, make(200_000, 20), folder, device)  # compiles
+        large(team, report, make(40_000, 12) if quick else make(100_000_000, 300), folder, device)
+
+
+def worker(only: Sequence[str], output: Path, folder: Path, device: str, quick: bool) -> None:
+    with distributed_context(device, print) as team, torch.no_grad():
+        for part in only:
+            report = Report("scale")
+            work(team, part, report, folder, device, quick)
+            if team.rank == 0:
+                with_earlier(report, output / "scale.json").write(output)
+
+
+def main(only: Sequence[str], output: Path, device: str, quick: bool, trained: Path) -> int:
+    words = [sys.executable, "-m", "research.gpu_scale", "--device", device, "--output", str(output)]
+    words += ["--quick"] * quick + ["--only", *(part for part in only if part != "command")]
+    with tempfile.TemporaryDirectory() as name:
+        code = launch_processes([*words, "--folder", name], 2, print) if set(only) - {"command"} else 0
+        if code == 0 and "command" in only:
+            report = Report("scale")
+            commands(report, trained.absolute(), Path(name), device, quick)
+            with_earlier(report, output / "scale.json").write(output)
+    return code
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
+    parser.add_argument("--quick", action="store_true", help="tiny scenes and networks")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    parser.add_argument("--folder", type=Path, help="of both processes")
+    fox = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
+    parser.add_argument("--config", type=Path, default=fox, help="of the run that commands lift")
+    given = parser.parse_args()
+    if "RANK" in os.environ:
+        worker(given.only, given.output, given.folder, given.device, given.quick)
+    else:
+        sys.exit(main(given.only, given.output, given.device, given.quick, given.config))

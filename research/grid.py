@@ -1,0 +1,146 @@
+"""The grid on which defaults are decided, by the rule of `research.rule` among those of `research.candidates`.
+
+    python -m research.grid                       all scenes, every Gaussian votes; for a GPU
+    python -m research.grid --minutes 9           no new cell after so many minutes; the same command goes on later
+    python -m research.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second third
+                                                    for CPUs: a sample votes and counts
+    python -m research.grid --quick               a small plain room, three cells per kind of region, for the tests
+
+Every finished cell is one line of `--rows`, which a later call reads first. The decision so far is always printed;
+results/grid.json is written when no cell is missing, or with `--report`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from research.candidates import CANDIDATES
+from research.cells import Place, Settings, Site
+from research.grid_report import report_of, show
+from research.report import RESULTS
+from research.rows import append, read_rows
+from research.rule import CHOICE, CONFIRMATION, SEEDS, Cell, cells_of
+
+CHUNK = 50
+"""Cells of one place that a worker takes at a time: whoever takes some first builds the place."""
+QUICK = Settings(voters=80, gaussians=2500, pieces=30, room_views=8, room_width=160)
+QUICK_CELLS = (
+    ("masks", "clip", "noise only"), ("masks", "clip", "group"), ("masks", "histogram", "arc"),
+    ("superpixels", "histogram", "mild"), ("grid", "clip", "dropped masks"), ("patches", "clip", "noise"),
+)  # fmt: skip
+
+
+def finished(path: Path, run: dict[str, Any]) -> dict[Cell, dict[str, Any]]:
+    """The rows of the cells that are done; raises as `read_rows`."""
+    return {Cell(*row["cell"]): row for row in read_rows(path, run)}
+
+
+@lru_cache(maxsize=1)
+def site_of(place: Place, settings: Settings) -> Site:
+    """The place of the last cell is kept."""
+    return Site(place, settings)
+
+
+@torch.no_grad()
+def run_cells(cells: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, deadline: float) -> int:
+    """Runs cells of one place until the deadline (`time.time`), and says how many."""
+    for done, cell in enumerate(cells):
+        if time.time() > deadline:
+            return done
+        site = site_of(Place.of(cell), settings)
+        start = time.perf_counter()
+        found = [site.run(cell, seed, CANDIDATES) for seed in seeds]
+        seconds = time.perf_counter() - start
+        values = {key: {one.name: [getattr(x[one.name], key) for x in found] for one in CANDIDATES}
+                  for key in ("miou", "copied")}  # fmt: skip
+        append(path, {"cell": list(cell), "seconds": round(seconds, 3), "voters": len(site.voters.truth), **values})
+        print(f"{seconds:6.2f} s  {', '.join(cell)}", flush=True)
+    return len(cells)
+
+
+def chunks(cells: Sequence[Cell]) -> Iterator[list[Cell]]:
+    """Cells of one place together, some at a time."""
+    places: dict[Place, list[Cell]] = {}
+    for cell in cells:
+        places.setdefault(Place.of(cell), []).append(cell)
+    for some in places.values():
+        for first in range(0, len(some), CHUNK):
+            yield some[first : first + CHUNK]
+
+
+def run_all(
+    missing: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, workers: int, deadline: float
+) -> None:
+    """Runs all cells, in several processes if asked for."""
+    jobs = [(some, settings, seeds, path, deadline) for some in chunks(missing)]
+    if workers == 1:
+        for job in jobs:
+            run_cells(*job)
+        return
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(workers, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
+        pool.starmap(run_cells, jobs, chunksize=1)
+
+
+def cells_to_run(scenes: Sequence[str], quick: bool) -> list[Cell]:
+    """All cells of the scenes, or a few of them."""
+    cells = [cell for scene in scenes for cell in cells_of(scene)]
+    return [cell for cell in cells if not quick or (cell[1:4] in QUICK_CELLS and cell.views in ("all", "3"))]
+
+
+@torch.no_grad()
+def main(arguments: argparse.Namespace) -> None:
+    start = time.time()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    given = {key: getattr(arguments, key) for key in ("voters", "gaussians", "views", "room_views", "pieces")}
+    settings = replace(QUICK if arguments.quick else Settings(**given), device=device)
+    scenes = ["demo"] if arguments.quick else arguments.scenes
+    seeds = SEEDS[:2] if arguments.quick else SEEDS
+    names = [one.name for one in CANDIDATES]
+    sizes = {key: value for key, value in asdict(settings).items() if key != "device"}
+    cells = cells_to_run(scenes, arguments.quick)
+    rows = finished(arguments.rows, run := {"seeds": list(seeds), "candidates": names, **sizes})
+    missing = [cell for cell in cells if cell not in rows]
+    print(f"{len(cells)} cells of {len(seeds)} seeds, {len(cells) - len(missing)} of them done before", flush=True)
+    deadline = start + 60 * arguments.minutes if arguments.minutes is not None else float("inf")
+    run_all(missing, settings, seeds, arguments.rows, arguments.workers, deadline)
+    rows = {cell: row for cell, row in finished(arguments.rows, run).items() if cell in set(cells)}
+    spent = sum(row["seconds"] for row in rows.values())
+    print(f"{len(rows)} of {len(cells)} cells done, {spent:.0f} s in cells so far, {time.time() - start:.0f} s now")
+    if len(rows) == 0:
+        sys.exit("no cell is done")
+    report = report_of(rows, names, len(cells), sizes)
+    if len(rows) == len(cells) or arguments.report:
+        report.write(arguments.output)
+    show(report, names)
+    if len(rows) < len(cells):
+        print("not a decision yet: the same command goes on")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=[*CHOICE, *CONFIRMATION], choices=[*CHOICE, *CONFIRMATION])
+    parser.add_argument("--voters", type=int, help="Gaussians of a scene that vote and count; all by default")
+    parser.add_argument("--gaussians", type=int, help="of each room; 40,000 by default")
+    parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
+    parser.add_argument("--room-views", type=int, help="training views of each room; 24 and 30 by default")
+    parser.add_argument("--pieces", type=int, help="superpixels, cells or patches per image; 256, 256, 1024 by default")
+    parser.add_argument("--workers", type=int, default=1, help="processes that run cells")
+    parser.add_argument("--minutes", type=float, help="no cell begins later than this")
+    parser.add_argument("--quick", action="store_true", help="a few cells of a small plain room")
+    parser.add_argument("--report", action="store_true", help="write the report even if cells are missing")
+    parser.add_argument("--rows", type=Path, default=RESULTS / "grid_rows.jsonl", help="file of finished cells")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the report")
+    main(parser.parse_args())

@@ -1,0 +1,33 @@
+"""The tables of the grid on which defaults are decided."""
+
+from __future__ import annotations
+
+from research.documents import Document, table
+
+POINTS = {"mean": "mean", "undamaged": "loss undamaged", "three_views": "loss with 3 views", "worst": "worst loss"}
+SHARES = {"worse": "worse cells", "column": "worst column", "copied": "copied"}
+
+
+def verdicts(grid: Document, group: str) -> str:
+    """What the rule's clauses say of every candidate, best mean first."""
+    v, start, end = grid.values, f"{group}.", ".eligible"
+    keys = [key for key in v if key.startswith(start) and key.endswith(end)]
+    units, rows = {metric.key: metric.unit for metric in grid.metrics}, []
+    for key in sorted((key.removesuffix(end) for key in keys), key=lambda key: -v[f"{key}.mean"]):
+        points = (f"{v[f'{key}.{x}']:.1f}" for x in POINTS)
+        shares = (f"{100 * v[f'{key}.{x}']:.0f} %" for x in SHARES)
+        rule = "eligible" if v[key + end] else "not: " + units[key + end]
+        rows.append((key.removeprefix(start), grid.interval(f"{key}.gain"), *points, *shares, rule))
+    return table(("candidate", "gain", *POINTS.values(), *SHARES.values(), "rule"), rows)
+
+
+def columns(grid: Document) -> str:
+    """Gain, and gain in the worst cell, of the methods in every column of the grid."""
+    v, start, end = grid.values, "column.", ".gain"
+    found = [key for key in v if key.startswith(start) and key.endswith(end)]
+    keys = [key.removeprefix(start).removesuffix(end).split(".", 2) for key in found]
+    methods, rows = list(dict.fromkeys(method for _, _, method in keys)), []
+    for axis, label in dict.fromkeys((axis, label) for axis, label, _ in keys):
+        starts = (f"column.{axis}.{label}.{method}" for method in methods)
+        rows.append((f"{axis}: {label}", *(f"{v[f'{x}.gain']:+.1f} ({-v[f'{x}.worst']:+.1f})" for x in starts)))
+    return table(("gain (worst cell)", *methods), rows)

@@ -1,0 +1,188 @@
+"""Thresholds suggested from histograms, and the word "probably not in this scene", against the truth.
+
+    python -m research.honest_answers           plain room, and the tabletop where the captures are
+    python -m research.honest_answers --scenes demo
+
+Writes results/honest_answers.json. CLIP-like features are made as in `damage`, of vectors of LVIS names: those of the
+scene's classes (in the plain room 13 names drawn at random), and four others as negatives. 60 names more, none closer
+to a class than a cosine of 0.9, are asked for as well and are in no scene. The colour encoder looks at pictures of
+the plain room, cut into superpixels and into squares; words that are not in the scene are all names of the XKCD
+survey whose cosine to every colour of the room is below 0.5.
+
+Keys: <scene>.<damage or cut>.<rule>.
+  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5), suggested, Otsu's, and
+                      the best for each class, which nobody knows
+  called_absent       % of the classes of which the answer says that they are probably not in the scene
+  called_present      % of the words that are not in the scene of which it does not say so
+  auc.<statistic>     the chance that a class has more of a statistic than a word that is not in the scene
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from normlift_ns import nearest_neighbors, rasterize_evidence, refine
+from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.lift import lift
+from normlift_ns.demo.capture import demo_cameras, view_image
+from normlift_ns.encoders.base import RegionFeatures
+from normlift_ns.encoders.color import ColorEncoder, ColorTextEncoder
+from normlift_ns.options import RefineConfig, RelevancyRule
+from normlift_ns.query.histogram import Histogram, presence_limit, relevancy_histogram
+from normlift_ns.segmentation.regions import Grid, Superpixels
+from research.damage import LADDER, observe
+from research.report import RESULTS, Report
+from research.synthetic_scenes import Words, World, demo, real_words, tabletop
+from tests.plain_room import plain_room
+
+DAMAGES = ("mild", "hard")
+OTHERS, NEAR = 60, 0.9
+NOT_A_COLOUR = 0.5
+_BINS = 128
+
+
+def otsu(values: np.ndarray) -> float:
+    """Otsu's threshold, of 128 bins."""
+    counts, edges = np.histogram(values, _BINS)
+    share, middle = counts / counts.sum(), (edges[1:] + edges[:-1]) / 2
+    weight, moment = share.cumsum(), (share * middle).cumsum()
+    rest = weight * (1 - weight)
+    between = np.where(rest > 0, (moment[-1] * weight - moment) ** 2 / np.where(rest > 0, rest, 1), 0)
+    return float(edges[between.argmax() + 1])
+
+
+def iou(relevancy: np.ndarray, truth: np.ndarray, threshold: float) -> float:
+    chosen = relevancy > threshold
+    return float((chosen & truth).sum() / max(1, (chosen | truth).sum()))
+
+
+def chance(more: list[float], less: list[float]) -> float:
+    """The chance that one of the first is larger than one of the second, ties half."""
+    a, b = np.array(more)[:, None], np.array(less)
+    return float(((a > b) + 0.5 * (a == b)).mean())
+
+
+STATISTICS = {
+    "top": lambda h, x: h.top,
+    "top_above_median": lambda h, x: h.top - h.median,
+    "z": lambda h, x: (h.top - h.median) / (1e-9 + np.median(np.abs(x - h.median))),
+    "otsu_separation": lambda h, x: float(np.var([x[x > otsu(x)].mean(), x[x <= otsu(x)].mean()]) / (1e-12 + x.var())),
+    "skewness": lambda h, x: float((((x - x.mean()) / (1e-9 + x.std())) ** 3).mean()),
+}
+"""What might tell the classes from words that are not in the scene, from a histogram and the relevancies."""
+
+
+def measure(
+    report: Report,
+    name: str,
+    present: np.ndarray,
+    absent: np.ndarray,
+    truth: np.ndarray,
+    rule: RelevancyRule,
+    encoder: str,
+) -> None:
+    """Adds the rows of one rule.
+
+    Args:
+        present: relevancies [N, K] of the classes, of Gaussians with a direction; absent: [N, M] of other words.
+        truth: [N] class, -1 where it is not known.
+    """
+    limit, valid = presence_limit(rule, encoder), np.ones(len(truth), bool)
+
+    def of(values: np.ndarray) -> list[Histogram]:
+        found = [relevancy_histogram(x, valid, threshold=0.5, limit=limit) for x in values.T]
+        return [h for h in found if h is not None]
+
+    there, elsewhere, known = of(present), of(absent), truth >= 0
+    found: dict[str, list[float]] = {"fixed": [], "suggested": [], "otsu": [], "best": []}
+    for q, h in enumerate(there):
+        x, y = present[known, q], truth[known] == q
+        if y.sum() < 30:
+            continue
+        thresholds = {"fixed": 0.5, "suggested": h.suggested, "otsu": otsu(present[:, q])}
+        for key, threshold in thresholds.items():
+            found[key].append(iou(x, y, threshold))
+        found["best"].append(max(iou(x, y, t) for t in np.quantile(x, np.linspace(0, 0.9995, 200))))
+    for key, values in found.items():
+        report.add(f"{name}.{rule}.iou.{key}", float(np.mean(values)), "of 1")
+    if limit is not None:
+        report.add(f"{name}.{rule}.called_absent", 100 * float(np.mean([not h.stands_out for h in there])), "%")
+        report.add(f"{name}.{rule}.called_present", 100 * float(np.mean([bool(h.stands_out) for h in elsewhere])), "%")
+    for key, statistic in STATISTICS.items():
+        a, b = (
+            [statistic(h, x) for h, x in zip(hs, values.T)] for hs, values in ((there, present), (elsewhere, absent))
+        )
+        report.add(f"{name}.{rule}.auc.{key}", chance(a, b), "of 1")
+
+
+def refined_directions(means: torch.Tensor, evidence: Evidence, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Directions after the paper's vote, and which Gaussians have one."""
+    lifted = lift(evidence, features)
+    config = RefineConfig(vote="paper")
+    neighbors, s = nearest_neighbors(means, config.k), lifted.scalars
+    source = refine(means, lifted.directions, s.reliability, config, own=s.own_evidence, neighbors=neighbors).long()
+    valid = (s.norm > 0)[source]
+    return lifted.directions()[source[valid]], valid
+
+
+def clip_like(report: Report, world: World) -> None:
+    """Rows of a world whose classes are LVIS names."""
+    words, g = real_words(), torch.Generator().manual_seed(1)
+    if world.classes != len(words.classes):
+        words = Words(words.others[torch.randperm(len(words.others), generator=g)[: world.classes]], words.others)
+    far = words.others[(words.others @ words.classes.T).amax(1) < NEAR]
+    far = far[torch.randperm(len(far), generator=g)]
+    negatives, others = far[:4], far[4 : 4 + OTHERS]
+    for damage in DAMAGES:
+        observed = observe(world, words, LADDER[damage], 0)
+        directions, valid = refined_directions(world.scene.means, observed.evidence, observed.features)
+        present, absent, rivals = ((directions @ x.T).numpy() for x in (words.classes, others, negatives))
+        truth, rival = world.truth[valid].numpy(), rivals.max(1, keepdims=True)
+        name = f"{world.name}.{damage}"
+        measure(report, name, present, absent, truth, "cosine", "open_clip")
+        present, absent = (1 / (1 + np.exp(-10 * (x - rival))) for x in (present, absent))
+        measure(report, name, present, absent, truth, "lerf", "open_clip")
+
+
+def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:
+    """Rows of the plain room, seen by the colour encoder."""
+    from matplotlib.colors import XKCD_COLORS  # noqa: PLC0415 (the names)
+
+    room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColorTextEncoder()
+    names = [name.removeprefix("xkcd:") for name in XKCD_COLORS if "/" not in name]
+    classes, survey = texts.text(room.names), texts.text(names)
+    others = survey[(survey @ classes.T).amax(1) < NOT_A_COLOUR]
+    for cut, regions in (("superpixels", Superpixels(256)), ("squares", Grid(192))):
+        source = RegionFeatures(regions, ColorEncoder())
+        seen = [source.view(view_image(room, camera), f"{i}.png") for i, camera in enumerate(cameras)]
+        counts = [len(view.features) for view in seen]
+        evidence = rasterize_evidence(room.scene, cameras, [view.labels for view in seen], num_regions=counts)
+        table = torch.cat([view.features for view in seen])
+        directions, valid = refined_directions(room.scene.means, evidence, table)
+        present, absent = ((directions @ x.T).numpy() for x in (classes, others))
+        measure(report, f"demo.colour_{cut}", present, absent, room.labels[valid].numpy(), "cosine", "colour")
+
+
+def main(arguments: argparse.Namespace) -> None:
+    torch.set_grad_enabled(False)
+    report = Report("honest_answers")
+    size = (15_000, 12, 240)
+    if "demo" in arguments.scenes:
+        colours(report, *size)
+        clip_like(report, replace(demo(*size), name="demo"))
+    if "tabletop" in arguments.scenes:
+        clip_like(report, tabletop(arguments.views))
+    report.write(arguments.output)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=["demo", "tabletop"], help="demo, tabletop")
+    parser.add_argument("--views", type=int, default=16, help="training views of the tabletop")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
+    main(parser.parse_args())

@@ -1,0 +1,63 @@
+"""Licences of the packages that pyproject.toml names, as they state them: python -m research.licences"""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.metadata import PackageNotFoundError, metadata, requires
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "docs" / "licences.md"
+_CLASSIFIER = "License :: OSI Approved :: "
+_USES = {"": "always", "sam": "extra `sam`", "siglip": "extra `siglip`", "dev": "development"}
+_UNSTATED = {"gsplat": "Apache-2.0", "segment-anything": "Apache-2.0", "tomli": "MIT"}
+"""As their repositories state it, of packages whose metadata state none, or that not every Python needs."""
+_SHORT = 60
+HEAD = """# Licences
+
+normlift_ns is under the Apache License 2.0. It contains no code of the packages below; pip installs them beside it,
+each under its own licence, here as the package states it. Weights of encoders have licences of their own. This page is
+made of what is installed: `python -m research.licences`.
+
+| package | licence | needed |
+|---|---|---|
+"""
+
+
+def packages() -> dict[str, str]:
+    """Names of the packages that this one requires, and what for, in alphabetical order."""
+    found: dict[str, str] = {}
+    for line in requires("normlift-ns") or []:
+        name = re.split(r"[\s<>=!~;\[(]", line)[0].lower().replace("_", "-")
+        extra = re.search(r"extra == ['\"](\w+)['\"]", line)
+        if name != "normlift-ns":
+            found.setdefault(name, _USES[extra[1] if extra else ""])
+    return dict(sorted(found.items()))
+
+
+def licence(package: str) -> str:
+    """What an installed package states: an SPDX expression, else its classifiers, else the first line of its text.
+
+    Raises:
+        PackageNotFoundError: it is not installed, and not known otherwise.
+    """
+    try:
+        stated = metadata(package)
+    except PackageNotFoundError:
+        if package in _UNSTATED:
+            return _UNSTATED[package]
+        raise
+    classifiers = [x.removeprefix(_CLASSIFIER) for x in stated.get_all("Classifier") or [] if x.startswith(_CLASSIFIER)]
+    text = (stated["License"] or "").strip().splitlines()
+    found = stated["License-Expression"] or ", ".join(classifiers) or (text[0][:_SHORT] if text else "")
+    return found or _UNSTATED.get(package, "see its page")
+
+
+def page() -> str:
+    """The whole page."""
+    return HEAD + "".join(f"| {name} | {licence(name)} | {use} |\n" for name, use in packages().items())
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), "utf8")
+    sys.stdout.write(f"Written: {PAGE}\n")

@@ -1,0 +1,127 @@
+"""The rule for defaults, on made tables that hit every clause."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from research.candidates import CANDIDATES, FIRST, Candidate
+from research.damage import LADDER, STEPS
+from research.rule import CHOICE, CONFIRMATION, LIMITS, Cell, cells_of, damage_of, decide, verdict
+
+NAMES = ("none", "one", "two")
+CELLS = [cell for scene in CHOICE for cell in cells_of(scene)]
+ROOM = cells_of("third")
+
+
+def table(cells=CELLS, **given: float | Callable[[Cell], float]):
+    """Rows in which none has 50 points; a gain is a number or a function of the cell."""
+    gains: dict[str, Any] = {"one": 0.0, "two": 0.0} | given
+    return {
+        cell: {"none": [48.0, 52.0]} | {
+            name: [50 + float(gain(cell) if isinstance(gain, Callable) else gain)] * 2 for name, gain in gains.items()
+        }
+        for cell in cells
+    }  # fmt: skip
+
+
+def some(count, loss, gain=3.0, cells=CELLS, chosen=lambda cell: True):
+    """A gain everywhere, and a loss in so many of the chosen cells."""
+    struck = [cell for cell in cells if chosen(cell)][:count]
+    return lambda cell: -loss if cell in struck else gain
+
+
+def test_the_grid_is_the_one_that_was_written_down():
+    assert CHOICE == ("tabletop", "demo") and CONFIRMATION == ("second", "third")
+    assert len(CELLS) == 2 * 299 and len(ROOM) == 299 and len(set(CELLS)) == len(CELLS)
+    assert Counter(cell.kind for cell in ROOM) == {"masks": 212, "superpixels": 29, "grid": 29, "patches": 29}
+    assert Counter(cell.views for cell in ROOM) == {"all": 96, "6": 96, "3": 96, "4": 11}
+    assert sum(cell.undamaged for cell in ROOM) == 11
+    assert {cell.damage for cell in ROOM} == set(STEPS) and len(LADDER) == 13 and len(STEPS) == 15
+    assert damage_of(Cell("demo", "masks", "clip", "mild", "3")).views == 3
+    assert damage_of(Cell("demo", "masks", "clip", "few views", "4")) == LADDER["few views"]
+    assert damage_of(Cell("demo", "masks", "clip", "hard", "all")) == LADDER["hard"]
+
+
+def test_candidates_have_names_of_their_own_and_the_simplest_come_first():
+    names = [one.name for one in CANDIDATES]
+    assert len(set(names)) == len(names) and names[0] == "none"
+    assert {"paper", "plain_knn", "linear", "norm_only", "support_only", "posterior", "consensus"} <= set(names)
+    assert FIRST["paper"] == Candidate("paper", None, sigma_d=1.0, tau=0.95, gamma=0.4, delta=0.0)
+    assert Candidate("posterior", 3.0, sigma_d=2.0, prior=8.0).name == "consensus_posterior power 3 prior 8"
+
+
+def test_the_best_mean_of_the_eligible_wins():
+    found = decide(table(one=1.0, two=2.0), NAMES)
+    assert (found.default, found.choice, found.confirmed) == ("two", "two", None)
+    assert found.verdicts["two"].gain == pytest.approx(2) and found.verdicts["two"].mean == pytest.approx(52)
+    assert found.verdicts["none"].gain == 0 and found.verdicts["none"].eligible
+
+
+def test_a_tie_goes_to_the_simpler_and_none_is_the_fallback():
+    assert decide(table(one=2.0, two=2.0), NAMES).default == "one"
+    assert decide(table(one=0.0, two=0.0), NAMES).default == "none"
+    assert decide(table(one=-0.1, two=-0.1), NAMES).default == "none"
+    everything_fails = decide(table(one=-5.0, two=lambda cell: -5.0 if cell.views == "3" else 9.0), NAMES)
+    assert everything_fails.default == "none"
+    assert set(everything_fails.verdicts["one"].broken) == {"undamaged", "3 views", "overall", "column"}
+
+
+def test_clause_1_undamaged():
+    for loss, broken in ((0.2, ()), (0.21, ("undamaged",))):
+        found = verdict(table(one=lambda cell, loss=loss: -loss if cell.undamaged else 5.0), "one")
+        assert found.undamaged == pytest.approx(loss)
+        assert found.broken == broken
+
+
+def test_clause_2_three_views():
+    for loss, holds in ((1.0, True), (1.01, False)):
+        found = verdict(table(one=lambda cell, loss=loss: -loss if cell.views == "3" else 9.0), "one")
+        assert found.three_views == pytest.approx(loss)
+        assert ("3 views" in found.broken) is not holds
+
+
+def test_clause_3_share_of_all_cells():
+    spread = [cell for i, cell in enumerate(CELLS) if i % 17 == 0]
+    most = int(LIMITS.overall * len(CELLS))
+    for count, holds in ((most, True), (most + 1, False)):
+        found = verdict(table(one=lambda cell, n=count: -1.5 if cell in spread[:n] else 5.0), "one")
+        assert found.worse == pytest.approx(count / len(CELLS))
+        assert ("overall" not in found.broken) is holds
+    assert verdict(table(one=some(len(CELLS), 1.0)), "one").worse == 0  # exactly 1 point is not more
+
+
+def test_clause_4_share_of_a_column():
+    few = [cell for cell in CELLS if cell.damage == "few views"]
+    assert len(few) == 22
+    for count, broken in ((4, ()), (5, ("column",))):
+        found = verdict(table(one=some(count, 2.0, chosen=lambda cell: cell.damage == "few views")), "one")
+        assert (found.broken, found.column) == (broken, pytest.approx(count / 22))
+        assert found.column_name in ("damage few views", "views 4")
+        assert (found.worst, found.worst_cell in few) == (2.0, True)
+
+
+def test_rooms_confirm_or_refute_and_are_never_chosen_on():
+    choice = table(one=1.0, two=2.0)
+    best_in_the_room = decide(choice | table(ROOM, one=9.0, two=1.0), NAMES)
+    assert (best_in_the_room.default, best_in_the_room.confirmed) == ("two", True)
+    assert best_in_the_room.verdicts["one"].mean == pytest.approx(51)  # the room does not count
+    for gain in (0.0, -0.5, lambda cell: -0.3 if cell.undamaged else 3.0, some(15, 2.0, cells=ROOM)):
+        refuted = decide(choice | table(ROOM, one=9.0, two=gain), NAMES)
+        assert (refuted.default, refuted.choice, refuted.confirmed) == ("none", "two", False)
+    second = table(cells_of("second"), one=9.0, two=1.0)
+    assert decide(choice | second | table(ROOM, one=9.0, two=1.0), NAMES).default == "two"
+    assert decide(choice | second | table(ROOM, one=9.0, two=0.0), NAMES).default == "none"  # one room is enough
+    for count, confirmed in ((3, True), (4, False)):  # 2.2 of 11 cells of a column are allowed, and one more
+        room = table(ROOM, two=some(count, 2.0, cells=ROOM, chosen=lambda cell: cell.damage == "few views"))
+        assert decide(table(two=2.0) | room, NAMES).confirmed is confirmed
+    none = decide(table(one=-1.0, two=-1.0) | table(ROOM, one=5.0, two=5.0), NAMES)
+    assert (none.default, none.confirmed) == ("none", True)
+
+
+def test_a_decision_needs_cells_and_none():
+    with pytest.raises(ValueError, match="tabletop or demo"):
+        decide(table(ROOM), NAMES)
+    with pytest.raises(ValueError, match="candidate none"):
+        decide(table(), ("one", "two"))
