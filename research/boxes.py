@@ -2,8 +2,8 @@
 
     python -m research.boxes --views 16
 
-True Gaussians are those of the controlled benchmark (`research.synthetic_scenes.PURITY`). Boxes are made of both alike, but the
-objects found are connected parts, of which the largest counts.
+True Gaussians are those of the controlled benchmark (`research.synthetic_scenes.PURITY`). Boxes are made of both
+alike, but the objects found are connected parts, of which the largest counts.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
     python -m research.floaters                     plain room, and the tabletop where the captures are
     python -m research.floaters --scenes demo --quick
 
-Writes results/floaters.json. `synthetic_scenes.with_floaters` puts 5 % more Gaussians before the cameras, half-transparent blobs
-that belong to nothing. Real are Gaussians of known class; masks and features are damaged as in `damage`.
+Writes results/floaters.json. `synthetic_scenes.with_floaters` puts 5 % more Gaussians before the cameras,
+half-transparent blobs that belong to nothing. Real are Gaussians of known class; masks and features are damaged as in
+`damage`.
 
 The rule by which the limit was chosen, written before this benchmark gave a number, but after looking at how well
 single signals tell floaters, at 1 % lost: on the plain room with damage "mild" and seed 0, the least limit, rounded up
