@@ -19,7 +19,10 @@ from tests.scripts.conftest import SMALL
 
 ROOT = Path(__file__).resolve().parents[1]
 LACKING = ("resource", "fcntl", "termios", "tty", "pty", "pwd", "grp", "triton", "nerfstudio", "gsplat")
-NEED_THEM = ("kernels", "raster.triton", "raster.gsplat", "nerfstudio_plugin", "method_configs", "plugin", "demo.run")
+NEED_THEM = (
+    *("kernels", "rasterization.triton", "rasterization.gsplat", "nerfstudio_plugin", "method_configs", "plugin"),
+    "demo.capture",
+)
 PROGRAM = """
 import signal, sys
 from importlib import import_module

@@ -20,12 +20,12 @@ import torch
 from normlift_ns import LiftOptions, SourceOptions, open_scene
 from normlift_ns.encoders.build import make_source
 from normlift_ns.pipeline import lift_scene
-from normlift_ns.planning import load_kernels, measure
+from normlift_ns.planning import time_kernel_loading, measure
 from normlift_ns.planning import make_plan
 torch.set_num_threads(1)
 scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
 source, options = make_source(SourceOptions(encoder="colour")), LiftOptions(max_views=9)
-load_kernels(scene, options)
+time_kernel_loading(scene, options)
 found = []
 for _ in range(2):
     plan = make_plan(measure(scene, source, options, cache, clock=time.process_time))

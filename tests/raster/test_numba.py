@@ -137,7 +137,7 @@ def test_a_second_process_compiles_nothing_even_beside_code_that_cannot_be_writt
     """Where no folder for bytecode can be made beside the code, numba keeps its cache in the user's folder."""
     package = tmp_path / "installed" / "normlift_ns"
     shutil.copytree(Path(normlift_ns.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "raster" / "__pycache__").write_bytes(b"")
+    (package / "rasterization" / "__pycache__").write_bytes(b"")
     environment = {**os.environ, "PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment.pop("NUMBA_CACHE_DIR", None)
     runs = [
