@@ -10,7 +10,7 @@ BESIDE := -n $(WORKERS) --dist worksteal
 .PHONY: check style changed-types quick-tests test test-slow test-all test-versions test-viser1 soak torture demo docs bench lint format clean
 
 # Compiles the kernels of the CPU rasterizer that no cache holds, which takes half a minute for each precision
-KERNELS = import torch; from normlift_ns.rasterization.numba import warm; warm(torch.float32, torch.float64).join()
+KERNELS = import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32, torch.float64).join()
 
 .venv/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 12) else f"Python 3.10 to 3.12 is needed, this is {v[0]}.{v[1]}; try: make PYTHON=python3.11 $(MAKECMDGOALS)")'

@@ -70,7 +70,7 @@ assert torch.equal(scene.gaussians.means, run.scene.gaussians.means) and len(sce
 try:
     nl.open_splat(folder / "none.npz", options)
 except nl.InputError as error:
-    assert "is no splat" in str(error), error
+    assert "is not a splat" in str(error), error
 else:
     sys.exit("accepted")
 """

@@ -31,7 +31,9 @@ _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
 """Superpixels per view: small enough to separate the green star of a tomato."""
 _ASK_OPTIONS = AskOptions(threshold="auto")
-_COMPILE = "import torch; from normlift_ns.rasterization.numba import warm; warm(torch.float32).join()"
+_COMPILE = (
+    "import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32).join()"
+)
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """Old path of `normlift_ns.cli.demo`."""
 
-from normlift_ns.cli.demo import entrypoint
+from normlift_ns.cli.common import run_command_process
+from normlift_ns.cli.demo import Demo
 
 if __name__ == "__main__":
-    entrypoint()
+    run_command_process(Demo)

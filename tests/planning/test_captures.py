@@ -20,7 +20,7 @@ import torch
 from normlift_ns import LiftOptions, SourceOptions, open_scene
 from normlift_ns.encoders.build import make_source
 from normlift_ns.pipeline import lift_scene
-from normlift_ns.planning import time_kernel_loading, measure
+from normlift_ns.planning import measure_capture, time_kernel_loading
 from normlift_ns.planning import make_plan
 torch.set_num_threads(1)
 scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
@@ -28,7 +28,7 @@ source, options = make_source(SourceOptions(encoder="colour")), LiftOptions(max_
 time_kernel_loading(scene, options)
 found = []
 for _ in range(2):
-    plan = make_plan(measure(scene, source, options, cache, clock=time.process_time))
+    plan = make_plan(measure_capture(scene, source, options, cache, clock=time.process_time))
     start = time.process_time()
     result = lift_scene(scene, source, options, cache, encoder={})
     found.append({"told": plan.to_json(), "taken": time.process_time() - start, "stages": result.seconds,

@@ -125,7 +125,7 @@ def test_what_is_warmed_is_what_is_called(dtype):
 CHILD = """
 import torch
 from normlift_ns.rasterization import numba as backend
-backend.warm(torch.float32).join()
+backend.compile_kernels(torch.float32).join()
 kernels = [kernel for kernel, _ in backend.kernel_signatures(torch.float32)]
 print(sum(sum(k.stats.cache_hits.values()) for k in kernels), sum(sum(k.stats.cache_misses.values()) for k in kernels))
 print(kernels[0].stats.cache_path)

@@ -463,10 +463,9 @@ def test_what_the_environment_says_and_cannot_say():
 
 
 RAY = f"""#!{sys.executable}
-from normlift_ns.cli.captures import work
-from normlift_ns.cli.start import batch
-work.work.__kwdefaults__["program"] = {STAND_IN!r}
-batch()
+from normlift_ns.cli import batch, start
+batch.lift_captures.__kwdefaults__["program"] = {STAND_IN!r}
+start.batch()
 """
 
 
