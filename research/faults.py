@@ -29,18 +29,19 @@ from queue import Queue
 
 PACKAGES = (
     "core",
-    "raster",
+    "rasterization",
     "kernels",
     "encoders",
-    "scenes",
-    "runs",
+    "segmentation",
+    "data",
+    "io",
+    "query",
     "session",
     "viewer",
-    "objects",
-    "insight",
+    "analysis",
     "evaluation",
     "nerfstudio_plugin",
-    "scripts",
+    "cli",
     ".",  # modules at the top
 )
 KINDS = (
