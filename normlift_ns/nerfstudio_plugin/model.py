@@ -110,7 +110,7 @@ class NormLiftModel(SplatfactoModel):
 
     @property
     def on_cpu(self) -> bool:
-        """Whether normlift_ns renders; stock splatfacto needs CUDA."""
+        """True if normlift_ns renders; stock splatfacto needs CUDA."""
         return self.device.type == "cpu"
 
     @property

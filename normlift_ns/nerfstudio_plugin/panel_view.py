@@ -49,7 +49,7 @@ from normlift_ns.viewer.widgets import (
 VISER_SCALE = 10.0
 """Units of the viser scene per scene unit: nerfstudio's VISER_NERFSTUDIO_SCALE_RATIO."""
 CLICK_MODES = {"More like this": "like", "Select": "select", "Add": "add", "Drop": "take away"}
-"""What a click does, by the caption of its button."""
+"""Effect of a click, by the caption of its button."""
 
 
 class ClickListener:
@@ -67,7 +67,7 @@ class ClickListener:
 
     @property
     def armed(self) -> bool:
-        """Whether a browser waits for a click."""
+        """True if a browser waits for a click."""
         return self._armed is not None
 
     def arm(self, button: str, client: Any) -> None:
@@ -605,7 +605,7 @@ class PanelView(torch.nn.Module):
 
     @property
     def viewed(self) -> bool:
-        """Whether a viewer shows the panel."""
+        """True if a viewer shows the panel."""
         return self._widgets is not None
 
     def act(self, name: str, value: Any = None, client: Any = None) -> None:

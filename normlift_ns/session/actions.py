@@ -111,7 +111,7 @@ def _only_clicks(question: Query) -> bool:
 
 
 ClickMode = Literal["select", "add", "take away"]
-"""What a click does with the object under it."""
+"""Effect of a click on the object under it."""
 MAX_GROW_STEPS = 10
 """Largest number of steps by which a selection can be grown or shrunk."""
 MIN_THRESHOLD, MAX_THRESHOLD = -0.2, 1.0

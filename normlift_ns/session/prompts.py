@@ -37,7 +37,7 @@ class Prompt:
 
     @property
     def clicked(self) -> bool:
-        """Whether the prompt is a click on the scene instead of a text."""
+        """True if the prompt is a click on the scene instead of a text."""
         return is_click(self.text)
 
 

@@ -173,7 +173,7 @@ class SelectionBox:
     wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Rotation as a quaternion."""
     keeps_inside: bool = True
-    """Whether Gaussians inside the box stay selected; False: those outside."""
+    """True if Gaussians inside the box stay selected; False: those outside."""
 
     @property
     def corners(self) -> Float[np.ndarray, "8 3"]:

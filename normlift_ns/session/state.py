@@ -36,7 +36,7 @@ class State:
     shown: int | None = None
     """Index of the only prompt of the query that selects; None: all of them select."""
     from_answer: bool = True
-    """Whether the prompts select; False: the selection was made by hand."""
+    """True if the prompts select; False: the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     steps: int = 0
@@ -89,7 +89,7 @@ class State:
 
     @property
     def refined(self) -> bool:
-        """Whether the query uses refined features."""
+        """True if the query uses refined features."""
         return True if self.question is None else self.question.refined
 
     @cached_property
@@ -154,12 +154,12 @@ class History(Generic[T]):
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is an earlier state."""
+        """True if there is an earlier state."""
         return self.at > 0
 
     @property
     def can_redo(self) -> bool:
-        """Whether there is a later state, after an undo."""
+        """True if there is a later state, after an undo."""
         return self.at < len(self.states) - 1
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:

@@ -1,4 +1,4 @@
-"""What lets viser's page live in a browser without WebGL."""
+"""Adapter for viser: its server, pages, widgets, security headers, and pages without WebGL."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def with_script(page: bytes) -> bytes:
 
 
 def picture_script(jpeg: bytes) -> str:
-    """What the page runs to show a picture in place of the scene."""
+    """Return the script that shows an image in place of the scene."""
     return _PICTURE.replace("CONTENT", base64.b64encode(jpeg).decode())
 
 
@@ -364,12 +364,12 @@ class BrowserPage:
 
     @property
     def gone(self) -> bool:
-        """Whether the connection is lost."""
+        """True if the connection is lost."""
         return self._buffer.done
 
     @property
     def behind(self) -> bool:
-        """Whether messages wait until the page has received earlier ones."""
+        """True if messages wait until the page has received earlier ones."""
         return len(self._buffer.message_from_id) > 0
 
     def together(self) -> Any:
