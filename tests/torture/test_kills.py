@@ -107,8 +107,9 @@ def test_a_killed_command_loses_nothing(name: str, place: Place, record: Record)
     moments += [{"step": step, "signal": signal.SIGTERM} for step in spread(draw, steps, TERMS)]
     for moment in moments:
         place.restore()
-        ((code, _),) = place.server.run({"words": words, "folder": str(watched), **moment})
-        assert code != 0 or "seconds" in moment, moment
+        ((code, taken),) = place.server.run({"words": words, "folder": str(watched), **moment})
+        # where processes wait for each other's locks, a run has a few steps more or less than another
+        assert code != 0 or "seconds" in moment or taken < moment["step"] > steps - 10, moment
         look(place, command)
         state = {path: content for path, content in tree(watched).items() if ".cache" not in path}
         kept = [known for known in (old, new) if differing(state, without_cache(known)) == []]
