@@ -219,6 +219,14 @@ class NormLiftQuery:
         for name in ("json", "output_path", "render_dir", "save", "why", "why_dir", "segment", "objects"):
             if flags != ["--text"] and getattr(self, name):
                 raise InputError(f"--{name.replace('_', '-')} works with --text only; leave it out with {flags[0]}")
+        self._check_dependent_options()
+        if self.interactive and not sys.stdin.isatty():
+            raise InputError(
+                "--interactive needs a terminal to read from; to read prompts from a file, use --stdin True"
+            )
+        check_prompt_list("text", self.text)
+
+    def _check_dependent_options(self) -> None:
         if len(self.render_views) > 0 and self.render_dir is None:
             raise InputError("--render-views has no effect without --render-dir; give the folder for the renders")
         if self.why_dir is not None and not self.why:
@@ -230,11 +238,6 @@ class NormLiftQuery:
             if getattr(self, name) is not None and not self.objects:
                 flag = f"--{name.replace('_', '-')}"
                 raise InputError(f"{flag} has no effect without --objects True; add that flag")
-        if self.interactive and not sys.stdin.isatty():
-            raise InputError(
-                "--interactive needs a terminal to read from; to read prompts from a file, use --stdin True"
-            )
-        check_prompt_list("text", self.text)
 
     def _existing_renders(self) -> list[Path]:
         """Return existing renders that new ones could replace: of the same prompts, and of --render-views if given."""

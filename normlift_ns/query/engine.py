@@ -85,6 +85,11 @@ class Answer:
         """Gaussians that any of the prompts selects."""
         return self.selected.any(1)
 
+    @property
+    def suggested_threshold(self) -> float | None:
+        """One threshold for all prompts, which their relevancies suggest; None if no Gaussian has a direction."""
+        return suggest_threshold(as_numpy(self.relevancy), as_numpy(self.valid))
+
     def __len__(self) -> int:
         return len(self.texts)
 
@@ -318,7 +323,7 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
     If the query asks for a suggested threshold, the query in the result has that threshold.
     """
     if question.suggest:
-        suggested = suggest_threshold(as_numpy(answer.relevancy), as_numpy(answer.valid))
+        suggested = answer.suggested_threshold
         question = replace(question, threshold=question.threshold if suggested is None else suggested, suggest=False)
     reliable = answer.valid & (answer.field.scalars.reliability >= question.min_reliability)
     return replace(answer, question=question, selected=(answer.relevancy > question.threshold) & reliable[:, None])
